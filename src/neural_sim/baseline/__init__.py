@@ -1,0 +1,1 @@
+"""Ways to choose psi that Neural-Sim is compared with."""

@@ -1,0 +1,1 @@
+"""RetinaNet as pure functions of a parameter dictionary."""

@@ -1,0 +1,1 @@
+"""Meshes: procedural, YCB layout, BOP models, any folder of meshes."""

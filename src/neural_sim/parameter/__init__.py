@@ -1,0 +1,1 @@
+"""Distributions p_psi over scene parameters (paper, Tool 1)."""

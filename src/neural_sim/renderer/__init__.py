@@ -1,0 +1,1 @@
+"""Camera to image and opacity: mesh rasteriser, ray caster, radiance field."""

@@ -1,0 +1,1 @@
+"""Linear solvers with a status, and the operators they act on."""

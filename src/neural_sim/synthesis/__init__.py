@@ -1,0 +1,1 @@
+"""From rendered objects to labelled training images."""

@@ -1,0 +1,1 @@
+"""Labelled target sets: what the detector shall be good at."""

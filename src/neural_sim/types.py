@@ -1,0 +1,118 @@
+"""The frozen dataclasses that travel between rooms. They hold tensors and no behaviour beyond selection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays in the object's frame; ``directions`` are unit vectors, so that distances are Euclidean."""
+
+    origins: Float[Tensor, "*rays 3"]
+    directions: Float[Tensor, "*rays 3"]
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A square-pixel pinhole camera without distortion; the principal point is the image's centre.
+
+    ``width`` and ``height`` in pixels, ``field_of_view`` (vertical) in radians.
+    """
+
+    width: int
+    height: int
+    field_of_view: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera: width and height must be at least 1, got {self.width} x {self.height}")
+        if not 0.0 < self.field_of_view < torch.pi:
+            raise ValueError(f"camera: field_of_view must lie in (0, pi) radians, got {self.field_of_view}")
+
+
+@dataclass(frozen=True)
+class PosedViews:
+    """Views of one object with their cameras, the training set of a radiance field.
+
+    ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
+    (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
+    """
+
+    images: Float[Tensor, "views height width 4"]
+    camera_to_world: Float[Tensor, "views 4 4"]
+    camera: PinholeCamera
+
+    def __len__(self) -> int:
+        return self.images.shape[0]
+
+    def select(self, index: Tensor) -> PosedViews:
+        return PosedViews(self.images[index], self.camera_to_world[index], self.camera)
+
+
+@dataclass(frozen=True)
+class LabelledImages:
+    """Images with boxes. Rows of ``boxes`` whose label is -1 are padding.
+
+    ``images`` in [0, 1]; ``boxes`` are (x0, y0, x1, y1) in pixels, the image spanning [0, width] x [0, height];
+    ``labels`` are class indices from 0. ``bins`` is the pose bin an image was drawn from (-1: unknown),
+    for reports only.
+    """
+
+    images: Float[Tensor, "images 3 height width"]
+    boxes: Float[Tensor, "images boxes 4"]
+    labels: Int[Tensor, "images boxes"]
+    bins: Int[Tensor, "images"]
+
+    def __len__(self) -> int:
+        return self.images.shape[0]
+
+    def select(self, index: Tensor | slice) -> LabelledImages:
+        return LabelledImages(self.images[index], self.boxes[index], self.labels[index], self.bins[index])
+
+    @property
+    def present(self) -> Bool[Tensor, "images boxes"]:
+        """Which rows of ``boxes`` are boxes rather than padding."""
+        return self.labels >= 0
+
+    @staticmethod
+    def concatenate(parts: list[LabelledImages]) -> LabelledImages:
+        """Join sets of equal image size; boxes are padded to the longest list among them."""
+        if not parts:
+            raise ValueError("concatenate: got no image sets, want at least one")
+        most = max(part.boxes.shape[1] for part in parts)
+
+        def pad(part: LabelledImages) -> LabelledImages:
+            missing = most - part.boxes.shape[1]
+            boxes = torch.nn.functional.pad(part.boxes, (0, 0, 0, missing))
+            labels = torch.nn.functional.pad(part.labels, (0, missing), value=-1)
+            return LabelledImages(part.images, boxes, labels, part.bins)
+
+        padded = [pad(part) for part in parts]
+        joined = {f.name: torch.cat([getattr(p, f.name) for p in padded]) for f in fields(LabelledImages)}
+        return LabelledImages(**joined)
+
+
+@dataclass(frozen=True)
+class SceneDraw:
+    """Scene parameters V of one object's images, drawn from p_psi (paper, Sec. 3.1, Tool 1).
+
+    ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the
+    origin in object radii. ``bins`` is the index of the drawn (or largest relaxed) pose bin, from 0. Fields may carry
+    gradients with respect to psi.
+    """
+
+    phi: Float[Tensor, "images"]
+    rho: Float[Tensor, "images"]
+    distance: Float[Tensor, "images"]
+    bins: Int[Tensor, "images"]
+
+    def __len__(self) -> int:
+        return self.phi.shape[0]
+
+    def select(self, index: Tensor | slice) -> SceneDraw:
+        return SceneDraw(**{f.name: getattr(self, f.name)[index] for f in fields(SceneDraw)})

@@ -1,0 +1,21 @@
+"""Small shared scenes, and where the real data lies."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder that holds ycb/ and ycb_video_sample/: ``NEURAL_SIM_DATA``, else ../shared beside the checkout."""
+    root = Path(os.environ.get("NEURAL_SIM_DATA", Path(__file__).parents[2] / "shared"))
+    if not (root / "ycb").is_dir():
+        pytest.skip(f"no real data: {root / 'ycb'} does not exist (set NEURAL_SIM_DATA)")
+    return root
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
