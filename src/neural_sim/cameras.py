@@ -36,7 +36,9 @@ def focal_length(camera: PinholeCamera) -> float:
     return 0.5 * camera.height / math.tan(0.5 * camera.field_of_view)
 
 
-def pixel_directions(camera: PinholeCamera, *, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "height width 3"]:
+def pixel_directions(
+    camera: PinholeCamera, *, dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "height width 3"]:
     """Unit directions of the pixel centres in the camera's own frame; row 0 is the top of the image."""
     focal = focal_length(camera)
     x = (torch.arange(camera.width, dtype=dtype, device=device) + 0.5 - 0.5 * camera.width) / focal
@@ -54,7 +56,9 @@ def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Ray
     return Rays(position[..., None, None, :].expand_as(directions), directions)
 
 
-def unit_sphere_span(bundle: Rays, radius: float = 1.0) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
+def unit_sphere_span(
+    bundle: Rays, radius: float = 1.0
+) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
     """Entry and exit distances of the sphere about the origin; entry >= exit where a ray misses it.
 
     A camera inside the sphere enters at distance 0.

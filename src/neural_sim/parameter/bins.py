@@ -1,0 +1,94 @@
+"""A categorical distribution over bins and its Gumbel-softmax relaxation (paper, Sec. 3.1, Tool 1).
+
+Everything is a pure function of logits psi and of noise drawn beforehand, so that a draw can be replayed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
+    """log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
+
+    The floor keeps every bin within reach of a draw and every log p finite, however far psi has run.
+
+    Raises:
+        ValueError: unless 0 <= floor < 1 / k.
+    """
+    bins = psi.shape[-1]
+    if not 0.0 <= floor < 1.0 / bins:
+        raise ValueError(f"parameter: floor must lie in [0, 1/{bins}), got {floor}")
+    log_softmax = torch.log_softmax(psi, -1)
+    if floor == 0.0:
+        return log_softmax
+    return torch.logaddexp(log_softmax + math.log1p(-bins * floor), torch.full_like(psi, math.log(floor)))
+
+
+def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
+    """Centred logits whose :func:`log_probabilities` are log ``probabilities`` (raised to just above the floor)."""
+    bins = probabilities.shape[-1]
+    above_floor = ((probabilities - floor) / (1.0 - bins * floor)).clamp_min(1e-6)
+    log_p = above_floor.log()
+    return log_p - log_p.mean(-1, keepdim=True)
+
+
+def gumbel(shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
+    """Standard Gumbel noise; the uniform is kept off 0 and 1 so that it is finite in every dtype."""
+    uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
+    return -(-(uniform.clamp(1e-12, 1.0 - 1e-12)).log()).log().to(dtype)
+
+
+def gumbel_softmax(
+    log_p: Float[Tensor, "*n k"], noise: Float[Tensor, "*n k"], temperature: float
+) -> Float[Tensor, "*n k"]:
+    """y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
+
+    Raises:
+        ValueError: unless the temperature is positive.
+    """
+    if not temperature > 0.0:
+        raise ValueError(f"parameter: temperature must be positive, got {temperature}")
+    return torch.softmax((noise + log_p) / temperature, -1)
+
+
+def centres(bins: int, low: float, high: float, like: Tensor) -> Float[Tensor, "k"]:
+    """Centres of ``bins`` equal bins of [low, high], in the unit of ``low``."""
+    steps = torch.arange(bins, dtype=like.dtype, device=like.device) + 0.5
+    return low + (high - low) / bins * steps
+
+
+def linear_mean(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
+    """The paper's approximate bin centre, sum_i y_i B_i. On a circle it is wrong across the wrap."""
+    return weights @ bin_centres
+
+
+def circular_mean(
+    weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"], smallest_resultant: float = 0.1
+) -> Float[Tensor, "*n"]:
+    """The direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
+
+    Its derivative grows as one over the resultant's length, without bound where opposite bins mix in equal
+    parts; below ``smallest_resultant`` the length in the derivative is held there (see
+    :func:`resultant_length` for the status). The value is not touched.
+    """
+    sine, cosine = weights @ bin_centres.sin(), weights @ bin_centres.cos()
+    squared = (sine.square() + cosine.square()).detach().clamp_min(smallest_resultant**2)
+    value = torch.atan2(sine, cosine).detach() % (2.0 * math.pi)
+    slope = (cosine.detach() * sine - sine.detach() * cosine) / squared
+    return value + (slope - slope.detach())
+
+
+def resultant_length(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
+    """|sum_i y_i exp(i B_i)|: 1 for a single bin, 0 where the circular mean is undefined."""
+    return torch.hypot(weights @ bin_centres.sin(), weights @ bin_centres.cos())
+
+
+def nearest_bin(angle: Float[Tensor, "*n"], bins: int, low: float, high: float) -> Int[Tensor, "*n"]:
+    """Index of the bin of [low, high) that holds ``angle``, taken modulo the range."""
+    fraction = ((angle.detach() - low) / (high - low)) % 1.0
+    return (fraction * bins).long().clamp_max(bins - 1)

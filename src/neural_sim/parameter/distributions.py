@@ -1,0 +1,67 @@
+"""Distributions over bins by name, as configurations state them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Specification = str | Mapping[str, object] | Sequence[float]
+
+DOMINANT_REST = 0.02  # the paper's biased sets: all but one bin share 0.02 each, for k = 8 leaving 0.86
+
+
+def distribution(specification: Specification, bins: int, where: str = "distribution") -> Float[Tensor, "k"]:
+    """Probabilities over ``bins`` bins, float64.
+
+    ``uniform``; ``{dominant: b}``, 0.02 on all bins but b, which has the rest (0.86 for k = 8);
+    ``{modes: [b, ...]}``, 0.02 on all others, the rest shared equally by the modes; or ``bins`` numbers
+    that add up to 1. Bins are numbered from 1, as in the paper.
+
+    Raises:
+        ValueError: an unknown name, a bin outside 1..bins, numbers that are negative or do not add up to 1;
+            the message begins with ``where``.
+    """
+    if specification == "uniform":
+        return torch.full((bins,), 1.0 / bins, dtype=torch.float64)
+    if isinstance(specification, Mapping):
+        if set(specification) == {"dominant"}:
+            return _peaked([specification["dominant"]], bins, where)
+        if set(specification) == {"modes"} and isinstance(specification["modes"], Sequence):
+            return _peaked(list(specification["modes"]), bins, where)
+    elif isinstance(specification, Sequence) and not isinstance(specification, str):
+        return _numbers(specification, bins, where)
+    raise ValueError(
+        f"{where}: want uniform, {{dominant: b}}, {{modes: [b, ...]}} or {bins} numbers, got {specification!r}"
+    )
+
+
+def _peaked(modes: list[object], bins: int, where: str) -> Tensor:
+    if not modes or len(set(modes)) != len(modes):
+        raise ValueError(f"{where}: want one or more different bins, got {modes}")
+    for mode in modes:
+        if isinstance(mode, bool) or not isinstance(mode, int) or not 1 <= mode <= bins:
+            raise ValueError(f"{where}: bins are numbered 1 to {bins}, got {mode!r}")
+    rest = min(DOMINANT_REST, 0.5 / bins)
+    probabilities = torch.full((bins,), rest, dtype=torch.float64)
+    index = torch.tensor([int(str(mode)) - 1 for mode in modes])
+    probabilities[index] = (1.0 - rest * (bins - len(modes))) / len(modes)
+    return probabilities
+
+
+def _numbers(values: Sequence[float], bins: int, where: str) -> Tensor:
+    if len(values) != bins:
+        raise ValueError(f"{where}: want {bins} numbers, got {len(values)}")
+    probabilities = torch.tensor([float(value) for value in values], dtype=torch.float64)
+    if not torch.isfinite(probabilities).all() or (probabilities < 0).any():
+        raise ValueError(f"{where}: probabilities must be finite and not negative, got {list(values)}")
+    if abs(probabilities.sum().item() - 1.0) > 1e-6:
+        raise ValueError(f"{where}: probabilities must add up to 1, got {probabilities.sum().item():.6g}")
+    return probabilities
+
+
+def total_variation(p: Float[Tensor, "*n k"], q: Float[Tensor, "*n k"]) -> Float[Tensor, "*n"]:
+    """Half the L1 distance between two distributions: 0 when equal, 1 when disjoint."""
+    return 0.5 * (p - q).abs().sum(-1)
