@@ -1,1 +1,0 @@
-"""Ways to choose psi that Neural-Sim is compared with."""
