@@ -1,0 +1,127 @@
+"""The choice of lambda in ``(H + lambda I) v = b``, and of the curvature operator it is added to."""
+
+from __future__ import annotations
+
+import abc
+import logging
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.solver.lanczos import Spectrum, lanczos, random_start
+from neural_sim.solver.operator import Matvec
+
+logger = logging.getLogger(__name__)
+Curvature = Literal["hessian", "gauss_newton"]
+
+
+@dataclass(frozen=True)
+class Damped:
+    """``value`` is lambda >= 0; ``spectrum`` is that of the undamped operator, None where it was not estimated."""
+
+    value: float
+    spectrum: Spectrum | None
+
+    @property
+    def condition(self) -> float:
+        """Estimated condition number of the damped operator; nan where no spectrum was estimated."""
+        return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
+
+
+class Damping(abc.ABC):
+    """Chooses lambda for an operator; ``curvature`` names the operator that this choice is meant for."""
+
+    curvature: ClassVar[Curvature] = "hessian"
+
+    @abc.abstractmethod
+    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        """lambda for ``matvec`` on vectors of the size, dtype and device of ``like``."""
+
+
+@dataclass(frozen=True)
+class FixedDamping(Damping):
+    """A given lambda, for instance 0 where the inner problem's own proximal term already bounds its curvature.
+
+    ``lanczos_steps`` > 0 estimates the spectrum all the same, for the log.
+    """
+
+    value: float
+    lanczos_steps: int = 0
+
+    def __post_init__(self) -> None:
+        _check("fixed", self.value, self.lanczos_steps)
+
+    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        return Damped(self.value, _estimate(matvec, like, self.lanczos_steps, generator))
+
+
+@dataclass(frozen=True)
+class LanczosDamping(Damping):
+    """lambda past the most negative curvature, and large enough for a wanted condition number.
+
+    With the Ritz value lowered by its own error bound, ``m = smallest - error``:
+    ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``;
+    the last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
+    """
+
+    margin: float = 0.25
+    max_condition: float = 1e3
+    minimum: float = 1e-6
+    lanczos_steps: int = 12
+
+    def __post_init__(self) -> None:
+        _check("lanczos", self.minimum, self.lanczos_steps)
+        if self.lanczos_steps < 1 or self.margin <= 0.0 or not self.max_condition > 1.0:
+            raise ValueError(
+                "lanczos damping: want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
+                f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
+            )
+
+    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        spectrum = lanczos(
+            matvec,
+            random_start(like.numel(), generator, dtype=like.dtype, device=like.device),
+            self.lanczos_steps,
+        )
+        if not spectrum.finite:
+            logger.warning(
+                "damping: the operator is not finite; lambda falls to its minimum, %g", self.minimum
+            )
+            return Damped(self.minimum, spectrum)
+        low = spectrum.smallest - spectrum.smallest_error
+        bounded = (spectrum.largest - self.max_condition * low) / (self.max_condition - 1.0)
+        return Damped(max(self.minimum, (1.0 + self.margin) * max(0.0, -low), bounded), spectrum)
+
+
+@dataclass(frozen=True)
+class GaussNewtonDamping(Damping):
+    """The Gauss-Newton operator in the Hessian's place, whose curvature is non-negative where the loss is convex in
+    the model's outputs, with a fixed lambda.
+    """
+
+    curvature: ClassVar[Curvature] = "gauss_newton"
+    value: float
+    lanczos_steps: int = 0
+
+    def __post_init__(self) -> None:
+        _check("gauss_newton", self.value, self.lanczos_steps)
+
+    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        return Damped(self.value, _estimate(matvec, like, self.lanczos_steps, generator))
+
+
+def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generator) -> Spectrum | None:
+    if steps == 0:
+        return None
+    return lanczos(matvec, random_start(like.numel(), generator, dtype=like.dtype, device=like.device), steps)
+
+
+def _check(name: str, value: float, steps: int) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ValueError(f"{name} damping: lambda must be finite and at least 0, got {value}")
+    if steps < 0:
+        raise ValueError(f"{name} damping: lanczos_steps must be at least 0, got {steps}")

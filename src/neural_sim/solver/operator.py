@@ -1,0 +1,84 @@
+"""Linear operators as callables: the shift, the counter that watches every product, the dense matrix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Matvec = Callable[[Tensor], Tensor]
+
+
+class NonFiniteProduct(ArithmeticError):
+    """An operator returned inf or nan. Raised by ``Watched`` and turned into a status by the solver's base."""
+
+
+@dataclass(frozen=True)
+class Shifted:
+    """``x -> A x + shift x``: a Hessian with its damping. Solvers that treat the shift apart (nystrom) can see it."""
+
+    matvec: Matvec
+    shift: float
+
+    def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        return self.matvec(vector) + self.shift * vector
+
+
+def norm(vector: Tensor) -> float:
+    """Euclidean norm accumulated in float64, so that float32 entries up to 1e38 do not overflow when squared."""
+    return float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+
+
+def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
+    """Inner product accumulated in float64."""
+    return float(left.double() @ right.double())
+
+
+class Watched:
+    """Counts an operator's products, keeps the range of their Rayleigh quotients, raises ``NonFiniteProduct``."""
+
+    def __init__(self, matvec: Matvec) -> None:
+        self._matvec = matvec
+        self.products = 0
+        self._low, self._high = math.inf, -math.inf
+
+    @property
+    def curvature(self) -> tuple[float, float]:
+        return (self._low, self._high) if self._low <= self._high else (0.0, 0.0)
+
+    @property
+    def shift(self) -> float:
+        """The known multiple of the identity inside this operator."""
+        return self._matvec.shift if isinstance(self._matvec, Shifted) else 0.0
+
+    def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        product = self._matvec(vector)
+        if product.shape != vector.shape:
+            raise ValueError(
+                f"operator: got a product of shape {tuple(product.shape)}, want {tuple(vector.shape)}"
+            )
+        self.products += 1
+        if not bool(torch.isfinite(product).all()):
+            raise NonFiniteProduct(f"product {self.products} of the operator is not finite")
+        size = norm(vector)
+        if size > 0.0:
+            quotient = dot(vector, product) / size**2
+            self._low, self._high = min(self._low, quotient), max(self._high, quotient)
+        return product
+
+
+def dense(
+    matvec: Matvec, size: int, *, dtype: torch.dtype, device: torch.device | str = "cpu"
+) -> Float[Tensor, "n n"]:
+    """The operator's matrix, one product a column: an oracle for small problems."""
+    matrix = torch.empty(size, size, dtype=dtype, device=device)
+    basis = torch.zeros(size, dtype=dtype, device=device)
+    for column in range(size):
+        basis[column] = 1.0
+        matrix[:, column] = matvec(basis)
+        basis[column] = 0.0
+    return matrix
