@@ -1,0 +1,58 @@
+"""Sessions that set up all they need: ``nox -s demo``, ``tests``, ``slow``, ``lint``, ``types``, ``bench``."""
+
+import nox
+
+nox.options.default_venv_backend = "uv"
+nox.options.reuse_existing_virtualenvs = True
+nox.options.sessions = ["lint", "types", "tests"]
+
+
+def _install(session: nox.Session, editable: bool = True) -> None:
+    """The locked environment, then the project itself without resolving again."""
+    session.install("-r", "requirements.lock")
+    session.install("--no-deps", *(["-e"] if editable else []), ".")
+    session.env["OMP_WAIT_POLICY"] = "PASSIVE"
+
+
+@nox.session
+def demo(session: nox.Session) -> None:
+    """Learn which poses to render for the embedded objects; minutes on two cores."""
+    _install(session)
+    session.run("python", "-m", "src.main", "+experiment=pose_gap", "scale=quick", *session.posargs)
+
+
+@nox.session
+def tests(session: nox.Session) -> None:
+    """The fast suite, one run through the command line included."""
+    _install(session)
+    session.run("python", "-m", "pytest", *session.posargs)
+
+
+@nox.session
+def slow(session: nox.Session) -> None:
+    """The tests that take minutes."""
+    _install(session)
+    session.run("python", "-m", "pytest", "-m", "slow", *session.posargs)
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Style and format; no part of the project is imported."""
+    session.install("-r", "requirements.lock")
+    session.run("ruff", "check", ".")
+    session.run("ruff", "format", "--check", ".")
+
+
+@nox.session
+def types(session: nox.Session) -> None:
+    """Static types."""
+    _install(session)
+    session.run("pyright")
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """The benchmarks: tables on the screen, JSON under outputs/benchmarks."""
+    _install(session)
+    for name in session.posargs or ["field", "render"]:
+        session.run("python", f"benchmarks/{name}.py")

@@ -1,0 +1,180 @@
+"""The command line. The only module that reads a DictConfig: it turns each group into the object it names.
+
+User errors become one line and exit status 2; inside a sweep a failed job raises, so that the others go on.
+Heavy imports happen inside functions, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import types
+import typing
+from collections.abc import Mapping
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+if TYPE_CHECKING:
+    from neural_sim.pipeline import Experiment
+
+_log = logging.getLogger(__name__)
+
+# Groups whose mapping names a class or function (``_target_``); the rest are plain settings.
+_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "damping")
+_SETTINGS = ("gradient", "outer", "training")
+
+
+class UserError(ValueError):
+    """Something in the configuration or the input that the user can mend."""
+
+
+def conf_directory() -> Path:
+    """The checkout's ``conf/`` where there is one, else the copy that travels in the wheel.
+
+    Raises:
+        FileNotFoundError: neither exists.
+    """
+    here = Path(__file__).resolve()
+    for candidate in (here.parents[2] / "conf", here.parent / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise FileNotFoundError(f"no conf/config.yaml beside {here.parents[2]} or in the installed package")
+
+
+def build(config: DictConfig) -> Experiment:
+    """Every part of an experiment from its group, validated before any stage runs.
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or out of range, with the key and what was got.
+    """
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise UserError(_first_line(error)) from error
+    if not isinstance(plain, dict):
+        raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
+    plain = {str(key): value for key, value in plain.items()}
+    _check_top(plain)
+    from neural_sim.pipeline import Experiment
+
+    parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
+    parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}
+    if set(parameters) != {"pose"}:
+        raise UserError(f"parameter: this version optimises [pose], got {sorted(parameters)}")
+    return Experiment(
+        name=plain["name"],
+        method=plain["baseline"]["name"],
+        optimise=plain["baseline"]["optimise"],
+        seed=plain["seed"],
+        stages=tuple(plain["stages"]),
+        store=Path(plain["paths"]["store"]),
+        mlflow=plain["paths"]["mlflow"],
+        progress=plain["progress"],
+        accelerator=plain["trainer"]["accelerator"],
+        pose=parameters["pose"],
+        config=plain,
+        **parts,
+    )
+
+
+def _check_top(plain: Mapping[str, Any]) -> None:
+    from neural_sim.pipeline import STAGES
+
+    if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:
+        raise UserError(f"seed must be a whole number from 0, got {plain['seed']!r}")
+    if not isinstance(plain["stages"], list) or not plain["stages"]:
+        raise UserError(f"stages must be a list of {', '.join(STAGES)}, got {plain['stages']!r}")
+    for stage in plain["stages"]:
+        if stage not in STAGES:
+            raise UserError(f"stages: unknown stage {stage!r}, want some of {', '.join(STAGES)}")
+    if not isinstance(plain["progress"], bool):
+        raise UserError(f"progress must be true or false, got {plain['progress']!r}")
+    if plain["trainer"]["accelerator"] not in ("cpu", "gpu"):
+        raise UserError(f"trainer.accelerator must be cpu or gpu, got {plain['trainer']['accelerator']!r}")
+
+
+def _instantiate(node: Any, where: str) -> Any:
+    if not isinstance(node, Mapping) or "_target_" not in node:
+        raise UserError(f"{where}: want a group with a _target_, got {node!r}")
+    _check_arguments(node, where)
+    try:
+        return hydra.utils.instantiate(dict(node), _convert_="all")
+    except Exception as error:  # Hydra wraps whatever the constructor raised
+        cause = error.__cause__ or error
+        if isinstance(cause, (ValueError, TypeError, FileNotFoundError, hydra.errors.InstantiationException)):
+            raise UserError(f"{where}: {_first_line(cause)}") from error
+        raise
+
+
+def _check_arguments(node: Mapping[str, Any], where: str) -> None:
+    """Keys and scalar types against the constructor's signature, since plain YAML takes anything."""
+    make = hydra.utils.get_object(node["_target_"])
+    known = signature(make).parameters
+    hints = typing.get_type_hints(make.__init__ if isinstance(make, type) else make)
+    for key, value in node.items():
+        if key.startswith("_"):
+            continue
+        if key not in known:
+            raise UserError(f"{where}.{key}: unknown key, want one of {', '.join(known)}")
+        if isinstance(value, Mapping) and "_target_" in value:
+            _check_arguments(value, f"{where}.{key}")
+        elif not _fits(value, hints.get(key, Any)):
+            raise UserError(f"{where}.{key}: want {_type_name(hints[key])}, got {value!r}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a YAML scalar fits a type hint. Hints that are not about scalars are left to the constructor."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return any(_fits(value, option) for option in typing.get_args(hint))
+    if typing.get_origin(hint) is typing.Literal:
+        return value in typing.get_args(hint)
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (str, bool):
+        return isinstance(value, hint)
+    if hint is type(None):
+        return value is None
+    return hint is Any or not isinstance(value, (str, int, float, bool, type(None)))
+
+
+def _type_name(hint: Any) -> str:
+    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")  # pyright: ignore
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return lines[0].strip() if lines else type(error).__name__
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_directory()), config_name="config")
+def _task(config: DictConfig) -> float | None:
+    runtime = HydraConfig.get()
+    try:
+        experiment = build(config)
+        from neural_sim.pipeline import run
+
+        return run(experiment, Path(runtime.runtime.output_dir))
+    except (ValueError, FileNotFoundError) as error:
+        if runtime.mode == RunMode.MULTIRUN:
+            raise
+        _log.debug("details", exc_info=True)
+        print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def main() -> None:
+    """Entry point of ``neural-sim`` and ``python -m src.main``."""
+    _task()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Steps of psi from a hypergradient in logits, each bounded so that one noisy gradient cannot collapse p."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class UpdateState:
+    """What an update carries between steps: first and second moments of the direction, and the step count."""
+
+    first: Float[Tensor, "objects k"]
+    second: Float[Tensor, "objects k"]
+    steps: int = 0
+
+
+def _check(learning_rate: float, max_step: float, **rates: float) -> None:
+    if not learning_rate > 0.0:
+        raise ValueError(f"outer.update.learning_rate must be positive, got {learning_rate}")
+    if not max_step > 0.0:
+        raise ValueError(f"outer.update.max_step must be positive, got {max_step}")
+    for name, rate in rates.items():
+        if not 0.0 <= rate < 1.0:
+            raise ValueError(f"outer.update.{name} must lie in [0, 1), got {rate}")
+
+
+def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:
+    """The centred step, scaled down per object where its largest change of a logit exceeds ``largest``."""
+    centred = step - step.mean(-1, keepdim=True)
+    size = centred.abs().amax(-1, keepdim=True)
+    return centred * (largest / size.clamp_min(largest))
+
+
+@dataclass(frozen=True)
+class SGD:
+    """Gradient descent with momentum on the logits (the paper: rate 1e-5 on its own loss scale, momentum 0.9)."""
+
+    learning_rate: float = 1e-5
+    momentum: float = 0.9
+    max_step: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check(self.learning_rate, self.max_step, momentum=self.momentum)
+
+    def start(self, psi: Tensor) -> UpdateState:
+        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
+
+    def step(
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+    ) -> tuple[Tensor, UpdateState]:
+        """psi after one step, and the state to pass to the next."""
+        velocity = self.momentum * state.first + gradient
+        moved = psi + bound(-self.learning_rate * velocity, self.max_step)
+        return moved, UpdateState(velocity, state.second, state.steps + 1)
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam (Kingma and Ba 2015) on the logits."""
+
+    learning_rate: float = 0.3
+    betas: tuple[float, float] = (0.8, 0.95)
+    epsilon: float = 1e-12
+    max_step: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check(self.learning_rate, self.max_step, beta1=self.betas[0], beta2=self.betas[1])
+
+    def start(self, psi: Tensor) -> UpdateState:
+        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
+
+    def step(
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+    ) -> tuple[Tensor, UpdateState]:
+        """psi after one step, and the state to pass to the next."""
+        beta1, beta2 = self.betas
+        steps = state.steps + 1
+        first = beta1 * state.first + (1 - beta1) * gradient
+        second = beta2 * state.second + (1 - beta2) * gradient.square()
+        unbiased = first / (1 - beta1**steps)
+        scale = (second / (1 - beta2**steps)).sqrt() + self.epsilon
+        return psi + bound(-self.learning_rate * unbiased / scale, self.max_step), UpdateState(
+            first, second, steps
+        )
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
+
+    The step in the logits is the gradient with respect to p, which is the one in the logits over p (centred):
+    a bin that p has left gets as long a step as one it favours. Momentum averages the direction; its scale is taken out
+    by a running root mean square over all objects and bins, so that ``learning_rate`` is in logits per
+    step whatever the units of the loss.
+    """
+
+    learning_rate: float = 0.4
+    momentum: float = 0.6
+    max_step: float = 0.8
+    scale_memory: float = field(default=0.9)
+
+    def __post_init__(self) -> None:
+        _check(self.learning_rate, self.max_step, momentum=self.momentum, scale_memory=self.scale_memory)
+
+    def start(self, psi: Tensor) -> UpdateState:
+        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
+
+    def step(
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+    ) -> tuple[Tensor, UpdateState]:
+        """psi after one step, and the state to pass to the next."""
+        steps = state.steps + 1
+        direction = gradient / log_p.exp()
+        direction = direction - direction.mean(-1, keepdim=True)
+        memory = self.scale_memory
+        second = memory * state.second + (1 - memory) * direction.square().mean().expand_as(psi)
+        scale = (second / (1 - memory**steps)).sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
+        velocity = self.momentum * state.first + (1 - self.momentum) * direction
+        unbiased = velocity / (1 - self.momentum**steps)
+        moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
+        return moved, UpdateState(velocity, second, steps)
+
+
+Update = SGD | Adam | Mirror

@@ -1,0 +1,144 @@
+"""The figures a run leaves, as matplotlib figures that the caller saves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from neural_sim.types import LabelledImages
+
+matplotlib.use("Agg")
+
+INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
+METHOD_COLOURS = {"ns": "#c2c8cf", "learned": "#2f6db5", "matched": "#4c9f70"}
+CLASS_COLOURS = ("#2f6db5", "#e08a1e", "#4c9f70", "#b5417a", "#7b5cc4", "#b08d3c", "#3aa6b9", "#8c564b")
+
+
+def _style(axes: Any) -> None:
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelsize=8)
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a PNG and return its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150, facecolor="white")
+    return path
+
+
+def psi_figure(
+    history: Mapping[str, Sequence[Sequence[float]]], target: Mapping[str, Sequence[float]], title: str
+) -> Figure:
+    """p over the bins at every iteration, stacked, with the target distribution as a bar beside it.
+
+    ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them.
+    """
+    names = list(history)
+    columns = min(3, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
+    bins = len(next(iter(target.values())))
+    colours = matplotlib.colormaps["twilight_shifted"](np.linspace(0.08, 0.92, bins))
+    figure.suptitle(title, color=INK, fontsize=11)
+    for place, name in enumerate(names, 1):
+        axes = figure.add_subplot(rows, columns, place)
+        p = np.asarray(history[name])
+        steps = np.arange(len(p))
+        width = max(1.0, 0.12 * len(p))
+        axes.stackplot(steps, p.T, colors=colours, linewidth=0)
+        bottom = 0.0
+        for b, share in enumerate(target[name]):
+            axes.bar(len(p) - 1 + 1.1 * width, share, width, bottom=bottom, color=colours[b], linewidth=0)
+            if share > 0.25:
+                axes.text(len(p) - 1 + 1.1 * width, bottom + share / 2, str(b + 1), ha="center", va="center",
+                          color="white", fontsize=8)  # fmt: skip
+            bottom += share
+        axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=name)
+        axes.title.set_fontsize(9)
+        ticks = np.unique(np.linspace(0, len(p) - 1, min(6, len(p))).astype(int))
+        axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
+        _style(axes)
+    handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
+    figure.legend(
+        handles, [str(b + 1) for b in range(bins)], loc="outside lower center", ncols=min(bins, 16),
+        title="pose bin (x: outer iteration, y: probability)", fontsize=8, title_fontsize=8, frameon=False,
+    )  # fmt: skip
+    return figure
+
+
+def ap_figure(ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str]) -> Figure:
+    """AP of every class for each training distribution; biased classes stand first, in bold."""
+    order = [n for n in class_names if n in emphasised] + [n for n in class_names if n not in emphasised]
+    labels = [*order, "mean"]
+    figure = Figure(figsize=(1.1 * len(labels) + 1.6, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    width = 0.8 / max(1, len(ap))
+    for i, (method, scores) in enumerate(ap.items()):
+        values = [100 * scores["per_class"].get(n, float("nan")) for n in order] + [100 * scores["ap"]]
+        x = np.arange(len(labels)) + (i - (len(ap) - 1) / 2) * width
+        axes.bar(x, values, 0.92 * width, color=METHOD_COLOURS.get(method, MUTED), label=method)
+        for at, value in zip(x, values, strict=True):
+            if np.isfinite(value):
+                axes.text(at, value + 1, f"{value:.0f}", ha="center", fontsize=7, color=INK)
+    axes.set_xticks(range(len(labels)), labels)
+    for tick, name in zip(axes.get_xticklabels(), labels, strict=True):
+        tick.set_fontweight("bold" if name in emphasised else "normal")
+    axes.set(ylabel="AP on the test set (%)", ylim=(0, 105))
+    axes.yaxis.grid(color=GRID)
+    axes.set_axisbelow(True)
+    _style(axes)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="trained on")
+    return figure
+
+
+def image_grid(
+    images: LabelledImages,
+    class_names: Sequence[str],
+    columns: int = 8,
+    predictions: Sequence[Mapping[str, torch.Tensor]] | None = None,
+    title: str = "",
+) -> Figure:
+    """Images with their boxes (solid), or with predictions drawn solid over dashed true boxes."""
+    count = len(images)
+    rows = max(1, -(-count // columns))
+    figure = Figure(figsize=(1.35 * columns, 1.5 * rows + 0.7), layout="constrained")
+    figure.suptitle(title, color=INK, fontsize=11)
+    for i in range(count):
+        axes = figure.add_subplot(rows, columns, i + 1)
+        axes.imshow(images.images[i].permute(1, 2, 0).clamp(0, 1).cpu().numpy())
+        axes.set_axis_off()
+        caption = []
+        for box, label in zip(images.boxes[i].tolist(), images.labels[i].tolist(), strict=True):
+            if label >= 0:
+                _box(axes, box, label, dashed=predictions is not None)
+                caption.append(class_names[label])
+        if predictions is not None:
+            caption = [_best_prediction(axes, predictions[i], class_names)]
+        axes.set_title(", ".join(caption) or "no box", fontsize=6.5, color=MUTED, pad=2)
+    return figure
+
+
+def _best_prediction(axes: Any, prediction: Mapping[str, torch.Tensor], class_names: Sequence[str]) -> str:
+    if not len(prediction["scores"]):
+        return "nothing found"
+    best = int(prediction["scores"].argmax())
+    label = int(prediction["labels"][best])
+    _box(axes, prediction["boxes"][best].tolist(), label, dashed=False)
+    return f"{class_names[label]} {float(prediction['scores'][best]):.2f}"
+
+
+def _box(axes: Any, box: Sequence[float], label: int, dashed: bool) -> None:
+    x0, y0, x1, y1 = box
+    colour = "white" if dashed else CLASS_COLOURS[label % len(CLASS_COLOURS)]
+    axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor=colour,
+                             linewidth=0.9 if dashed else 1.4, linestyle="--" if dashed else "-"))  # fmt: skip

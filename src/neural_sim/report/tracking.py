@@ -1,0 +1,113 @@
+"""A run in MLflow: one per method and seed, its stages as metric prefixes, figures and files as artifacts."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+_log = logging.getLogger(__name__)
+
+
+def tracking_uri(location: str) -> str:
+    """The URI of a tracking store: a URI as it is, a path as a SQLite file with an absolute path.
+
+    Raises:
+        ValueError: an empty location.
+    """
+    if not location:
+        raise ValueError("paths.mlflow is empty: want a file such as outputs/mlflow.db or a tracking URI")
+    if "://" in location or location == "databricks":
+        return location
+    return f"sqlite:///{Path(location).resolve()}"
+
+
+def log_run(
+    uri: str,
+    experiment: str,
+    name: str,
+    tags: Mapping[str, str],
+    parameters: Mapping[str, Any],
+    metrics: Mapping[str, float],
+    series: Mapping[str, Sequence[float]],
+    artifacts: Path,
+) -> str:
+    """Write one finished run and return its id.
+
+    ``series`` holds a value a step (``psi/pitcher/bin_3``), ``metrics`` final numbers (``evaluate/learned/ap``).
+    Non-finite values are left out, since MLflow's charts break on them. A new SQLite store is created once, under a
+    lock, so that sweep workers that start together do not race for its tables.
+    """
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from mlflow import MlflowClient
+        from mlflow.entities import Metric, Param, RunTag
+
+        for noisy in ("mlflow", "alembic", "sqlalchemy"):
+            logging.getLogger(noisy).setLevel(logging.WARNING)
+        client = _client(MlflowClient, uri)
+        experiment_id = _experiment_id(client, uri, experiment)
+        run = client.create_run(experiment_id, run_name=name, tags=dict(tags))
+        run_id = run.info.run_id
+        now = run.info.start_time
+        rows = [Metric(k, float(v), now, 0) for k, v in metrics.items() if math.isfinite(v)]
+        for key, values in series.items():
+            rows += [Metric(key, float(v), now, step) for step, v in enumerate(values) if math.isfinite(v)]
+        pairs = [Param(k, str(v)[:6000]) for k, v in parameters.items()]
+        for start in range(0, max(len(rows), len(pairs), 1), 100):
+            window = slice(start, start + 100)
+            client.log_batch(
+                run_id, metrics=rows[window], params=pairs[window], tags=[RunTag("source", "neural-sim")]
+            )
+        client.log_artifacts(run_id, str(artifacts))
+        client.set_terminated(run_id)
+    return run_id
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as dotted keys, as MLflow's parameters are filtered by."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{name}."))
+        else:
+            flat[name] = value
+    return flat
+
+
+def _client(make: Any, uri: str) -> Any:
+    if not uri.startswith("sqlite:///"):
+        return make(tracking_uri=uri)
+    import fcntl
+
+    database = Path(uri.removeprefix("sqlite:///"))
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{database}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        client = make(tracking_uri=uri)
+        client.search_experiments(max_results=1)
+    return client
+
+
+def _experiment_id(client: Any, uri: str, name: str) -> str:
+    from mlflow.exceptions import MlflowException
+
+    found = client.get_experiment_by_name(name)
+    if found is None:
+        location = None
+        if uri.startswith("sqlite:///"):
+            location = (Path(uri.removeprefix("sqlite:///")).parent / "mlartifacts" / name).as_uri()
+        try:
+            return client.create_experiment(name, artifact_location=location)
+        except MlflowException as error:  # another worker was first
+            _log.info("mlflow: %s", error)
+            found = client.get_experiment_by_name(name)
+            if found is None:
+                raise
+    return found.experiment_id

@@ -1,0 +1,88 @@
+"""Steps of psi: closed forms, bounds, and descent on a known function."""
+
+import pytest
+import torch
+
+from neural_sim.parameter.update import SGD, Adam, Mirror, bound
+
+
+def test_bound_keeps_direction_and_limits_size():
+    step = torch.tensor([[3.0, -1.0, -2.0], [0.1, 0.0, -0.1]], dtype=torch.float64)
+    limited = bound(step, 0.5)
+    assert limited[0].abs().max().item() == pytest.approx(0.5)
+    torch.testing.assert_close(limited[0] / limited[0, 0], step[0] / step[0, 0])
+    torch.testing.assert_close(limited[1], step[1])
+
+
+def test_sgd_matches_torch():
+    psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
+    reference = torch.nn.Parameter(psi.clone())
+    optimiser = torch.optim.SGD([reference], lr=0.01, momentum=0.9)
+    update = SGD(learning_rate=0.01, momentum=0.9, max_step=10.0)
+    state = update.start(psi)
+    for gradient in torch.tensor(
+        [[[1.0, -0.5, -0.5]], [[0.2, 0.3, -0.5]], [[0.0, 1.0, -1.0]]], dtype=torch.float64
+    ):
+        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, state)
+        reference.grad = gradient.clone()
+        optimiser.step()
+    torch.testing.assert_close(psi, reference.detach())
+
+
+def test_adam_matches_torch_up_to_centring():
+    psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
+    reference = torch.nn.Parameter(psi.clone())
+    optimiser = torch.optim.Adam([reference], lr=0.01, betas=(0.8, 0.95), eps=1e-12)
+    update = Adam(learning_rate=0.01, max_step=10.0)
+    state = update.start(psi)
+    for gradient in torch.tensor([[[1.0, -0.5, -0.5]], [[0.2, 0.3, -0.5]]], dtype=torch.float64):
+        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, state)
+        reference.grad = gradient.clone()
+        optimiser.step()
+    expected = reference.detach() - reference.detach().mean()
+    torch.testing.assert_close(psi - psi.mean(), expected)
+
+
+def test_mirror_step_is_exponentiated_gradient():
+    """Without momentum, p_new is proportional to p exp(-eta dL/dp)."""
+    log_p = torch.log_softmax(torch.tensor([[0.5, -1.0, 0.2]], dtype=torch.float64), -1)
+    slope = torch.tensor([[0.3, -0.2, 0.9]], dtype=torch.float64)
+    p = log_p.exp()
+    gradient = p * (slope - (p * slope).sum())
+    update = Mirror(learning_rate=0.05, momentum=0.0, max_step=10.0)
+    moved, _ = update.step(log_p, log_p, gradient, update.start(log_p))
+    centred = slope - slope.mean()
+    eta = 0.05 / centred.square().mean().sqrt()
+    expected = torch.softmax(log_p - eta * slope, -1)
+    torch.testing.assert_close(torch.softmax(moved, -1), expected)
+
+
+@pytest.mark.parametrize("update", [SGD(learning_rate=2.0), Adam(), Mirror()])
+def test_each_finds_the_best_bin(update):
+    cost = torch.tensor([[0.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 1.0]], dtype=torch.float64)
+    psi = torch.log(torch.tensor([[0.02, 0.94, 0.02, 0.02]], dtype=torch.float64)).repeat(2, 1)
+    state = update.start(psi)
+    for _ in range(40):
+        log_p = torch.log_softmax(psi, -1)
+        gradient = log_p.exp() * (cost - (log_p.exp() * cost).sum(-1, keepdim=True))
+        psi, state = update.step(psi, log_p, gradient, state)
+    assert psi.argmax(-1).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize(
+    "update", [SGD(learning_rate=1e3), Adam(learning_rate=1e3), Mirror(learning_rate=1e3)]
+)
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e30])
+def test_steps_are_finite_and_bounded_whatever_the_scale(update, scale):
+    psi = torch.zeros(1, 4, dtype=torch.float64)
+    gradient = scale * torch.tensor([[1.0, -2.0, 0.5, 0.5]], dtype=torch.float64)
+    moved, _ = update.step(psi, torch.log_softmax(psi, -1), gradient, update.start(psi))
+    assert torch.isfinite(moved).all()
+    assert moved.abs().max() <= update.max_step * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0), lambda: Adam(betas=(1.0, 0.9)),
+                                  lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0)])  # fmt: skip
+def test_bad_settings_are_refused(make):
+    with pytest.raises(ValueError, match=r"outer\.update"):
+        make()

@@ -1,0 +1,73 @@
+"""Orbit poses and rays against hand-made geometry and central differences."""
+
+import math
+
+import pytest
+import torch
+
+from neural_sim import cameras
+from neural_sim.types import PinholeCamera
+
+
+def _pose(phi, rho=0.0, distance=3.0):
+    return cameras.orbit(*(torch.tensor(x, dtype=torch.float64) for x in (phi, rho, distance)))
+
+
+@pytest.mark.parametrize("phi", [0.0, math.pi / 2, math.pi, 3 * math.pi / 2, 1.234])
+@pytest.mark.parametrize("rho", [0.0, 0.7, -0.7])
+def test_orbit_is_a_rotation_that_looks_at_the_origin(phi, rho):
+    pose = _pose(phi, rho)
+    rotation, position = pose[:3, :3], pose[:3, 3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
+    assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
+    assert position.norm().item() == pytest.approx(3.0)
+    torch.testing.assert_close(-rotation[:, 2], -position / 3.0)
+
+
+def test_quarters_of_the_circle():
+    assert _pose(0.0)[:3, 3].tolist() == pytest.approx([0, 0, 3])
+    assert _pose(math.pi / 2)[:3, 3].tolist() == pytest.approx([3, 0, 0], abs=1e-12)
+    assert _pose(math.pi)[:3, 3].tolist() == pytest.approx([0, 0, -3], abs=1e-12)
+    assert _pose(3 * math.pi / 2)[:3, 3].tolist() == pytest.approx([-3, 0, 0], abs=1e-12)
+
+
+def test_the_up_vector_is_carried_through_the_pole():
+    before, after = _pose(-1e-6)[:3, 1], _pose(1e-6)[:3, 1]
+    assert (before @ after).item() == pytest.approx(1.0, abs=1e-10)
+
+
+def test_orbit_derivative_against_central_differences():
+    at = torch.tensor([0.8, 0.3, 2.7], dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(lambda v: cameras.orbit(v[0], v[1], v[2]), at)
+    for i in range(3):
+        e = torch.zeros(3, dtype=torch.float64)
+        e[i] = 1e-6
+        slope = (cameras.orbit(*(at + e)) - cameras.orbit(*(at - e))) / 2e-6
+        torch.testing.assert_close(jacobian[..., i], slope, atol=1e-8, rtol=1e-7)
+
+
+def test_corner_ray_has_half_the_field_of_view():
+    camera = PinholeCamera(64, 64, math.radians(40.0))
+    bundle = cameras.rays(camera, _pose(math.pi / 2))
+    assert bundle.directions.shape == (64, 64, 3)
+    middle_top = bundle.directions[0, 31:33].mean(0)
+    angle = math.atan2(middle_top[2], -middle_top[0])
+    focal = cameras.focal_length(camera)
+    assert angle == pytest.approx(math.atan(31.5 / focal), abs=1e-9)
+    assert math.atan(32 / focal) == pytest.approx(math.radians(20.0))
+
+
+def test_sphere_span_hits_misses_and_starts_inside():
+    camera = PinholeCamera(33, 33, math.radians(60.0))
+    bundle = cameras.rays(camera, _pose(0.3))
+    near, far = cameras.unit_sphere_span(bundle)
+    assert near[16, 16].item() == pytest.approx(2.0) and far[16, 16].item() == pytest.approx(4.0)
+    assert near[0, 0] >= far[0, 0]
+    near, far = cameras.unit_sphere_span(cameras.rays(camera, _pose(0.3, distance=0.5)))
+    assert (near == 0).all() and (far > 0.4).all()
+
+
+@pytest.mark.parametrize("bad", [(0, 8, 0.5), (8, 0, 0.5), (8, 8, 0.0), (8, 8, 3.2)])
+def test_impossible_cameras_are_refused(bad):
+    with pytest.raises(ValueError, match="camera"):
+        PinholeCamera(*bad)
