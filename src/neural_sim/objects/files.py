@@ -1,0 +1,67 @@
+"""Reading one mesh file, and hashing files without parsing them; shared by the loaders."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import trimesh
+
+from neural_sim.objects.mesh import ObjectMesh, normalise
+from neural_sim.objects.repair import repair
+
+
+def file_digest(*paths: Path) -> str:
+    """SHA-256 over the files' bytes, in the order given; files that do not exist are skipped."""
+    state = hashlib.sha256()
+    for path in paths:
+        if path.is_file():
+            state.update(path.read_bytes())
+    return state.hexdigest()
+
+
+def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
+    """Read, repair and normalise a mesh file; several parts in it are joined.
+
+    ``transform`` leads back to the file's frame in metres. Raises ``ValueError`` with the file and the reason where
+    it cannot be read or holds nothing to draw.
+    """
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        NotImplementedError,
+        AttributeError,
+    ) as error:
+        raise ValueError(f"{path}: object {name!r} cannot be read as a mesh: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise ValueError(f"{path}: object {name!r} holds a {type(mesh).__name__}, want a triangle mesh")
+    mesh = repair(mesh, name, str(path))
+    if metres_per_unit != 1.0:
+        mesh.apply_scale(metres_per_unit)
+    return normalise(mesh, name, str(path), digest)
+
+
+def choose(
+    available: dict[str, Path], names: list[str] | None, aliases: dict[str, str], where: str
+) -> list[str]:
+    """The wanted names in the wanted order (all, sorted, for None), through aliases; ``ValueError`` for others."""
+    if names is None:
+        return sorted(available)
+    chosen = []
+    for name in names:
+        key = name if name in available else aliases.get(name)
+        if key is None:
+            raise ValueError(
+                f"objects.names: {name!r} is not in {where}; there are {', '.join(sorted(available))}"
+            )
+        if key in chosen:
+            raise ValueError(f"objects.names: {name!r} names the object {key!r} twice")
+        chosen.append(key)
+    if not chosen:
+        raise ValueError(f"objects.names: want at least one of {', '.join(sorted(available))}, got none")
+    return chosen

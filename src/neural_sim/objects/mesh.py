@@ -1,0 +1,67 @@
+"""One object ready for rendering: normalised to the unit sphere, with the way back to its source."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+DEGENERATE_EXTENT = 1e-9
+
+
+@dataclass(frozen=True)
+class ObjectMesh:
+    """A mesh whose bounding box is centred on the origin and whose farthest vertex has norm 1; +z up.
+
+    ``transform`` maps normalised coordinates to the source's frame, in metres. ``digest`` is the SHA-256 of what
+    the object was made from and keys stored results.
+    """
+
+    name: str
+    mesh: trimesh.Trimesh
+    transform: Float[np.ndarray, "4 4"]
+    digest: str
+
+
+def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
+    """Centre the bounding box and scale to the unit sphere. ``mesh`` in metres; it is copied, not changed.
+
+    ``source`` (a file or other origin) is for messages. Without ``digest`` the geometry's own bytes are hashed.
+    Raises ``ValueError`` where the extent is zero or not finite.
+    """
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if len(vertices) == 0 or not np.isfinite(vertices).all():
+        raise ValueError(
+            f"{source}: want finite vertices, got {len(vertices)} with some not finite or none at all"
+        )
+    centre = 0.5 * (vertices.min(0) + vertices.max(0))
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
+    if radius < DEGENERATE_EXTENT:
+        raise ValueError(f"{source}: want a mesh with extent, got one of radius {radius:g}")
+    scaled = mesh.copy()
+    normals = np.array(mesh.vertex_normals)  # similarity keeps normals; trimesh would drop those a file gave
+    scaled.vertices = (vertices - centre) / radius
+    scaled.vertex_normals = normals
+    transform = np.eye(4)
+    transform[:3, :3] *= radius
+    transform[:3, 3] = centre
+    return ObjectMesh(name, scaled, transform, digest or content_digest(mesh))
+
+
+def content_digest(mesh: trimesh.Trimesh) -> str:
+    """SHA-256 of vertices, faces and colours or texture; equal for equal meshes on every machine."""
+    state = hashlib.sha256()
+    state.update(np.ascontiguousarray(np.round(mesh.vertices, 9), dtype="<f8").tobytes())
+    state.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
+    visual = mesh.visual
+    image = getattr(getattr(visual, "material", None), "image", None)
+    if visual.kind == "texture" and image is not None:
+        state.update(np.ascontiguousarray(visual.uv, dtype="<f8").tobytes())
+        state.update(np.asarray(image.convert("RGB")).tobytes())
+    elif visual.kind in ("vertex", "face"):
+        colours = visual.vertex_colors if visual.kind == "vertex" else visual.face_colors
+        state.update(np.ascontiguousarray(colours).tobytes())
+    return state.hexdigest()

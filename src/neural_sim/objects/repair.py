@@ -1,0 +1,92 @@
+"""Mending what meshes from elsewhere bring along, and refusing what cannot be mended."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import trimesh
+
+log = logging.getLogger(__name__)
+
+GREY = (160, 160, 160, 255)
+HUGE_FACES = 500_000
+
+
+def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
+    """A copy fit for rendering: finite normals, no degenerate faces, some colour. Every mend is a logged warning.
+
+    Normals that are not finite are recomputed from the faces; a mesh without colours, or whose texture is missing,
+    becomes grey; one of more than ``HUGE_FACES`` faces is only warned about. Raises ``ValueError`` naming ``source``
+    where no face or no finite vertex is left.
+    """
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
+        raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
+    mesh = _without_bad_faces(mesh, name, source)
+    if len(mesh.faces) > HUGE_FACES:
+        log.warning(
+            "%s: object %r has %d faces; more than %d draw slowly, decimate it if views take long",
+            source, name, len(mesh.faces), HUGE_FACES,
+        )  # fmt: skip
+    mesh = _with_finite_normals(mesh, name, source)
+    return _with_colour(mesh, name, source)
+
+
+def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
+    mesh = mesh.copy()
+    finite = np.isfinite(mesh.vertices).all(1)
+    good = finite[mesh.faces].all(1)
+    if good.any():
+        corners = np.asarray(mesh.vertices)[mesh.faces]
+        doubled = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        good &= np.nan_to_num(doubled) > 0.0
+    if not good.any():
+        raise ValueError(f"{source}: object {name!r} has no face of positive area with finite vertices")
+    if not good.all():
+        log.warning(
+            "%s: object %r: dropped %d of %d faces (no area or not finite)",
+            source, name, int((~good).sum()), len(good),
+        )  # fmt: skip
+        mesh.update_faces(good)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
+    normals = np.asarray(mesh.vertex_normals)
+    bad = ~np.isfinite(normals).all(1) | (np.linalg.norm(normals, axis=1) < 0.5)
+    if not bad.any():
+        return mesh
+    log.warning(
+        "%s: object %r: %d of %d normals were not finite, recomputed", source, name, bad.sum(), len(bad)
+    )
+    # A mesh built anew has no normals from the file, so trimesh computes them from the faces.
+    rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=mesh.visual.copy(), process=False)
+    fresh = np.array(rebuilt.vertex_normals)
+    lost = ~np.isfinite(fresh).all(1) | (np.linalg.norm(fresh, axis=1) < 0.5)
+    fresh[lost] = (0.0, 0.0, 1.0)
+    rebuilt.vertex_normals = fresh
+    return rebuilt
+
+
+def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
+    visual = mesh.visual
+    if visual.kind == "texture":
+        material = visual.material
+        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
+            uv = np.asarray(visual.uv)
+            if not np.isfinite(uv).all():
+                log.warning("%s: object %r: texture coordinates that are not finite set to 0", source, name)
+                visual.uv = np.nan_to_num(uv, nan=0.0, posinf=0.0, neginf=0.0)
+            return mesh
+        log.warning("%s: object %r: its texture is missing, painted grey", source, name)
+    elif visual.kind in ("vertex", "face"):
+        return mesh
+    else:
+        log.warning("%s: object %r has no colours, painted grey", source, name)
+    colours = np.tile(np.array(GREY, dtype=np.uint8), (len(mesh.vertices), 1))
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
+    return mesh

@@ -1,0 +1,114 @@
+"""Meshes through OpenGL: pyrender offscreen. Importing this module imports pyrender; choose through ``views``."""
+
+from __future__ import annotations
+
+import atexit
+import weakref
+
+import numpy as np
+import pyrender
+import torch
+import trimesh
+from jaxtyping import Float
+from pyrender.constants import GLTF
+from torch import Tensor
+
+from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.surface import Surface, shaded_surface
+from neural_sim.renderer.supersampling import straight_alpha
+from neural_sim.types import PinholeCamera
+
+# Closer than this to the camera nothing is drawn; objects have radius 1 and cameras keep outside of them.
+NEAR, FAR = 0.01, 100.0
+
+
+class PyrenderRenderer:
+    """Renders with pyrender's unlit pass over a surface whose light is baked into its vertices.
+
+    pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each
+    pixel averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views; ``close``
+    frees it (so does the interpreter's exit). Needs PYOPENGL_PLATFORM set before this module is imported.
+    """
+
+    name = "pyrender"
+
+    def __init__(self, supersample: int = 2, lighting: Lighting | None = None) -> None:
+        if supersample < 1:
+            raise ValueError(f"renderer.supersample: want at least 1, got {supersample}")
+        self.supersample = supersample
+        self.lighting = Lighting() if lighting is None else lighting
+        self._context: pyrender.OffscreenRenderer | None = None
+        _open_renderers.add(self)
+
+    def render(
+        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+    ) -> Float[Tensor, "n h w 4"]:
+        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is."""
+        scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
+        scene.add(_primitives(shaded_surface(mesh, self.lighting)))
+        lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)
+        eye = scene.add(lens, pose=np.eye(4))
+        flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
+        context = self._sized_context(camera)
+        images = []
+        for pose in camera_to_world.detach().cpu().double().numpy():
+            scene.set_pose(eye, pose)
+            premultiplied, _ = context.render(scene, flags=flags)
+            images.append(
+                straight_alpha(torch.from_numpy(premultiplied / np.float32(255.0)), self.supersample)
+            )
+        if not images:
+            return torch.zeros(0, camera.height, camera.width, 4)
+        return torch.stack(images)
+
+    def close(self) -> None:
+        """Free the OpenGL context; a later ``render`` makes a new one."""
+        if self._context is not None:
+            self._context.delete()
+            self._context = None
+
+    def _sized_context(self, camera: PinholeCamera) -> pyrender.OffscreenRenderer:
+        width, height = camera.width * self.supersample, camera.height * self.supersample
+        if self._context is None:
+            self._context = pyrender.OffscreenRenderer(width, height)
+        self._context.viewport_width, self._context.viewport_height = width, height
+        return self._context
+
+
+def _primitives(surface: Surface) -> pyrender.Mesh:
+    """Front faces, and the same faces turned round with the light of their inner side.
+
+    Each is culled where it faces away, so exactly one of the two is seen and they never fight for depth.
+    """
+    texture = None
+    if surface.texture is not None:
+        texture = pyrender.Texture(source=surface.texture, source_channels="RGB")
+    material = pyrender.MetallicRoughnessMaterial(
+        baseColorFactor=(1.0, 1.0, 1.0, 1.0), baseColorTexture=texture, alphaMode="OPAQUE", doubleSided=False
+    )
+    sides = []
+    for shade, faces in ((surface.front, surface.faces), (surface.back, surface.faces[:, ::-1])):
+        colour = np.ones((len(shade), 4), dtype=np.float32)
+        colour[:, :3] = surface.albedo * shade[:, None]
+        uv = None if surface.uv is None else surface.uv.astype(np.float32)
+        sides.append(
+            pyrender.Primitive(
+                positions=surface.vertices.astype(np.float32),
+                texcoord_0=uv,
+                color_0=colour,
+                indices=np.ascontiguousarray(faces, dtype=np.uint32),
+                material=material,
+                mode=GLTF.TRIANGLES,
+            )
+        )
+    return pyrender.Mesh(primitives=sides)
+
+
+_open_renderers: weakref.WeakSet[PyrenderRenderer] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    # PyOpenGL's modules are gone by the time the garbage collector would get here.
+    for renderer in list(_open_renderers):
+        renderer.close()

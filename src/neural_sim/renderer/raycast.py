@@ -1,0 +1,110 @@
+"""Meshes by ray casting on the CPU (trimesh over embree), for machines without OpenGL."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.cameras import rays
+from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.supersampling import straight_alpha
+from neural_sim.renderer.surface import Surface, shaded_surface
+from neural_sim.renderer.texture_sampling import Pyramid
+from neural_sim.types import PinholeCamera
+
+
+class RaycastRenderer:
+    """The same image as ``PyrenderRenderer`` without OpenGL: one ray a sample, textures filtered by footprint."""
+
+    name = "raycast"
+
+    def __init__(self, supersample: int = 2, lighting: Lighting | None = None) -> None:
+        if supersample < 1:
+            raise ValueError(f"renderer.supersample: want at least 1, got {supersample}")
+        self.supersample = supersample
+        self.lighting = Lighting() if lighting is None else lighting
+
+    def render(
+        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+    ) -> Float[Tensor, "n h w 4"]:
+        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is."""
+        surface = shaded_surface(mesh, self.lighting)
+        bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        pyramid = None if surface.texture is None else Pyramid(surface.texture)
+        fine = PinholeCamera(
+            camera.width * self.supersample, camera.height * self.supersample, camera.field_of_view
+        )
+        images = []
+        for pose in camera_to_world.detach().cpu().double():
+            premultiplied = _cast(bare, surface, pyramid, fine, pose)
+            images.append(straight_alpha(premultiplied, self.supersample))
+        if not images:
+            return torch.zeros(0, camera.height, camera.width, 4)
+        return torch.stack(images)
+
+    def close(self) -> None:
+        """Nothing to free; here so that both mesh renderers are used alike."""
+
+
+def _cast(
+    mesh: trimesh.Trimesh, surface: Surface, pyramid: Pyramid | None, camera: PinholeCamera, pose: Tensor
+) -> Float[Tensor, "h w 4"]:
+    bundle = rays(camera, pose)
+    origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
+    face = mesh.ray.intersects_first(origins, directions)
+    hit = np.flatnonzero(face >= 0)
+    image = np.zeros((len(face), 4), dtype=np.float32)
+    if len(hit):
+        colour = _colours(surface, pyramid, face[hit], origins[hit], directions[hit], camera)
+        image[hit, :3], image[hit, 3] = colour, 1.0
+    return torch.from_numpy(image).reshape(camera.height, camera.width, 4)
+
+
+def _colours(
+    surface: Surface,
+    pyramid: Pyramid | None,
+    face: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    camera: PinholeCamera,
+) -> Float[np.ndarray, "hits 3"]:
+    corners = surface.faces[face]
+    weights, distance, cosine, area = _barycentric(surface.vertices[corners], origins, directions)
+    sides = np.where((cosine < 0.0)[:, None], surface.front[corners], surface.back[corners])
+    # As in OpenGL, albedo times shade is interpolated and clipped.
+    vertex_colour = surface.albedo[corners] * sides[..., None]
+    colour = np.einsum("nk,nkc->nc", weights, np.minimum(vertex_colour, np.inf))
+    if pyramid is not None and surface.uv is not None:
+        uv = surface.uv[corners]
+        first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        uv_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+        texels = uv_area * pyramid.texels / np.maximum(area, 1e-12)
+        sample = 2.0 * math.tan(0.5 * camera.field_of_view) / camera.height * distance
+        # OpenGL's isotropic filter takes the longer side of the footprint, which a slanted face stretches.
+        texels_a_side = np.sqrt(texels) * sample / np.maximum(np.abs(cosine), 0.05)
+        colour = colour * pyramid.sample(np.einsum("nk,nkc->nc", weights, uv), np.log2(texels_a_side + 1e-12))
+    return np.clip(colour, 0.0, 1.0)
+
+
+def _barycentric(
+    triangles: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Weights [n, 3] of each ray's hit on its triangle, distance, cosine (ray . outward normal) and area [n]."""
+    edge_1, edge_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal = np.cross(edge_1, edge_2)
+    length = np.maximum(np.linalg.norm(normal, axis=-1), 1e-20)
+    facing = np.einsum("nc,nc->n", normal, directions)
+    facing = np.where(np.abs(facing) < 1e-20, 1e-20, facing)
+    offset = triangles[:, 0] - origins
+    distance = np.einsum("nc,nc->n", normal, offset) / facing
+    inside = distance[:, None] * directions - offset
+    w1 = np.einsum("nc,nc->n", np.cross(inside, edge_2), normal) / length**2
+    w2 = np.einsum("nc,nc->n", np.cross(edge_1, inside), normal) / length**2
+    weights = np.clip(np.stack([1.0 - w1 - w2, w1, w2], -1), 0.0, 1.0)
+    weights = weights / weights.sum(-1, keepdims=True)
+    return weights, distance, facing / length, 0.5 * length
