@@ -48,9 +48,11 @@ class LinearSolver(abc.ABC):
         rtol: float = 1e-3,
         max_steps: int = 40,
     ) -> Solution:
-        """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps, starting from ``x0`` (default 0).
+        """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps, starting from ``x0`` (default
+        0).
 
-        Bad numbers give a status, never a NaN. Raises ``ValueError`` for shapes and settings that make no sense.
+        Bad numbers give a status, never a NaN. Raises ``ValueError`` for shapes and settings that make no
+        sense.
         """
         _check(b, x0, rtol, max_steps)
         operator = Watched(matvec)

@@ -44,7 +44,8 @@ class Damping(abc.ABC):
 
 @dataclass(frozen=True)
 class FixedDamping(Damping):
-    """A given lambda, for instance 0 where the inner problem's own proximal term already bounds its curvature.
+    """A given lambda, for instance 0 where the inner problem's own proximal term already bounds its
+    curvature.
 
     ``lanczos_steps`` > 0 estimates the spectrum all the same, for the log.
     """
@@ -99,8 +100,8 @@ class LanczosDamping(Damping):
 
 @dataclass(frozen=True)
 class GaussNewtonDamping(Damping):
-    """The Gauss-Newton operator in the Hessian's place, whose curvature is non-negative where the loss is convex in
-    the model's outputs, with a fixed lambda.
+    """The Gauss-Newton operator in the Hessian's place, whose curvature is non-negative where the loss is
+    convex in the model's outputs, with a fixed lambda.
     """
 
     curvature: ClassVar[Curvature] = "gauss_newton"

@@ -1,7 +1,7 @@
 """Products with the Hessian of a training loss, without the matrix (Pearlmutter 1994).
 
-The loss is a sum of terms, one a chunk of images; a product differentiates one term at a time, so that memory is that
-of one chunk. Cost in gradients of the same chunk: about 2 to 3 in every mode.
+The loss is a sum of terms, one a chunk of images; a product differentiates one term at a time, so that memory
+is that of one chunk. Cost in gradients of the same chunk: about 2 to 3 in every mode.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ Mode = Literal["reverse_over_reverse", "forward_over_reverse", "central_differen
 class HessianOperator:
     """``vector -> H vector`` for ``H`` the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
 
-    Vectors are flattened in the order of ``params``. Modes: ``reverse_over_reverse`` (any twice differentiable
-    operation), ``forward_over_reverse`` (less memory; needs forward-mode rules), ``central_difference`` (two gradients
-    at ``theta +- h v``; error of relative order eps^(2/3)). ``retain_graph`` keeps the first gradient's graph of all
-    terms for reverse_over_reverse: a product falls to one backward pass, memory grows to all chunks.
-    Raises ``ValueError`` without terms or for an unknown mode.
+    Vectors are flattened in the order of ``params``. Modes: ``reverse_over_reverse`` (any twice
+    differentiable operation), ``forward_over_reverse`` (less memory; needs forward-mode rules),
+    ``central_difference`` (two gradients at ``theta +- h v``; error of relative order eps^(2/3)).
+    ``retain_graph`` keeps the first gradient's graph of all terms for reverse_over_reverse: a product falls
+    to one backward pass, memory grows to all chunks. Raises ``ValueError`` without terms or for an unknown
+    mode.
     """
 
     def __init__(

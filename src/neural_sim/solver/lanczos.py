@@ -14,9 +14,11 @@ from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Extreme Ritz values. Some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the largest).
+    """Extreme Ritz values. Some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the
+    largest).
 
-    ``finite`` is False where the operator returned inf or nan; the values are those found until then (0 if none).
+    ``finite`` is False where the operator returned inf or nan; the values are those found until then (0 if
+    none).
     """
 
     smallest: float
@@ -33,10 +35,12 @@ class Spectrum:
 
 
 def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
-    """Ritz values of a symmetric operator after at most ``steps`` products from ``start`` (any non-zero vector).
+    """Ritz values of a symmetric operator after at most ``steps`` products from ``start`` (any non-zero
+    vector).
 
-    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue that the start
-    vector has a part in. Memory: steps vectors. Raises ``ValueError`` for a zero or non-finite start or steps < 1.
+    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue that the
+    start vector has a part in. Memory: steps vectors. Raises ``ValueError`` for a zero or non-finite start or
+    steps < 1.
     """
     if steps < 1:
         raise ValueError(f"lanczos: steps must be at least 1, got {steps}")

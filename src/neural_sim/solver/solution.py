@@ -32,12 +32,12 @@ class Status(enum.Enum):
 class Solution:
     """Result of ``A x = b``. Every field is finite whatever the inputs were.
 
-    ``residual`` is ``|b - A x| / |b|`` recomputed from a fresh product, never the recursion's, hence unchanged
-    when A and b are rescaled; 0 for b = 0, and 1 where no finite value was found and ``value`` is zero. Only an
-    APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest Rayleigh quotient
-    ``p^T A p / p^T p`` of all products taken (0, 0 if none). ``products`` counts all applications of A, ``steps`` the
-    solver's own iterations. ``warm_started`` says whether x0 was used (it is dropped when its residual is no better
-    than that of zero).
+    ``residual`` is ``|b - A x| / |b|`` recomputed from a fresh product, never the recursion's, hence
+    unchanged when A and b are rescaled; 0 for b = 0, and 1 where no finite value was found and ``value`` is
+    zero. Only an APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest
+    Rayleigh quotient ``p^T A p / p^T p`` of all products taken (0, 0 if none). ``products`` counts all
+    applications of A, ``steps`` the solver's own iterations. ``warm_started`` says whether x0 was used (it is
+    dropped when its residual is no better than that of zero).
     """
 
     value: Float[Tensor, "n"]

@@ -1,0 +1,95 @@
+"""What the estimators of ``d/dpsi <dL_train/dtheta, v>`` share: their inputs, their result, small protocols.
+
+No estimator knows of the implicit function theorem's minus sign; it is written once, in ``hypergradient.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.types import PinholeCamera, Rays, SceneDraw
+
+Params = dict[str, Tensor]
+
+
+class IndexedLoss(Protocol):
+    """Losses of training images by row, from whatever is cached of them (features of a frozen backbone)."""
+
+    def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]: ...
+
+
+class ImageLoss(Protocol):
+    """Losses of training images, differentiable (twice in all) in parameters and images; targets by row ``index``."""
+
+    def __call__(
+        self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
+    ) -> Float[Tensor, "n"]: ...
+
+
+@dataclass(frozen=True)
+class RenderedPath:
+    """How one object's images came from psi, so that the way can be walked again with derivatives.
+
+    ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to
+    premultiplied colour [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and
+    opacity maps to images with the nuisance bound. ``rgb`` and ``opacity`` are the first, derivative-free
+    render's.
+    """
+
+    relaxed: Callable[[Float[Tensor, "k"]], SceneDraw]
+    render_rays: Callable[[Rays], tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]]
+    compose: Callable[[Float[Tensor, "n h w 3"], Float[Tensor, "n h w"]], Float[Tensor, "n 3 h w"]]
+    camera: PinholeCamera
+    rgb: Float[Tensor, "n h w 3"]
+    opacity: Float[Tensor, "n h w"]
+
+
+@dataclass(frozen=True)
+class ObjectImages:
+    """One object's training images at one psi step.
+
+    ``psi`` logits; ``log_probabilities`` maps them to log p over the bins. ``index`` are the images' rows in
+    the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
+    ``draw`` is where they were rendered. ``path`` is needed by the pathwise estimators only.
+    """
+
+    psi: Float[Tensor, "k"]
+    log_probabilities: Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
+    images: Float[Tensor, "n 3 h w"]
+    index: Int[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+    draw: SceneDraw
+    path: RenderedPath | None = None
+
+
+@dataclass(frozen=True)
+class MixedDerivative:
+    """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+
+    ``standard_error`` is that of ``value`` over draws of the images (v held fixed); inf where it cannot be
+    told.
+    """
+
+    value: Float[Tensor, "k"]
+    standard_error: Float[Tensor, "k"]
+
+    @property
+    def signal_to_noise(self) -> Float[Tensor, "k"]:
+        """``|value| / standard_error`` per component; 0 where both vanish."""
+        ratio = self.value.abs() / self.standard_error
+        return torch.where(self.value == 0.0, torch.zeros_like(ratio), ratio)
+
+
+def from_contributions(contributions: Float[Tensor, "n k"]) -> MixedDerivative:
+    """The sum of independent per-image contributions, and the standard error of that sum."""
+    count = contributions.shape[0]
+    value = contributions.sum(0)
+    if count < 2:
+        return MixedDerivative(value, torch.full_like(value, torch.inf))
+    return MixedDerivative(value, contributions.std(0) * count**0.5)

@@ -1,0 +1,141 @@
+"""The hypergradient of Eq. 2.
+
+``dL_val/dpsi = - d/dpsi <dL_train/dtheta, v>`` with ``(H + lambda I) v = dL_val/dtheta``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
+from neural_sim.solver.adjoint import Adjoint, AdjointSolver
+from neural_sim.solver.damping import Damped
+from neural_sim.solver.flatten import unflatten
+from neural_sim.solver.hvp import Term, gradient
+from neural_sim.solver.operator import norm
+from neural_sim.solver.solution import Solution
+
+Estimate = Callable[[Params], MixedDerivative]
+
+
+@dataclass(frozen=True)
+class InnerProblem:
+    """``L_train(theta) = sum_i w_i l_i(theta) + proximal / 2 |theta - anchor|^2`` at its (near) minimiser
+    ``params``.
+
+    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. At most ``chunk_size``
+    images are in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term. ``subset`` limits
+    Hessian products (not the stationarity) to these rows, their weights scaled up to the same sum.
+    """
+
+    params: Params
+    losses: IndexedLoss
+    weights: Float[Tensor, "N"]
+    chunk_size: int = 32
+    proximal: float = 0.0
+    anchor: Params | None = None
+    subset: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.weights.ndim != 1 or self.weights.numel() == 0:
+            raise ValueError(
+                f"inner problem: weights must be a non-empty vector, got {tuple(self.weights.shape)}"
+            )
+        if self.chunk_size < 1 or self.proximal < 0.0:
+            raise ValueError(
+                f"inner problem: want chunk_size >= 1 and proximal >= 0, got {self.chunk_size}, {self.proximal}"
+            )
+        if self.proximal > 0.0 and self.anchor is None:
+            raise ValueError("inner problem: a proximal term needs its anchor theta_0")
+
+    def terms(self, subset: Tensor | None = None) -> list[Term]:
+        """The loss as a sum of chunks (and the proximal term), of all rows or of a subset standing for all."""
+        index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
+        weights = self.weights[index]
+        if subset is not None:
+            weights = weights * (self.weights.sum() / weights.sum())
+        chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
+        terms: list[Term] = [
+            lambda params, rows=rows, weight=weight: self.losses(params, rows) @ weight
+            for rows, weight in chunks
+        ]
+        if self.proximal > 0.0 and self.anchor is not None:
+            terms.append(proximal_term(self.proximal, self.anchor))
+        return terms
+
+
+@dataclass(frozen=True)
+class Hypergradient:
+    """``dL_val/dpsi`` per object with everything needed to judge it.
+
+    ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
+    ``seconds`` by phase: validation, solve, mixed.
+    """
+
+    psi_gradients: dict[str, Float[Tensor, "k"]]
+    signal_to_noise: dict[str, Float[Tensor, "k"]]
+    solution: Solution
+    damping: Damped
+    sensitivity: float
+    stationarity: float
+    validation_norm: float
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def hypergradient(
+    inner: InnerProblem,
+    validation: Sequence[Term],
+    estimates: Mapping[str, Estimate],
+    solver: AdjointSolver,
+    generator: torch.Generator,
+    previous: Float[Tensor, "m"] | None = None,
+) -> Hypergradient:
+    """Eq. 2 for every object.
+
+    ``validation`` are the terms of L_val as functions of the parameters. ``estimates`` maps an object's name
+    to its estimator with the object's images bound, a function of v giving ``d/dpsi <dL_train/dtheta, v>``.
+    ``previous`` warms the solve. A failed solve leaves v at the best iterate: the caller reads
+    ``solution.status``.
+    """
+    began = time.perf_counter()
+    right_hand_side = gradient(validation, inner.params)
+    stationarity = norm(gradient(inner.terms(), inner.params))
+    validated = time.perf_counter()
+    adjoint: Adjoint = solver.solve(
+        inner.terms(inner.subset), inner.params, right_hand_side, previous, generator
+    )
+    solved = time.perf_counter()
+    vector = unflatten(adjoint.vector, inner.params)
+    mixed = {name: estimate(vector) for name, estimate in estimates.items()}
+    seconds = {
+        "validation": validated - began,
+        "solve": solved - validated,
+        "mixed": time.perf_counter() - solved,
+    }
+    return Hypergradient(
+        # The one minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
+        psi_gradients={name: -part.value for name, part in mixed.items()},
+        signal_to_noise={name: part.signal_to_noise for name, part in mixed.items()},
+        solution=adjoint.solution,
+        damping=adjoint.damping,
+        sensitivity=adjoint.sensitivity,
+        stationarity=stationarity,
+        validation_norm=norm(right_hand_side),
+        seconds=seconds,
+    )
+
+
+def proximal_term(proximal: float, anchor: Params) -> Term:
+    """``proximal / 2 |theta - anchor|^2``: with it, ``(H + proximal I)^-1`` is the inner problem's exact derivative."""
+
+    def term(params: Params) -> Tensor:
+        squares = [(params[name] - anchor[name].detach()).square().sum() for name in params]
+        return 0.5 * proximal * torch.stack(squares).sum()
+
+    return term

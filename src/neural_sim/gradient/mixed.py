@@ -1,0 +1,96 @@
+"""The mixed second derivative of the training loss, contracted with v before anything large exists (paper,
+Tool 2).
+
+Contracting with v first leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one
+image-sized array, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 9 is never formed.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
+
+Mode = Literal["forward", "reverse"]
+
+
+def scores(
+    losses: IndexedLoss,
+    params: Params,
+    vector: Params,
+    index: Int[Tensor, "n"],
+    chunk_size: int = 32,
+    mode: Mode = "forward",
+) -> Float[Tensor, "n"]:
+    """``s_i = <dl_i/dtheta, v>`` of the images in ``index``, at most ``chunk_size`` of them in memory at a
+    time.
+
+    ``forward``: one Jacobian-vector product gives a chunk's scores. ``reverse`` differentiates the
+    vector-Jacobian product by its own cotangent, for losses without forward-mode rules. Raises ``ValueError``
+    for an unknown mode.
+    """
+    _check(mode, chunk_size)
+    along = _forward_scores if mode == "forward" else _reverse_scores
+    parts = [
+        along(lambda p, rows=rows: losses(p, rows), params, vector).detach()
+        for rows in index.split(chunk_size)
+    ]
+    return torch.cat(parts) if parts else index.new_zeros(0, dtype=next(iter(params.values())).dtype)
+
+
+def image_cotangent(
+    loss_of: ImageLoss,
+    params: Params,
+    vector: Params,
+    images: Float[Tensor, "n 3 h w"],
+    index: Int[Tensor, "n"],
+    weights: Float[Tensor, "n"],
+    chunk_size: int = 16,
+    mode: Mode = "forward",
+) -> Float[Tensor, "n 3 h w"]:
+    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``, the cotangent of every image (left factor of Eq. 9 times v).
+
+    ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the images, is always
+    reverse.
+    """
+    _check(mode, chunk_size)
+    along = _forward_scores if mode == "forward" else _reverse_scores
+    cotangents = []
+    for chunk, rows, weight in zip(
+        images.split(chunk_size), index.split(chunk_size), weights.split(chunk_size), strict=True
+    ):
+        leaf = chunk.detach().requires_grad_()
+        with torch.enable_grad():
+            score = along(lambda p, leaf=leaf, rows=rows: loss_of(p, leaf, rows), params, vector)
+            (cotangent,) = torch.autograd.grad(score @ weight, leaf, materialize_grads=True)
+        cotangents.append(cotangent.detach())
+    return torch.cat(cotangents) if cotangents else torch.zeros_like(images)
+
+
+def _forward_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
+    fixed = {name: tensor.detach() for name, tensor in params.items()}
+    return torch.func.jvp(losses, (fixed,), ({name: vector[name].detach() for name in fixed},))[1]
+
+
+def _reverse_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
+    leaves = {name: tensor.detach().requires_grad_() for name, tensor in params.items()}
+    with torch.enable_grad():
+        values = losses(leaves)
+        probe = torch.zeros_like(values, requires_grad=True)
+        slopes = torch.autograd.grad(
+            values, list(leaves.values()), probe, create_graph=True, materialize_grads=True
+        )
+        # Linear in the probe, so that its derivative by the probe is the product J v itself.
+        along = sum((slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+        return torch.autograd.grad(along, probe, create_graph=True, materialize_grads=True)[0]
+
+
+def _check(mode: str, chunk_size: int) -> None:
+    if mode not in get_args(Mode):
+        raise ValueError(f"gradient: mode must be one of {get_args(Mode)}, got {mode!r}")
+    if chunk_size < 1:
+        raise ValueError(f"gradient: chunk_size must be at least 1, got {chunk_size}")

@@ -1,0 +1,114 @@
+"""The exact derivative over hard bins: with ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is
+``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits without a floor ``p_i (s_i - sum_j p_j s_j)``.
+
+Only the bins' means are estimated, so every bin is drawn on purpose instead of waiting for p to draw it, and
+the renderer is never differentiated.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.gradient.base import MixedDerivative
+
+logger = logging.getLogger(__name__)
+LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
+
+
+def allocate(probabilities: Float[Tensor, "k"], total: int, minimum: int = 1) -> Int[Tensor, "k"]:
+    """Images per bin: ``minimum`` for every bin, the rest by largest remainder of p; sums to ``total``.
+
+    Raises ``ValueError`` if ``total`` cannot hold the minimum, or p is not a distribution.
+    """
+    bins = probabilities.numel()
+    if minimum < 0 or total < bins * minimum:
+        raise ValueError(
+            f"allocate: got total {total} and minimum {minimum} for {bins} bins, want total >= their product"
+        )
+    if bool((probabilities < 0.0).any()) or abs(float(probabilities.sum()) - 1.0) > 1e-4:
+        raise ValueError(
+            f"allocate: probabilities must be non-negative and sum to 1, got {probabilities.tolist()}"
+        )
+    shares = probabilities.double() * (total - bins * minimum)
+    counts = shares.floor().long()
+    left = total - bins * minimum - int(counts.sum())
+    counts[(shares - counts).argsort(descending=True, stable=True)[:left]] += 1
+    return counts + minimum
+
+
+def importance_weights(
+    probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], share: float = 1.0
+) -> Float[Tensor, "n"]:
+    """Weights ``share p_b / n_b`` under which images drawn on purpose from bins train as if p had drawn them.
+
+    ``share`` is the object's part of the training set. They sum to ``share`` when every bin of positive p was
+    drawn; the mass of bins left out is missing, not spread over the others.
+    """
+    counts = torch.bincount(bins, minlength=probabilities.numel())
+    return share * (probabilities / counts.clamp_min(1))[bins]
+
+
+def stratified(
+    scores: Float[Tensor, "n"],
+    bins: Int[Tensor, "n"],
+    psi: Float[Tensor, "k"],
+    log_probabilities: LogProbabilities,
+    share: float = 1.0,
+) -> MixedDerivative:
+    """``share * dE/dpsi`` from scores of images of known bins, however many each bin has.
+
+    A bin without images takes the p-weighted mean of the others as its mean score (logged), which is the
+    value at which it says nothing, and infinite standard error. Variances within bins are pooled for bins of
+    one image.
+    """
+    _check(scores, bins, psi)
+    counts = torch.bincount(bins, minlength=psi.numel()).to(scores.dtype)
+    seen = counts > 0
+    total = torch.zeros_like(counts).index_add_(0, bins, scores)
+    means = total / counts.clamp_min(1.0)
+    p, slopes = _jacobian(log_probabilities, psi)
+    if not bool(seen.all()):
+        logger.info("stratified: bins %s have no images", (~seen).nonzero().flatten().tolist())
+        mean = (p * means)[seen].sum() / p[seen].sum()
+        means = torch.where(seen, means, mean)
+    variance = _variance_of_means(scores - means[bins], bins, counts)
+    # A slope of zero makes a bin's unknown mean harmless; 0 * inf would not say so.
+    spread = torch.where(slopes == 0.0, torch.zeros_like(slopes), slopes.square() * variance[:, None])
+    return MixedDerivative(share * (means @ slopes), share * spread.sum(0).sqrt())
+
+
+def _variance_of_means(residuals: Tensor, bins: Tensor, counts: Tensor) -> Float[Tensor, "k"]:
+    squares = torch.zeros_like(counts).index_add_(0, bins, residuals.square())
+    freedom = counts - 1.0
+    spare = freedom.clamp_min(0.0).sum()
+    pooled = squares.sum() / spare if spare > 0 else squares.new_tensor(torch.inf)
+    within = torch.where(freedom > 0, squares / freedom.clamp_min(1.0), pooled)
+    return torch.where(counts > 0, within / counts.clamp_min(1.0), torch.full_like(counts, torch.inf))
+
+
+def _jacobian(
+    log_probabilities: LogProbabilities, psi: Tensor
+) -> tuple[Float[Tensor, "k"], Float[Tensor, "k k"]]:
+    """p, and ``dp_b/dpsi_i`` at row b, column i."""
+    leaf = psi.detach().requires_grad_()
+    with torch.enable_grad():
+        p = log_probabilities(leaf).exp()
+    rows = [torch.autograd.grad(p[b], leaf, retain_graph=True)[0] for b in range(p.numel())]
+    return p.detach(), torch.stack(rows)
+
+
+def _check(scores: Tensor, bins: Tensor, psi: Tensor) -> None:
+    if scores.ndim != 1 or scores.shape != bins.shape or scores.numel() == 0:
+        raise ValueError(
+            f"stratified: want equally many scores and bins, at least one, got shapes {tuple(scores.shape)} "
+            f"and {tuple(bins.shape)}"
+        )
+    if int(bins.min()) < 0 or int(bins.max()) >= psi.numel():
+        raise ValueError(
+            f"stratified: bins must lie in [0, {psi.numel()}), got {int(bins.min())} to {int(bins.max())}"
+        )

@@ -1,0 +1,102 @@
+"""``v = (H + lambda I)^-1 b``: curvature operator, damping and linear solver put together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.solver.base import LinearSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import Damped, Damping, LanczosDamping
+from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
+from neural_sim.solver.hvp import HessianOperator, Mode, Term
+from neural_sim.solver.operator import Matvec, Shifted, norm
+from neural_sim.solver.solution import Solution
+
+
+@dataclass(frozen=True)
+class Adjoint:
+    """The solved vector with its account.
+
+    ``sensitivity`` is ``|v(2 lambda) - v(lambda)| / |v(lambda)|``, nan if not asked for. Not a bias: an
+    indefinite H has poles in lambda.
+    """
+
+    solution: Solution
+    damping: Damped
+    sensitivity: float
+    seconds: float
+
+    @property
+    def vector(self) -> Float[Tensor, "n"]:
+        return self.solution.value
+
+
+@dataclass(frozen=True)
+class AdjointSolver:
+    """Solves ``(H + lambda I) v = b`` for H the Hessian (or Gauss-Newton matrix) of a sum of loss terms.
+
+    Args:
+        linear: the linear solver.
+        damping: the choice of lambda; a Gauss-Newton damping also swaps the operator and needs
+        ``CompositeTerm`` s. mode: how Hessian products are made, see ``HessianOperator``.
+        rtol, max_steps: passed to the linear solver.
+        retain_graph: keep the gradient's graph between products: faster, memory of all chunks at once.
+        sensitivity: also solve at 2 lambda, to see how much v hangs on the damping (twice the cost).
+    """
+
+    linear: LinearSolver = field(default_factory=ConjugateGradient)
+    damping: Damping = field(default_factory=LanczosDamping)
+    mode: Mode = "reverse_over_reverse"
+    rtol: float = 1e-2
+    max_steps: int = 40
+    retain_graph: bool = False
+    sensitivity: bool = False
+
+    def solve(
+        self,
+        terms: Sequence[Term],
+        params: Mapping[str, Tensor],
+        b: Float[Tensor, "n"],
+        x0: Float[Tensor, "n"] | None,
+        generator: torch.Generator,
+    ) -> Adjoint:
+        """v for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds Lanczos' start
+        vector.
+
+        Raises ``ValueError`` for a Gauss-Newton damping on terms that are not ``CompositeTerm`` s.
+        """
+        began = time.perf_counter()
+        operator = self.operator(terms, params)
+        damped = self.damping.choose(operator, b, generator)
+        solution = self.linear.solve(Shifted(operator, damped.value), b, x0, self.rtol, self.max_steps)
+        sensitivity = (
+            self._sensitivity(operator, damped.value, b, solution) if self.sensitivity else float("nan")
+        )
+        return Adjoint(solution, damped, sensitivity, time.perf_counter() - began)
+
+    def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
+        """The undamped curvature operator that the damping asks for."""
+        if self.damping.curvature == "hessian":
+            return HessianOperator(terms, params, self.mode, self.retain_graph)
+        composite = [term for term in terms if isinstance(term, CompositeTerm)]
+        if len(composite) < len(terms):
+            raise ValueError(
+                "solver.damping: Gauss-Newton needs every loss term as outputs and loss of outputs (CompositeTerm), "
+                f"got {len(terms) - len(composite)} of {len(terms)} without"
+            )
+        return GaussNewtonOperator(composite, params)
+
+    def _sensitivity(self, operator: Matvec, damping: float, b: Tensor, solution: Solution) -> float:
+        size = norm(solution.value)
+        if size == 0.0:
+            return float("nan")
+        doubled = self.linear.solve(
+            Shifted(operator, 2.0 * damping), b, solution.value, self.rtol, self.max_steps
+        )
+        return norm(doubled.value - solution.value) / size
