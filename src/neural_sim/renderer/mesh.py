@@ -14,8 +14,8 @@ from pyrender.constants import GLTF
 from torch import Tensor
 
 from neural_sim.renderer.lighting import Lighting
-from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.renderer.supersampling import straight_alpha
+from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.types import PinholeCamera
 
 # Closer than this to the camera nothing is drawn; objects have radius 1 and cameras keep outside of them.
@@ -25,8 +25,8 @@ NEAR, FAR = 0.01, 100.0
 class PyrenderRenderer:
     """Renders with pyrender's unlit pass over a surface whose light is baked into its vertices.
 
-    pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each
-    pixel averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views; ``close``
+    pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each pixel
+    averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views; ``close``
     frees it (so does the interpreter's exit). Needs PYOPENGL_PLATFORM set before this module is imported.
     """
 

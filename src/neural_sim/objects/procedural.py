@@ -1,0 +1,51 @@
+"""The embedded default objects, made at run time: no downloads, the same bytes for the same seed."""
+
+from __future__ import annotations
+
+import torch
+
+from neural_sim.objects import household
+from neural_sim.objects.mesh import ObjectMesh, normalise
+
+DESIGNS = {
+    "can": household.can,
+    "pitcher": household.pitcher,
+    "tall_box": household.tall_box,
+    "flat_box": household.flat_box,
+    "mug": household.mug,
+    "drill": household.drill,
+}
+
+
+class Procedural:
+    """Six textured household objects, two blue and four red, or those named.
+
+    ``seed`` draws their small print only; shapes and marks are fixed. An object does not depend on which others
+    are made. Raises ``ValueError`` for unknown names.
+    """
+
+    def __init__(self, names: list[str] | None = None, seed: int = 0) -> None:
+        chosen = list(DESIGNS) if names is None else list(names)
+        unknown = [name for name in chosen if name not in DESIGNS]
+        if unknown or not chosen or len(set(chosen)) < len(chosen):
+            raise ValueError(f"objects.names: want different ones of {', '.join(DESIGNS)}, got {chosen}")
+        if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+            raise ValueError(f"objects.seed: want an integer of at least 0, got {seed!r}")
+        self._names = chosen
+        self.seed = seed
+
+    def names(self) -> list[str]:
+        return list(self._names)
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each object's geometry and texture."""
+        return {item.name: item.digest for item in self.load()}
+
+    def load(self) -> list[ObjectMesh]:
+        """The objects, normalised, in the order of ``names``."""
+        order = list(DESIGNS)
+        items = []
+        for name in self._names:
+            generator = torch.Generator().manual_seed(self.seed * len(order) + order.index(name))
+            items.append(normalise(DESIGNS[name](generator), name, f"procedural object {name}"))
+        return items
