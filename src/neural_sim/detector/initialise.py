@@ -1,0 +1,36 @@
+"""Random initial values from an explicit generator; torch's module constructors know only the global one."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torchvision.models.detection.retinanet import RetinaNetClassificationHead
+
+
+def initialise(
+    module: nn.Module, generator: torch.Generator, prior_probability: float | None = None
+) -> dict[str, Tensor]:
+    """A state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
+
+    The output layers of a RetinaNet head (without normalisation, the only convolutions with a bias) start at
+    standard deviation 0.01; the class layer's bias makes it predict ``prior_probability`` (Lin et al., Sec. 4.1).
+    """
+    state = {name: value.detach().clone() for name, value in module.state_dict().items()}
+    for name, part in module.named_modules():
+        prefix = f"{name}." if name else ""
+        if isinstance(part, nn.Conv2d):
+            std = math.sqrt(2.0 / (part.in_channels * math.prod(part.kernel_size)))
+            if part.bias is not None:
+                std = 0.01
+                state[f"{prefix}bias"].zero_()
+            state[f"{prefix}weight"].normal_(0.0, std, generator=generator)
+        elif isinstance(part, nn.GroupNorm):
+            state[f"{prefix}weight"].fill_(1.0)
+            state[f"{prefix}bias"].zero_()
+    for name, part in module.named_modules():
+        if isinstance(part, RetinaNetClassificationHead) and prior_probability is not None:
+            prefix = f"{name}." if name else ""
+            state[f"{prefix}cls_logits.bias"].fill_(-math.log((1 - prior_probability) / prior_probability))
+    return state

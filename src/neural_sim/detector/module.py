@@ -1,0 +1,98 @@
+"""The detector's training loop as a LightningModule, over all parameters or any part of them."""
+
+from __future__ import annotations
+
+import math
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
+
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.targets import Targets
+
+Batch = tuple[tuple[Tensor, ...], Targets]
+
+
+class DetectorModule(pl.LightningModule):
+    """Minimises the detector's mean loss over ``learned`` with AdamW, linear warm-up and cosine decay to zero.
+
+    Batches are (inputs, targets). Inputs are the images (one tensor [n, 3, h, w]) where the backbone is learned,
+    else the features of the frozen backbone (one tensor for each level).
+
+    Args:
+        learned: parameters that are trained; copied.
+        fixed: all others; never written to.
+        total_steps: optimiser steps until the learning rate reaches zero.
+        learning_rate: at its peak.
+        weight_decay: decoupled, on convolution weights only.
+        warmup_fraction: part of ``total_steps`` in which the learning rate rises.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        learned: Parameters,
+        fixed: Parameters,
+        total_steps: int,
+        learning_rate: float,
+        weight_decay: float,
+        warmup_fraction: float,
+    ) -> None:
+        super().__init__()
+        self.detector = detector
+        self._names = list(learned)
+        self._values = nn.ParameterList([nn.Parameter(value.detach().clone()) for value in learned.values()])
+        self._fixed = {name: value.detach() for name, value in fixed.items()}
+        self._on_features = not any(name.startswith("backbone.") for name in learned)
+        self.total_steps, self.warmup_steps = total_steps, math.ceil(warmup_fraction * total_steps)
+        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+        self.epoch_losses: list[float] = []
+        self.steps_done = 0
+        self._losses: list[Tensor] = []
+        self._sizes: list[int] = []
+
+    def parameters_by_name(self) -> Parameters:
+        """The learned parameters as they are now, detached copies."""
+        return {name: value.detach().clone() for name, value in zip(self._names, self._values, strict=True)}
+
+    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        inputs, targets = batch
+        params = {**self._fixed, **dict(zip(self._names, self._values, strict=True))}
+        backbone, trainable = self.detector.split(params)
+        features = inputs if self._on_features else self.detector.features(backbone, inputs[0])
+        loss = self.detector.loss(trainable, features, targets)
+        self._losses.append(loss.detach())
+        self._sizes.append(len(targets))
+        return loss
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        # Lightning's own version refuses frozen dataclasses.
+        inputs, targets = batch
+        moved = Targets(targets.labels.to(device), targets.deltas.to(device))
+        return tuple(x.to(device) for x in inputs), moved
+
+    def on_train_epoch_end(self) -> None:
+        sizes = torch.tensor(self._sizes, dtype=torch.float64)
+        losses = torch.stack(self._losses).double().cpu()
+        self.epoch_losses.append(float((losses * sizes).sum() / sizes.sum()))
+        self.steps_done += len(self._sizes)
+        self._losses, self._sizes = [], []
+
+    def configure_optimizers(self) -> dict:
+        decayed = [value for value in self._values if value.ndim > 1]
+        others = [value for value in self._values if value.ndim <= 1]
+        groups = [
+            {"params": decayed, "weight_decay": self.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        optimiser = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
+        schedule = LambdaLR(optimiser, self._rate)
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _rate(self, step: int) -> float:
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        done = (step - self.warmup_steps) / max(1, self.total_steps - self.warmup_steps)
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))

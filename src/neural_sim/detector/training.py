@@ -1,0 +1,141 @@
+"""Training a detector to the end of a fixed budget of steps, and measuring its loss."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from neural_sim.detector.module import Batch, DetectorModule
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.targets import Targets
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class TrainingHistory:
+    """``losses``: mean training loss of each epoch, as met by the steps; ``steps``: optimiser steps done."""
+
+    losses: tuple[float, ...]
+    steps: int
+
+
+class Batches:
+    """Inputs and targets in batches, in an order that the generator shuffles anew each epoch."""
+
+    def __init__(
+        self, inputs: tuple[Tensor, ...], targets: Targets, batch_size: int, generator: torch.Generator
+    ) -> None:
+        self.inputs, self.targets, self.batch_size, self.generator = inputs, targets, batch_size, generator
+
+    def __len__(self) -> int:
+        return -(-len(self.targets) // self.batch_size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        order = torch.randperm(len(self.targets), generator=self.generator, device=self.generator.device)
+        for index in order.to(self.targets.labels.device).split(self.batch_size):
+            yield tuple(x[index] for x in self.inputs), self.targets.select(index)
+
+
+@torch.no_grad()
+def cached_features(
+    detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
+) -> tuple[Tensor, ...]:
+    """Feature maps of all images, computed batch by batch, without a graph."""
+    parts = [detector.features(backbone, chunk) for chunk in images.split(batch_size)]
+    return tuple(torch.cat(level) for level in zip(*parts, strict=True))
+
+
+def train_detector(
+    detector: Detector,
+    params: Parameters,
+    images: LabelledImages,
+    generator: torch.Generator,
+    epochs: int = 30,
+    batch_size: int = 32,
+    learning_rate: float = 3e-3,
+    weight_decay: float = 1e-2,
+    warmup_fraction: float = 0.1,
+    trainable_only: bool = False,
+    progress: bool = False,
+) -> tuple[Parameters, TrainingHistory]:
+    """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
+
+    Args:
+        trainable_only: train the pyramid and the head on the frozen backbone's features, computed once.
+        warmup_fraction: part of the steps over which the learning rate rises linearly.
+
+    Returns:
+        New parameters, detached, all of them (the frozen ones are the given tensors), and the history.
+
+    Raises:
+        ValueError: without images, epochs or a batch size.
+    """
+    if len(images) == 0 or epochs < 1 or batch_size < 1:
+        raise ValueError(
+            f"train_detector: want images, epochs and batch_size, got {len(images)}, {epochs}, {batch_size}"
+        )
+    backbone, trainable = detector.split(params)
+    targets = detector.assign(images.boxes, images.labels)
+    if trainable_only:
+        learned, fixed = trainable, backbone
+        inputs = cached_features(detector, backbone, images.images)
+    else:
+        names = set(detector.learnable(params))
+        learned = {name: value for name, value in params.items() if name in names}
+        fixed = {name: value for name, value in params.items() if name not in names}
+        inputs = (images.images,)
+    batches = Batches(inputs, targets, batch_size, generator)
+    module = DetectorModule(
+        detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction
+    )
+    _fit(module, batches, epochs, progress, next(iter(learned.values())).device)
+    values = {**fixed, **module.parameters_by_name()}
+    history = TrainingHistory(tuple(module.epoch_losses), module.steps_done)
+    return {name: values[name] for name in params}, history
+
+
+def _fit(module: DetectorModule, batches: Batches, epochs: int, progress: bool, device: torch.device) -> None:
+    """Run Lightning's loop with everything off that writes files or talks."""
+    talker = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    level = talker.level
+    talker.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="lightning")
+            trainer = Trainer(
+                max_epochs=epochs,
+                accelerator="cpu" if device.type == "cpu" else "gpu",
+                devices=1 if device.type == "cpu" else [device.index or 0],
+                logger=False,
+                enable_checkpointing=False,
+                enable_progress_bar=progress,
+                enable_model_summary=False,
+            )
+            trainer.fit(module, batches)
+    finally:
+        talker.setLevel(level)
+
+
+@torch.no_grad()
+def mean_loss(detector: Detector, params: Parameters, images: LabelledImages, batch_size: int = 64) -> float:
+    """Mean of the per-image loss over a set.
+
+    Raises:
+        ValueError: for an empty set, whose mean does not exist.
+    """
+    if len(images) == 0:
+        raise ValueError("mean_loss: got no images, want at least one")
+    backbone, trainable = detector.split(params)
+    total = 0.0
+    for index in torch.arange(len(images)).split(batch_size):
+        part = images.select(index)
+        features = detector.features(backbone, part.images)
+        targets = detector.assign(part.boxes, part.labels)
+        total += float(detector.per_image_loss(trainable, features, targets).sum())
+    return total / len(images)
