@@ -1,0 +1,197 @@
+"""Density and colour features on a packed grid: rows for the vertices of occupied cells only."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.interpolation import CORNERS, interpolate, interpolate_for_training, trilinear_weights
+from neural_sim.field.marching import SampleCollector, lookup, march
+from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, subdivide, vertices
+from neural_sim.types import Rays
+
+EMPTY_DENSITY = -1e4
+"""Raw density of the row that stands for all empty space: softplus gives exactly 0."""
+
+
+class GridField(RadianceField):
+    """Trilinear features over occupied cells; sigma = softplus(raw) / cell edge, so raw is free of the grid's scale.
+
+    ``features`` numbers per vertex make the colour: with ``head_width`` 0 the first three pass a sigmoid (no view
+    dependence; a Lambertian object under a fixed light needs none), otherwise a head of one hidden layer sees them and
+    the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the raw
+    density of a new field. A new field holds the cube [-1, 1]^3 in one cell; ``reset`` gives it its occupancy.
+    """
+
+    def __init__(
+        self, features: int = 3, head_width: int = 0, step_cells: float = 0.5, initial_density: float = -3.0
+    ) -> None:
+        super().__init__()
+        if features < 3:
+            raise ValueError(f"GridField: features must be at least 3, got {features}")
+        if head_width < 0 or not 0.0 < step_cells <= 2.0:
+            raise ValueError(
+                f"GridField: want head_width >= 0 and step_cells in (0, 2], got {head_width} and {step_cells}"
+            )
+        self.features, self.head_width = features, head_width
+        self.step_cells, self.initial_density = step_cells, initial_density
+        self.head: nn.Module | None = None
+        if head_width:
+            self.head = nn.Sequential(
+                nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)
+            )
+        self.table = nn.Parameter(torch.zeros(1, 1 + features))
+        for name in ("occupied", "origin", "cell", "index", "distance", "corners"):
+            self.register_buffer(name, torch.empty(0), persistent=name in ("occupied", "origin", "cell"))
+        self.occupied: Tensor
+        self.origin: Tensor
+        self.cell: Tensor
+        self.index: Tensor
+        self.distance: Tensor
+        self.corners: Tensor
+        self.register_load_state_dict_pre_hook(_resize_to_state)
+        self.reset(torch.ones(1, 1, 1, dtype=torch.bool), torch.full((3,), -1.0), 2.0)
+
+    def settings(self) -> dict[str, object]:
+        return {
+            "features": self.features,
+            "head_width": self.head_width,
+            "step_cells": self.step_cells,
+            "initial_density": self.initial_density,
+        }
+
+    @property
+    def occupancy(self) -> Occupancy:
+        return Occupancy(self.origin, float(self.cell), self.index, self.distance)
+
+    @property
+    def step(self) -> float:
+        """The quadrature's step in object radii."""
+        return self.step_cells * float(self.cell)
+
+    def reset(self, occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> None:
+        """Start over with these cells: raw density ``initial_density``, features 0."""
+        coordinates = self._set_cells(occupied, origin, cell)
+        table = self.table.new_zeros(len(coordinates) + 1, 1 + self.features)
+        table[:, 0] = self.initial_density
+        table[-1, 0] = EMPTY_DENSITY
+        self.table = nn.Parameter(table)
+
+    @torch.no_grad()
+    def keep(self, cells: Bool[Tensor, "cells"], refine: bool) -> None:
+        """Drop the occupied cells not in ``cells``; with ``refine``, halve the edge of the rest and interpolate."""
+        occupied = self.occupied.clone()
+        occupied[self.occupied] = cells
+        occupied, origin = crop(occupied, self.origin, float(self.cell))
+        cell = float(self.cell)
+        if refine:
+            occupied, cell = subdivide(occupied), cell / 2.0
+        before, table, old_cell, old_origin = self.occupancy, self.table, float(self.cell), self.origin
+        corners = self.corners
+        coordinates = self._set_cells(occupied, origin, cell)
+        # New vertices lie on old cells' faces; nudged towards the inside of an occupied cell they find a row each.
+        local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
+        rows = _interpolate_from(local, before, corners, table)
+        self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
+
+    def _set_cells(self, occupied: Tensor, origin: Tensor, cell: float) -> Int[Tensor, "vertices 3"]:
+        occupied = occupied.to(self.table.device)
+        occupancy = build_occupancy(occupied, origin.to(self.table), cell)
+        corners, coordinates = vertices(occupancy, CORNERS)
+        # The last row of corners points at the table's last row: empty space.
+        self.corners = functional.pad(corners, (0, 0, 0, 1), value=len(coordinates))
+        self.occupied, self.origin = occupied, occupancy.origin
+        self.cell = torch.tensor(cell, dtype=torch.float64)
+        self.index, self.distance = occupancy.index, occupancy.distance
+        return coordinates
+
+    def raw(
+        self, positions: Float[Tensor, "samples 3"], cells: Int[Tensor, "samples"] | None = None
+    ) -> Float[Tensor, "samples channels"]:
+        """Interpolated table rows. ``cells`` may carry the positions' known cell numbers (-1: empty)."""
+        local = (positions - self.origin) / float(self.cell)
+        base = local.detach().floor()
+        if cells is None:
+            cells = lookup(base, self.occupancy)
+        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
+        weights = trilinear_weights(local - base)
+        if self.training:
+            return interpolate_for_training(self.table, corners, weights)
+        return interpolate(self.table, corners, weights)
+
+    def decode(
+        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        """Density and colour of table rows."""
+        sigma = functional.softplus(raw[:, 0]) / float(self.cell)
+        if self.head is None:
+            return sigma, torch.sigmoid(raw[:, 1:4])
+        return sigma, torch.sigmoid(self.head(torch.cat([raw[:, 1:], directions], -1)))
+
+    def query(
+        self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        return self.decode(self.raw(positions), directions)
+
+    @torch.no_grad()
+    def sample(self, rays: Rays, termination: float) -> PackedSamples:
+        return self.sample_cells(rays, termination, 0.5)[0]
+
+    @torch.no_grad()
+    def sample_cells(
+        self, rays: Rays, termination: float, phase: Float[Tensor, "rays"] | float
+    ) -> tuple[PackedSamples, Int[Tensor, "samples"]]:
+        """``sample`` with a lattice phase per ray (see ``march``), and the number of the cell of each sample."""
+        rays = Rays(rays.origins.detach(), rays.directions.detach())
+        collector = SampleCollector(len(rays.origins), rays.origins)
+        depth = torch.zeros_like(rays.origins[:, 0])
+        deepest = float("inf") if termination <= 0.0 else -float(torch.tensor(termination).log())
+
+        def visit(ray: Tensor, distance: Tensor, cell: Tensor, local: Tensor) -> Tensor:
+            if deepest == float("inf"):
+                collector.add(ray, distance, cell)
+                return torch.ones_like(ray, dtype=torch.bool)
+            optical = torch.zeros_like(distance).flatten()
+            where = (cell >= 0).flatten().nonzero()[:, 0]
+            position = local.flatten(0, 1).index_select(0, where)
+            corners = self.corners.index_select(0, cell.flatten().index_select(0, where))
+            weights = trilinear_weights(position - position.floor())
+            density = self.table[:, :1].contiguous()
+            raw = interpolate(density, corners, weights)[:, 0]
+            optical[where] = functional.softplus(raw) * self.step_cells
+            optical = optical.view_as(distance)
+            inclusive = optical.cumsum(1) + depth.index_select(0, ray)[:, None]
+            collector.add(ray, distance, torch.where(inclusive - optical < deepest, cell, -1))
+            depth.index_copy_(0, ray, inclusive[:, -1])
+            return inclusive[:, -1] < deepest
+
+        march(rays, self.occupancy, self.step, phase, visit)
+        return collector.finish(self.step)
+
+
+def _interpolate_from(
+    local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
+) -> Float[Tensor, "vertices channels"]:
+    """Values of an old table at grid vertices, each taken from whichever of its eight neighbouring cells is occupied."""
+    result = table.new_zeros(len(local), table.shape[1])
+    missing = torch.arange(len(local), device=local.device)
+    for corner in CORNERS:
+        nudge = (corner.to(local) - 0.5) * 1e-2
+        here = local.index_select(0, missing)
+        cell = lookup(here + nudge, occupancy)
+        found = (cell >= 0).nonzero()[:, 0]
+        base = (here + nudge).floor().index_select(0, found)
+        weights = trilinear_weights(here.index_select(0, found) - base)
+        rows = corners.index_select(0, cell.index_select(0, found))
+        result[missing.index_select(0, found)] = interpolate(table, rows, weights)
+        missing = missing[cell < 0]
+    return result
+
+
+def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Give the field the cells of a saved state before its tensors are copied."""
+    if isinstance(field, GridField):
+        field.reset(state[prefix + "occupied"], state[prefix + "origin"], float(state[prefix + "cell"]))

@@ -1,0 +1,73 @@
+"""The visual hull: cells that no view's silhouette rules out (Laurentini 1994), carved coarse to fine."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from neural_sim.cameras import focal_length
+from neural_sim.field.occupancy import subdivide
+from neural_sim.types import PosedViews
+
+COARSEST = 32
+
+
+def visual_hull(
+    views: PosedViews, resolution: int, alpha_threshold: float = 0.004
+) -> tuple[Bool[Tensor, "nx ny nz"], Float[Tensor, "3"], float]:
+    """Occupied cells of the cube [-1, 1]^3 cut into ``resolution`` (32 times a power of two) along each edge.
+
+    A cell goes when some view that sees its centre has no pixel above ``alpha_threshold`` within the circle that
+    the cell can cover, so the hull is never too small. Returns cells, origin and edge length in object radii.
+    Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
+    """
+    if resolution < COARSEST or resolution & (resolution - 1):
+        raise ValueError(f"visual_hull: resolution must be a power of two from {COARSEST}, got {resolution}")
+    pose = views.camera_to_world
+    origin = torch.full((3,), -1.0, dtype=pose.dtype, device=pose.device)
+    size = COARSEST
+    occupied = torch.ones(size, size, size, dtype=torch.bool, device=pose.device)
+    while True:
+        cell = 2.0 / size
+        where = occupied.nonzero()
+        centres = origin + (where.to(pose.dtype) + 0.5) * cell
+        kept = where[_inside_all(views, centres, 0.5 * math.sqrt(3.0) * cell, alpha_threshold)]
+        if not len(kept):
+            raise ValueError(
+                f"visual_hull: the silhouettes of {len(views)} views share no cell; check alpha and poses"
+            )
+        occupied = torch.zeros_like(occupied)
+        occupied[kept.unbind(1)] = True
+        if size == resolution:
+            return occupied, origin, cell
+        occupied, size = subdivide(occupied), 2 * size
+
+
+def _inside_all(
+    views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
+) -> Bool[Tensor, "cells"]:
+    """Whether every view that sees a centre finds object within ``radius`` of it; unseen centres stay."""
+    camera, focal = views.camera, focal_length(views.camera)
+    nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
+    reach = math.ceil(focal * radius / nearest) + 1
+    mask = (views.images[..., 3] > alpha_threshold).to(centres.dtype)[:, None]
+    mask = functional.max_pool2d(mask, (2 * reach + 1, 1), 1, (reach, 0))
+    mask = functional.max_pool2d(mask, (1, 2 * reach + 1), 1, (0, reach))[:, 0] > 0
+    inside = torch.ones(len(centres), dtype=torch.bool, device=centres.device)
+    remaining = torch.arange(len(centres), device=centres.device)
+    for pose, silhouette in zip(views.camera_to_world, mask, strict=True):
+        local = (centres[remaining] - pose[:3, 3]) @ pose[:3, :3]
+        depth = (-local[:, 2]).clamp_min(1e-6)
+        column = (focal * local[:, 0] / depth + 0.5 * camera.width).floor().long()
+        row = (-focal * local[:, 1] / depth + 0.5 * camera.height).floor().long()
+        seen = (
+            (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] < 0)
+        )
+        hit = silhouette[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        inside[remaining[seen & ~hit]] = False
+        remaining = remaining[~seen | hit]
+    return inside

@@ -1,0 +1,58 @@
+"""From rays to pixels through any field: sample, query, composite. One place, so that training and rendering agree."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim import cameras
+from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.quadrature import composite
+from neural_sim.types import PinholeCamera, Rays
+
+
+def sample_points(
+    rays: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples 3"]]:
+    """Positions and directions of the samples, differentiable in the rays; the distances are constants."""
+    directions = rays.directions.index_select(0, samples.ray)
+    origins = rays.origins.index_select(0, samples.ray)
+    return origins + directions * samples.distance[:, None], directions
+
+
+def render_samples(
+    field: RadianceField, rays: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+    """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the given samples."""
+    positions, directions = sample_points(rays, samples)
+    sigma, rgb = field.query(positions, directions)
+    return composite(sigma, rgb, samples)
+
+
+def render_packed(
+    field: RadianceField, rays: Rays, termination: float
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+    """``render_samples`` on the samples that the field itself chooses."""
+    return render_samples(field, rays, field.sample(rays, termination))
+
+
+@torch.no_grad()
+def render_views(
+    field: RadianceField,
+    camera: PinholeCamera,
+    camera_to_world: Float[Tensor, "views 4 4"],
+    termination: float,
+    rays_per_chunk: int,
+) -> Float[Tensor, "views height width 4"]:
+    """Premultiplied RGBA of whole views; chunks bound the memory and may span views."""
+    bundle = cameras.rays(camera, camera_to_world)
+    origins, directions = bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)
+    pixels = [
+        torch.cat([rgb, opacity[:, None]], -1)
+        for rgb, opacity in (
+            render_packed(field, Rays(o, d), termination)
+            for o, d in zip(origins.split(rays_per_chunk), directions.split(rays_per_chunk), strict=True)
+        )
+    ]
+    return torch.cat(pixels).view(*bundle.origins.shape[:-1], 4)

@@ -1,0 +1,46 @@
+"""How well a field shows views that it was not fitted to."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+from neural_sim.field.base import RadianceField
+from neural_sim.field.rendering import render_views
+from neural_sim.types import PosedViews
+
+
+def over_white(premultiplied: Float[Tensor, "views height width 4"]) -> Float[Tensor, "views 3 height width"]:
+    """Premultiplied RGBA over a white background."""
+    rgb = premultiplied[..., :3] + (1.0 - premultiplied[..., 3:])
+    return rgb.movedim(-1, 1).clamp(0.0, 1.0)
+
+
+def score_views(
+    field: RadianceField, views: PosedViews, termination: float, rays_per_chunk: int
+) -> dict[str, float]:
+    """``psnr`` and ``ssim`` of whole images over white, ``psnr_foreground`` over the pixels of alpha above 0.
+
+    PSNR in dB, mean over views of each view's value; SSIM as torchmetrics' default (Gaussian window, range 1).
+    """
+    rendered = over_white(
+        render_views(field, views.camera, views.camera_to_world, termination, rays_per_chunk)
+    )
+    alpha = views.images[..., 3:]
+    target = over_white(torch.cat([views.images[..., :3] * alpha, alpha], -1))
+    psnr = peak_signal_noise_ratio(
+        rendered, target, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean"
+    )
+    ssim = structural_similarity_index_measure(rendered, target, data_range=1.0)
+    foreground = [
+        peak_signal_noise_ratio(image[:, mask], truth[:, mask], data_range=1.0)
+        for image, truth, mask in zip(rendered, target, alpha[..., 0] > 0.0, strict=True)
+        if bool(mask.any())
+    ]
+    return {
+        "psnr": float(psnr),
+        "psnr_foreground": float(torch.stack(foreground).mean()) if foreground else float("nan"),
+        "ssim": float(ssim if isinstance(ssim, Tensor) else ssim[0]),
+    }

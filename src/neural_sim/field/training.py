@@ -1,0 +1,83 @@
+"""Fit a field to posed views in one call; save and load it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import lightning
+import torch
+
+from neural_sim.field.base import RadianceField
+from neural_sim.field.fitting import Fitting
+from neural_sim.field.grid import GridField
+from neural_sim.field.module import Progress, RadianceFieldModule
+from neural_sim.types import PosedViews
+
+KINDS: dict[str, type[RadianceField]] = {"GridField": GridField}
+
+
+def fit_field(
+    views: PosedViews,
+    fitting: Fitting,
+    generator: torch.Generator,
+    *,
+    steps: int,
+    held_out: int = 0,
+    final_rate: float = 0.1,
+    score_every: int = 0,
+    progress: Progress | None = None,
+) -> tuple[RadianceField, list[dict[str, float]]]:
+    """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
+
+    Returns the field, in evaluation mode and without gradients, and its history. Raises ValueError when no view is
+    left to fit.
+    """
+    if not 0 <= held_out < len(views):
+        raise ValueError(
+            f"fit_field: held_out must lie in [0, {len(views)}) for {len(views)} views, got {held_out}"
+        )
+    count = len(views) - held_out
+    index = torch.arange(len(views))
+    module = RadianceFieldModule(
+        fitting,
+        views.select(index[:count]),
+        views.select(index[count:]) if held_out else None,
+        generator,
+        steps,
+        final_rate,
+        score_every,
+        progress,
+    )
+    device = views.images.device
+    trainer = lightning.Trainer(
+        accelerator="cpu" if device.type == "cpu" else "cuda",
+        devices=1,
+        max_epochs=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module)
+    field = module.field.eval().requires_grad_(False).to(device)
+    return field, module.history
+
+
+def save_field(field: RadianceField, path: Path | str) -> None:
+    """Write the kind, the constructor's arguments and the state to one file."""
+    kind = type(field).__name__
+    if kind not in KINDS:
+        raise ValueError(f"save_field: no field of kind {kind}, want one of {sorted(KINDS)}")
+    torch.save({"kind": kind, "settings": field.settings(), "state": field.state_dict()}, path)
+
+
+def load_field(path: Path | str, device: torch.device | str = "cpu") -> RadianceField:
+    """Read what ``save_field`` wrote, in evaluation mode. Raises ValueError when the file holds something else."""
+    saved = torch.load(path, map_location=device, weights_only=True)
+    if not isinstance(saved, dict) or saved.get("kind") not in KINDS:
+        raise ValueError(f"load_field: {path} holds no field of a kind among {sorted(KINDS)}")
+    field = KINDS[saved["kind"]](**saved["settings"]).to(device)
+    field.load_state_dict(saved["state"])
+    return field.eval().requires_grad_(False)
