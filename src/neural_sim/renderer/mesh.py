@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import weakref
 
 import numpy as np
@@ -17,6 +18,11 @@ from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.types import PinholeCamera
+
+with contextlib.suppress(ImportError):
+    # Mesa's software rasteriser loads LLVM, and triton (which torch's optimisers import) brings its own: loaded second,
+    # triton crashes the process; loaded first, both live. Machines without triton have no such trouble.
+    import triton  # noqa: F401
 
 # Closer than this to the camera nothing is drawn; objects have radius 1 and cameras keep outside of them.
 NEAR, FAR = 0.01, 100.0
@@ -54,12 +60,10 @@ class PyrenderRenderer:
         for pose in camera_to_world.detach().cpu().double().numpy():
             scene.set_pose(eye, pose)
             premultiplied, _ = context.render(scene, flags=flags)
-            images.append(
-                straight_alpha(torch.from_numpy(premultiplied / np.float32(255.0)), self.supersample)
-            )
+            images.append(straight_alpha(premultiplied / np.float32(255.0), self.supersample))
         if not images:
             return torch.zeros(0, camera.height, camera.width, 4)
-        return torch.stack(images)
+        return torch.from_numpy(np.stack(images))
 
     def close(self) -> None:
         """Free the OpenGL context; a later ``render`` makes a new one."""

@@ -45,7 +45,7 @@ class RaycastRenderer:
             images.append(straight_alpha(premultiplied, self.supersample))
         if not images:
             return torch.zeros(0, camera.height, camera.width, 4)
-        return torch.stack(images)
+        return torch.from_numpy(np.stack(images))
 
     def close(self) -> None:
         """Nothing to free; here so that both mesh renderers are used alike."""
@@ -53,7 +53,7 @@ class RaycastRenderer:
 
 def _cast(
     mesh: trimesh.Trimesh, surface: Surface, pyramid: Pyramid | None, camera: PinholeCamera, pose: Tensor
-) -> Float[Tensor, "h w 4"]:
+) -> Float[np.ndarray, "h w 4"]:
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
     face = mesh.ray.intersects_first(origins, directions)
@@ -62,7 +62,7 @@ def _cast(
     if len(hit):
         colour = _colours(surface, pyramid, face[hit], origins[hit], directions[hit], camera)
         image[hit, :3], image[hit, 3] = colour, 1.0
-    return torch.from_numpy(image).reshape(camera.height, camera.width, 4)
+    return image.reshape(camera.height, camera.width, 4)
 
 
 def _colours(
@@ -76,9 +76,9 @@ def _colours(
     corners = surface.faces[face]
     weights, distance, cosine, area = _barycentric(surface.vertices[corners], origins, directions)
     sides = np.where((cosine < 0.0)[:, None], surface.front[corners], surface.back[corners])
-    # As in OpenGL, albedo times shade is interpolated and clipped.
+    # As in OpenGL, the product of albedo and shade is interpolated, not its factors.
     vertex_colour = surface.albedo[corners] * sides[..., None]
-    colour = np.einsum("nk,nkc->nc", weights, np.minimum(vertex_colour, np.inf))
+    colour = np.einsum("nk,nkc->nc", weights, vertex_colour)
     if pyramid is not None and surface.uv is not None:
         uv = surface.uv[corners]
         first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
