@@ -1,0 +1,175 @@
+"""Backgrounds: procedural clutter, or crops of photographs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+# Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
+CHUNK = 16
+
+
+class Background(Protocol):
+    """A source of backgrounds, sRGB in [0, 1]; equal generators give equal images."""
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator
+    ) -> Float[Tensor, "n 3 height width"]: ...
+
+
+class ProceduralClutter:
+    """Indoor-like clutter: smooth noise in random colours under textured, shaded rectangles and ellipses.
+
+    Args:
+        octaves: octaves of noise, from 2 cells across the image and doubling.
+        contrast: amplitude of the noise.
+        shapes: shapes an image, drawn far to near.
+        distractors: share of shapes that are saturated red or blue, so that colour alone finds no object.
+        grain: standard deviation of pixel noise.
+
+    Raises:
+        ValueError: a negative number, or a share above 1.
+    """
+
+    def __init__(
+        self,
+        octaves: int = 5,
+        contrast: float = 0.35,
+        shapes: int = 10,
+        distractors: float = 0.4,
+        grain: float = 0.02,
+    ) -> None:
+        if octaves < 1 or shapes < 0:
+            raise ValueError(f"ProceduralClutter: want octaves >= 1 and shapes >= 0, got {octaves}, {shapes}")
+        if contrast < 0.0 or grain < 0.0:
+            raise ValueError(
+                f"ProceduralClutter: contrast and grain must not be negative, got {contrast}, {grain}"
+            )
+        if not 0.0 <= distractors <= 1.0:
+            raise ValueError(f"ProceduralClutter: distractors must lie in [0, 1], got {distractors}")
+        self.octaves, self.contrast, self.shapes = octaves, contrast, shapes
+        self.distractors, self.grain = distractors, grain
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator
+    ) -> Float[Tensor, "n 3 height width"]:
+        """``n`` images, float32 on the CPU."""
+        images = torch.empty(n, 3, height, width)
+        for start in range(0, n, CHUNK):
+            part = images[start : start + CHUNK]
+            part.copy_(self._chunk(len(part), height, width, generator))
+        return images
+
+    def _chunk(self, n: int, height: int, width: int, generator: torch.Generator) -> Tensor:
+        images = self._wall(n, height, width, generator)
+        for depth in range(self.shapes):
+            # Far shapes are large, near ones small, so that none hides all the others.
+            size = 0.45 * 0.5 ** (2.0 * depth / max(self.shapes - 1, 1))
+            cover, level, colour = self._shape(n, height, width, size, generator)
+            images += cover[:, None] * (colour * level[:, None] - images)
+        images += self.grain * torch.randn(images.shape, generator=generator)
+        return images.clamp_(0.0, 1.0)
+
+    def _wall(self, n: int, height: int, width: int, generator: torch.Generator) -> Tensor:
+        """A random colour with noise of every scale, mostly grey in hue."""
+        base = 0.2 + 0.6 * torch.rand((n, 1, 1, 1), generator=generator)
+        tint = 0.25 * (torch.rand((n, 3, 1, 1), generator=generator) - 0.5)
+        images = (base + tint).expand(n, 3, height, width).clone()
+        for octave in range(self.octaves):
+            cells = 2 ** (octave + 1) + 1
+            grey = torch.rand((n, 1, cells, cells), generator=generator)
+            hue = torch.rand((n, 3, cells, cells), generator=generator)
+            noise = (0.7 * grey + 0.3 * hue - 0.5) * (2.0 * self.contrast * 0.65**octave)
+            images += torch.nn.functional.interpolate(
+                noise, (height, width), mode="bilinear", align_corners=True
+            )
+        return images
+
+    def _shape(
+        self, n: int, height: int, width: int, size: float, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Coverage and brightness [n, h, w] and colour [n, 3, 1, 1] of one textured shape an image."""
+        u = torch.rand((12, n, 1, 1), generator=generator)
+        extent = float(min(height, width))
+        angle = math.pi * torch.where(u[0] < 0.5, 0.08 * (u[1] - 0.5), u[1])  # half of them nearly upright
+        x = torch.arange(width) + 0.5 - width * (1.2 * u[2] - 0.1)
+        y = (torch.arange(height) + 0.5)[:, None] - height * (1.2 * u[3] - 0.1)
+        along, across = angle.cos() * x + angle.sin() * y, angle.cos() * y - angle.sin() * x
+        half_x, half_y = (extent * size * (0.3 + 0.9 * u[i]) for i in (4, 5))
+        box = torch.maximum(along.abs() - half_x, across.abs() - half_y)
+        round_ = ((along / half_x).square() + (across / half_y).square()).sqrt_().sub_(1.0)
+        distance = torch.where(u[6] < 0.6, box, round_ * torch.minimum(half_x, half_y))
+        cover = (0.5 - distance).clamp_(0.0, 1.0)
+        period = extent * (0.04 + 0.2 * u[7])
+        stripes = (2.0 * math.pi / period * along + 6.28 * u[8]).sin_().mul_(4.0).clamp_(-1.0, 1.0)
+        checks = stripes * torch.where(u[9] < 0.5, across.sign(), torch.ones(()))
+        texture = torch.where(u[9] < 0.7, 0.25 * u[10], torch.zeros(()))  # three in ten are plain
+        level = 0.85 + texture * checks + 0.3 * (u[11] - 0.5) * across / half_y
+        return cover, level, self._colour(n, generator)
+
+    def _colour(self, n: int, generator: torch.Generator) -> Float[Tensor, "n 3 1 1"]:
+        """Any hue, mostly dull; a ``distractors`` share is saturated, near red or near blue."""
+        u = torch.rand((5, n), generator=generator)
+        strong = u[0] < self.distractors
+        centre = torch.where(u[1] < 0.5, 0.0, 0.61)
+        hue = torch.where(strong, centre + 0.1 * (u[2] - 0.5), u[2])
+        saturation = torch.where(strong, 0.5 + 0.5 * u[3], 0.6 * u[3].square())
+        value = 0.25 + 0.7 * u[4]
+        wheel = (hue[:, None] + torch.tensor([0.0, 2 / 3, 1 / 3])) % 1.0
+        pure = ((6.0 * wheel - 3.0).abs() - 1.0).clamp(0.0, 1.0)
+        return (value[:, None] * (1.0 - saturation[:, None] * (1.0 - pure)))[..., None, None]
+
+
+class PhotoFolder:
+    """Random crops of the photographs under a folder, resized; ``smallest`` is the least crop, as a share of the most.
+
+    Raises:
+        ValueError: no folder, no photograph in it, or ``smallest`` outside (0, 1].
+    """
+
+    def __init__(self, root: str | Path, smallest: float = 0.4) -> None:
+        self.root, self.smallest = Path(root).expanduser(), smallest
+        if not self.root.is_dir():
+            raise ValueError(f"synthesis.background.root: want a folder of photographs, got {self.root}")
+        if not 0.0 < smallest <= 1.0:
+            raise ValueError(f"synthesis.background.smallest must lie in (0, 1], got {smallest}")
+        self.files = sorted(path for path in self.root.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+        if not self.files:
+            raise ValueError(
+                f"synthesis.background.root: no photograph ({', '.join(PHOTO_SUFFIXES)}) in {self.root}"
+            )
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator
+    ) -> Float[Tensor, "n 3 height width"]:
+        """``n`` crops, float32 on the CPU. Raises ``ValueError`` naming a file that cannot be read."""
+        chosen = torch.randint(len(self.files), (n,), generator=generator).tolist()
+        uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
+        images = torch.empty(n, 3, height, width)
+        for file in sorted(set(chosen)):  # every file is decoded once
+            photo = _read(self.files[file])
+            for index in (i for i, other in enumerate(chosen) if other == file):
+                images[index] = self._crop(photo, height, width, *uniform[index])
+        return images
+
+    def _crop(self, photo: Image.Image, height: int, width: int, u: float, v: float, w: float) -> Tensor:
+        scale = min(photo.width / width, photo.height / height) * (self.smallest + (1.0 - self.smallest) * w)
+        left, top = u * (photo.width - scale * width), v * (photo.height - scale * height)
+        box = (left, top, left + scale * width, top + scale * height)
+        crop = photo.resize((width, height), Image.Resampling.BILINEAR, box=box)
+        return torch.from_numpy(np.asarray(crop, dtype=np.float32) / 255.0).movedim(-1, 0)
+
+
+def _read(path: Path) -> Image.Image:
+    try:
+        return Image.open(path).convert("RGB")
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"{path}: not a readable photograph ({error})") from error
