@@ -122,12 +122,12 @@ _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 def _blue_side(emblem: Colour, band: Colour, generator: torch.Generator) -> Print:
     """A cylinder's side: blue, the white label with header, emblem and small print on +x, a band round the foot."""
     side = Print(512, 256, BLUE)
-    side.rectangle(0.0, 0.06, 1.0, 0.16, band)
+    side.rectangle(0.0, 0.04, 1.0, 0.17, band)
     side.rectangle(0.3, 0.24, 0.7, 0.84, WHITE)
     side.rectangle(0.3, 0.68, 0.7, 0.78, NAVY)
-    side.disc(0.5, 0.48, 0.085, 0.16, emblem)
-    side.text_lines((0.33, 0.27, 0.4, 0.64), 5, DARK_GREY, generator)
-    side.text_lines((0.6, 0.27, 0.67, 0.64), 5, DARK_GREY, generator)
+    side.disc(0.5, 0.46, 0.1, 0.19, emblem)
+    side.text_lines((0.32, 0.27, 0.38, 0.64), 5, DARK_GREY, generator)
+    side.text_lines((0.62, 0.27, 0.68, 0.64), 5, DARK_GREY, generator)
     return side
 
 
@@ -161,9 +161,9 @@ def _spouted(part: Part, half_height: float) -> Part:
 
 def _red_front(emblem: Colour, band: Colour, generator: torch.Generator) -> Print:
     front = Print(192, 256, RED)
-    front.rectangle(0.0, 0.84, 1.0, 0.94, band)
+    front.rectangle(0.0, 0.82, 1.0, 0.95, band)
     front.rectangle(0.14, 0.2, 0.86, 0.74, WHITE)
-    front.disc(0.5, 0.52, 0.22, 0.165, emblem)
+    front.disc(0.5, 0.53, 0.26, 0.19, emblem)
     front.text_lines((0.2, 0.23, 0.8, 0.33), 2, DARK_GREY, generator)
     return front
 

@@ -1,0 +1,99 @@
+"""A BOP benchmark's ``models`` folder: ``obj_000001.ply`` in millimetres and ``models_info.json``."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from neural_sim.objects.files import choose, file_digest, load_file
+from neural_sim.objects.mesh import ObjectMesh
+
+log = logging.getLogger(__name__)
+
+MILLIMETRE = 1e-3
+# models_info.json rounds, and some of its diameters are measured on denser models.
+DIAMETER_TOLERANCE = 0.05
+
+
+class BOP:
+    """Objects of a BOP models folder, all of them or those named: 'obj_000001', '000001', '1' or 1.
+
+    Raises ``ValueError`` where the folder holds no ``obj_*.ply`` or a name is unknown.
+    """
+
+    def __init__(self, root: str | Path, names: list[str | int] | None = None) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise ValueError(f"objects.root: {self.root} is not a folder")
+        files = {path.stem: path for path in self.root.glob("obj_*.ply")}
+        if not files:
+            raise ValueError(f"objects.root: {self.root} holds no obj_*.ply; want a BOP models folder")
+        aliases: dict[str, str] = {}
+        for stem in files:
+            number = stem.removeprefix("obj_")
+            aliases[number] = stem
+            aliases[number.lstrip("0") or "0"] = stem
+        wanted = None if names is None else [str(name) for name in names]
+        self._files = {name: files[name] for name in choose(files, wanted, aliases, str(self.root))}
+        self._info = self.root / "models_info.json"
+
+    def names(self) -> list[str]:
+        return list(self._files)
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the mesh and its texture file by object, without parsing the mesh."""
+        return {name: file_digest(path, path.with_suffix(".png")) for name, path in self._files.items()}
+
+    def load(self) -> list[ObjectMesh]:
+        """The objects, normalised, in the order of ``names``; transforms lead to metres.
+
+        Raises ``ValueError`` where a mesh's extent contradicts the diameter in models_info.json in any unit.
+        """
+        diameters, digests = self._diameters(), self.digests()
+        items = []
+        for name, path in self._files.items():
+            item = load_file(path, name, digests[name], MILLIMETRE)
+            number = str(int(name.removeprefix("obj_")))
+            items.append(self._checked(item, path, diameters.get(number)))
+        return items
+
+    def _diameters(self) -> dict[str, float]:
+        """Diameters in millimetres by object number; empty, with a warning, where the folder has no such file."""
+        if not self._info.is_file():
+            log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
+            return {}
+        try:
+            info = json.loads(self._info.read_text())
+            return {str(int(number)): float(entry["diameter"]) for number, entry in info.items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{self._info}: want {{number: {{'diameter': mm}}}}: {error}") from error
+
+    def _checked(self, item: ObjectMesh, path: Path, diameter: float | None) -> ObjectMesh:
+        """The object with its unit settled: the file's unit is millimetres or, by its diameter, metres."""
+        if diameter is None:
+            return item
+        measured = _diameter(item) / MILLIMETRE
+        if abs(measured / diameter - 1.0) <= DIAMETER_TOLERANCE:
+            return item
+        if abs(measured / MILLIMETRE / diameter - 1.0) <= DIAMETER_TOLERANCE:
+            log.warning("%s is in metres, not millimetres, by the diameter in %s", path, self._info)
+            transform = item.transform.copy()
+            transform[:3] /= MILLIMETRE
+            return ObjectMesh(item.name, item.mesh, transform, item.digest)
+        raise ValueError(
+            f"{path}: measures {measured:.4g} mm across where {self._info.name} says {diameter:.4g}; "
+            "want both in millimetres"
+        )
+
+
+def _diameter(item: ObjectMesh) -> float:
+    """Largest distance between two vertices, in metres; over the hull's vertices, where it is attained."""
+    try:
+        points = np.asarray(item.mesh.convex_hull.vertices)
+    except (ValueError, RuntimeError):  # flat meshes have no hull; scipy's QhullError is a RuntimeError
+        points = np.asarray(item.mesh.vertices)
+    farthest = max(float(np.linalg.norm(points - point, axis=1).max()) for point in points)
+    return farthest * float(item.transform[0, 0])
