@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+
 from neural_sim import cameras
 from neural_sim.gradient.base import ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import logging
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,10 +36,10 @@ class LinearSolver(abc.ABC):
         operator: Watched,
         rhs: Float[Tensor, "n"],
         start: Float[Tensor, "n"],
-        rtol: float,
+        tolerance: float,
         max_steps: int,
     ) -> Iterate:
-        """Iterate from ``start`` on a right-hand side of norm 1 until the relative residual is below ``rtol``."""
+        """Iterate from ``start`` until the residual's norm is below ``tolerance``; ``rhs`` has a norm in [1, 2)."""
 
     def solve(
         self,
@@ -62,14 +63,15 @@ class LinearSolver(abc.ABC):
         failed = Solution(torch.zeros_like(b), Status.NON_FINITE, 0, 1.0, (0.0, 0.0), 0, False)
         if not bool(torch.isfinite(b).all()):
             return failed
-        # Two divisions rather than one by the norm: 1e30 squared overflows float32, 1e-30 squared underflows.
-        rhs = b / scale
+        scale = _power_of_two(scale)
+        rhs = b / scale  # the norm of b itself would overflow float32 at 1e20 and underflow at 1e-30
+        unit = _power_of_two(norm(rhs))
+        rhs = rhs / unit
         size = norm(rhs)
-        rhs = rhs / size
-        start = _warm_start(operator, rhs, None if x0 is None else x0 / scale / size)
+        start = _warm_start(operator, rhs, None if x0 is None else x0 / scale / unit)
         try:
-            end = self.iterate(operator, rhs, start, rtol, max_steps)
-            residual = norm(rhs - operator(end.value))
+            end = self.iterate(operator, rhs, start, rtol * size, max_steps)
+            residual = norm(rhs - operator(end.value)) / size
         except NonFiniteProduct as error:
             logger.warning("%s: %s", type(self).__name__, error)
             return Solution(
@@ -79,7 +81,7 @@ class LinearSolver(abc.ABC):
             # Rounding made the recursion lose touch with the true residual: zero is the better answer.
             logger.warning("%s: the true residual is %.3g; zero is returned", type(self).__name__, residual)
             end, residual = Iterate(torch.zeros_like(rhs), _lost(end.status), end.steps), 1.0
-        value = end.value * size * scale
+        value = end.value * unit * scale
         if not bool(torch.isfinite(value).all()):
             return Solution(
                 failed.value, Status.NON_FINITE, end.steps, 1.0, operator.curvature, operator.products, False
@@ -96,6 +98,11 @@ def _verified(claimed: Status, residual: float, rtol: float) -> Status:
     return Status.STAGNATED if claimed is Status.CONVERGED else claimed
 
 
+def _power_of_two(size: float) -> float:
+    """The power of two below ``size``: scaling by it is exact, so the scaled residual is the original one's."""
+    return 2.0 ** (math.frexp(size)[1] - 1)
+
+
 def _lost(claimed: Status) -> Status:
     return Status.STAGNATED if claimed in (Status.CONVERGED, Status.MAX_STEPS) else claimed
 
@@ -108,7 +115,7 @@ def _warm_start(
     if guess is None or not bool(torch.isfinite(guess).all()) or not bool(guess.any()):
         return zero
     try:
-        residual = norm(rhs - operator(guess))
+        residual = norm(rhs - operator(guess)) / norm(rhs)
     except NonFiniteProduct:
         logger.info("warm start dropped: its product is not finite")
         return zero

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.base import Iterate, LinearSolver
-from neural_sim.solver.operator import Watched, dot, norm
+from neural_sim.solver.operator import Matvec, Watched, dot, norm
 from neural_sim.solver.solution import Status
 
 
@@ -30,37 +30,53 @@ class ConjugateGradient(LinearSolver):
         operator: Watched,
         rhs: Float[Tensor, "n"],
         start: Float[Tensor, "n"],
-        rtol: float,
+        tolerance: float,
         max_steps: int,
     ) -> Iterate:
-        value = best = start
-        residual = rhs - operator(start) if bool(start.any()) else rhs
-        confirmed = best_norm = norm(residual)
-        direction, squared = residual, confirmed**2
-        if confirmed <= rtol:
-            return Iterate(best, Status.CONVERGED, 0)
-        for step in range(1, max_steps + 1):
-            product = operator(direction)
-            curvature = dot(direction, product)
-            # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich),
-            # so one below machine epsilon is curvature that rounding cannot tell from zero.
-            if curvature <= torch.finfo(rhs.dtype).eps * norm(direction) * norm(product):
-                return Iterate(best, Status.NEGATIVE_CURVATURE, step)
-            alpha = squared / curvature
-            value = value + alpha * direction
-            residual = residual - alpha * product
-            size = norm(residual)
-            if size < best_norm:
-                best, best_norm = value, size
-            beta = size**2 / squared
-            if size <= rtol:
-                residual = rhs - operator(value)
-                true = norm(residual)
-                if true <= rtol:
-                    return Iterate(value, Status.CONVERGED, step)
-                if true > self.restart_gain * confirmed:
-                    return Iterate(value, Status.STAGNATED, step)
-                confirmed = best_norm = size = true
-                best, beta = value, 0.0
-            direction, squared = residual + beta * direction, size**2
-        return Iterate(best, Status.MAX_STEPS, max_steps)
+        return conjugate_gradients(operator, rhs, start, tolerance, max_steps, self.restart_gain)
+
+
+def conjugate_gradients(
+    operator: Watched,
+    rhs: Float[Tensor, "n"],
+    start: Float[Tensor, "n"],
+    tolerance: float,
+    max_steps: int,
+    restart_gain: float,
+    precondition: Matvec = lambda residual: residual,
+) -> Iterate:
+    """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse."""
+    value = best = start
+    residual = rhs - operator(start) if bool(start.any()) else rhs
+    confirmed = best_norm = norm(residual)
+    if confirmed <= tolerance:
+        return Iterate(best, Status.CONVERGED, 0)
+    direction = precondition(residual)
+    energy = dot(residual, direction)
+    for step in range(1, max_steps + 1):
+        product = operator(direction)
+        curvature = dot(direction, product)
+        # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich), so one
+        # below machine epsilon is curvature that rounding cannot tell from zero.
+        if curvature <= torch.finfo(rhs.dtype).eps * norm(direction) * norm(product):
+            return Iterate(best, Status.NEGATIVE_CURVATURE, step)
+        alpha = energy / curvature
+        value = value + alpha * direction
+        residual = residual - alpha * product
+        size = norm(residual)
+        if size < best_norm:
+            best, best_norm = value, size
+        restart = size <= tolerance
+        if restart:
+            residual = rhs - operator(value)
+            true = norm(residual)
+            if true <= tolerance:
+                return Iterate(value, Status.CONVERGED, step)
+            if true > restart_gain * confirmed:
+                return Iterate(value, Status.STAGNATED, step)
+            confirmed = best_norm = true
+            best = value
+        conditioned = precondition(residual)
+        before, energy = energy, dot(residual, conditioned)
+        direction = conditioned if restart else conditioned + (energy / before) * direction
+    return Iterate(best, Status.MAX_STEPS, max_steps)

@@ -45,9 +45,9 @@ class GaussNewtonOperator:
         tangent = unflatten(vector, self._params)
         total = torch.zeros_like(vector)
         for term in self._terms:
-            outputs, pull_back = torch.func.vjp(term.outputs, self._params)
-            _, moved = torch.func.jvp(term.outputs, (self._params,), (tangent,))
-            _, curved = torch.func.jvp(torch.func.grad(term.loss), (outputs,), (moved,))
+            outputs, pull_back = torch.func.vjp(term.outputs, self._params)[:2]
+            moved = torch.func.jvp(term.outputs, (self._params,), (tangent,))[1]
+            curved = torch.func.jvp(torch.func.grad(term.loss), (outputs,), (moved,))[1]
             (part,) = pull_back(curved)
             total += flatten(part)
         return total

@@ -81,7 +81,7 @@ class HessianOperator:
     def _reverse_over_reverse(self, vector: Tensor) -> Tensor:
         total = torch.zeros_like(self._point)
         kept = self._retained is not None
-        for point, slope in self._retained if kept else self._gradient_graphs():
+        for point, slope in self._gradient_graphs() if self._retained is None else self._retained:
             if slope.requires_grad:  # a linear term's gradient is constant
                 (part,) = torch.autograd.grad(slope, point, vector, retain_graph=kept, materialize_grads=True)
                 total += part

@@ -67,8 +67,12 @@ class Watched:
         size = norm(vector)
         if size > 0.0:
             quotient = dot(vector, product) / size**2
-            self._low, self._high = min(self._low, quotient), max(self._high, quotient)
+            self.observe(quotient, quotient)
         return product
+
+    def observe(self, low: float, high: float) -> None:
+        """Widen the curvature range by values known otherwise, for instance eigenvalues."""
+        self._low, self._high = min(self._low, low), max(self._high, high)
 
 
 def dense(

@@ -1,0 +1,34 @@
+"""The inverse taken as a multiple of the identity: the one-step choice T1-T2 (Luketina et al. 2016)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.operator import Watched
+from neural_sim.solver.solution import Status
+
+
+@dataclass(frozen=True)
+class Identity(LinearSolver):
+    """``x = scale b``. One product is spent all the same, on an honest residual."""
+
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.scale) and self.scale != 0.0):
+            raise ValueError(f"identity: scale must be finite and not 0, got {self.scale}")
+
+    def iterate(
+        self,
+        operator: Watched,
+        rhs: Float[Tensor, "n"],
+        start: Float[Tensor, "n"],
+        tolerance: float,
+        max_steps: int,
+    ) -> Iterate:
+        return Iterate(self.scale * rhs, Status.APPROXIMATE, 0)

@@ -1,0 +1,102 @@
+"""Minimum residuals (Paige and Saunders 1975) for symmetric operators, indefinite and singular ones included."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.operator import Watched, dot, norm
+from neural_sim.solver.solution import Status
+
+
+@dataclass(frozen=True)
+class MinimumResidual(LinearSolver):
+    """For any symmetric operator. The residual falls monotonically; on an inconsistent singular system it
+    ends at a least-squares solution and says so. ``restart_gain`` as in ``ConjugateGradient``.
+    """
+
+    restart_gain: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.restart_gain < 1.0:
+            raise ValueError(f"minres: restart_gain must lie in (0, 1), got {self.restart_gain}")
+
+    def iterate(
+        self,
+        operator: Watched,
+        rhs: Float[Tensor, "n"],
+        start: Float[Tensor, "n"],
+        tolerance: float,
+        max_steps: int,
+    ) -> Iterate:
+        value, steps = start, 0
+        residual = rhs - operator(start) if bool(start.any()) else rhs
+        size = norm(residual)
+        while size > tolerance:
+            if steps >= max_steps:
+                return Iterate(value, Status.MAX_STEPS, steps)
+            cycle = _cycle(operator, residual, tolerance, max_steps - steps)
+            steps += cycle.steps
+            after = rhs - operator(value + cycle.value)
+            reached = norm(after)
+            if cycle.least is not None and reached > self.restart_gain * cycle.least_norm:
+                return Iterate(value + cycle.least, Status.LEAST_SQUARES, steps)
+            if reached > (self.restart_gain if cycle.converged else 1.0) * size:
+                best = value + cycle.value if reached < size else value
+                return Iterate(best, Status.STAGNATED, steps)
+            value, residual, size = value + cycle.value, after, reached
+        return Iterate(value, Status.CONVERGED, steps)
+
+
+@dataclass(frozen=True)
+class _Cycle:
+    """One run from a residual. ``least`` is the iterate whose residual was all but orthogonal to the range, if any."""
+
+    value: Float[Tensor, "n"]
+    converged: bool
+    steps: int
+    least: Float[Tensor, "n"] | None
+    least_norm: float
+
+
+def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, budget: int) -> _Cycle:
+    """Lanczos three-term recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
+    eta = norm(residual)  # the signed residual norm: last entry of the rotated right-hand side
+    basis, before = residual / eta, torch.zeros_like(residual)
+    direction, older = torch.zeros_like(residual), torch.zeros_like(residual)
+    value = torch.zeros_like(residual)
+    beta, cosine, sine, cosine_before, sine_before, largest = 0.0, 1.0, 0.0, 1.0, 0.0, 0.0
+    least, least_norm, lowest = None, math.inf, math.inf
+    half_digits = torch.finfo(residual.dtype).eps ** 0.5
+    for step in range(1, budget + 1):
+        product = operator(basis) - beta * before
+        alpha = dot(basis, product)
+        product = product - alpha * basis
+        beta_next = norm(product)
+        largest = max(largest, math.hypot(beta, alpha, beta_next))
+        carried = cosine_before * beta
+        diagonal = cosine * alpha - sine * carried
+        upper, upper_two = cosine * carried + sine * alpha, sine_before * beta
+        # |A r| / |r| of the iterate so far (Choi, Paige and Saunders 2011). Where it all but vanishes, what is left of
+        # the right-hand side lies outside the range, or on eigenvalues below half the digits: going on tells which.
+        slope = math.hypot(diagonal, cosine * beta_next) / largest if largest > 0.0 else 0.0
+        if slope <= min(half_digits, lowest):
+            least, least_norm, lowest = value, abs(eta), slope
+        rotated = math.hypot(diagonal, beta_next)
+        bounced = least is not None and slope > 1e4 * half_digits and abs(eta) > 0.5 * least_norm
+        if rotated == 0.0 or bounced:
+            return _Cycle(value, False, step, least, least_norm)
+        cosine_before, sine_before = cosine, sine
+        cosine, sine = diagonal / rotated, beta_next / rotated
+        direction, older = (basis - upper_two * older - upper * direction) / rotated, direction
+        value = value + (cosine * eta) * direction
+        eta = -sine * eta
+        if abs(eta) <= tolerance or beta_next == 0.0:
+            return _Cycle(value, True, step, least, least_norm)
+        before, basis, beta = basis, product / beta_next, beta_next
+    return _Cycle(value, False, budget, least, least_norm)

@@ -1,0 +1,239 @@
+"""Hessian and Gauss-Newton products against torch.func.hessian, Lanczos and damping against eigvalsh."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
+from neural_sim.solver.hvp import HessianOperator, gradient
+from neural_sim.solver.lanczos import lanczos, random_start
+from neural_sim.solver.operator import dense
+from neural_sim.solver.solution import Status
+
+DOUBLE = torch.float64
+MODES = ["reverse_over_reverse", "forward_over_reverse", "central_difference"]
+
+
+@pytest.fixture
+def network(generator):
+    """A small network's parameters and its loss terms, split at the outputs, over uneven chunks of inputs."""
+
+    def draw(*shape: int):
+        return torch.randn(*shape, generator=generator, dtype=DOUBLE)
+
+    params = {"in": draw(3, 4), "bias": draw(4), "out": draw(4, 2)}
+    inputs, targets = draw(7, 3), draw(7, 2)
+
+    def outputs(x):
+        return lambda p: (torch.nn.functional.silu(x @ p["in"] + p["bias"]) @ p["out"],)
+
+    def loss(y):
+        return lambda out: torch.logaddexp(out[0], -y * out[0]).sum() / 7
+
+    terms = [
+        CompositeTerm(outputs(x), loss(y)) for x, y in zip(inputs.split(3), targets.split(3), strict=True)
+    ]
+    return params, terms
+
+
+def dense_hessian(params, terms):
+    return torch.func.hessian(lambda flat: sum(term(unflatten(flat, params)) for term in terms))(
+        flatten(params)
+    )
+
+
+@pytest.mark.parametrize(("mode", "retain"), [(mode, False) for mode in MODES] + [(MODES[0], True)])
+def test_hessian_products_equal_the_dense_hessian(network, mode, retain):
+    params, terms = network
+    operator = HessianOperator(terms, params, mode, retain_graph=retain)
+    tolerance = 1e-7 if mode == "central_difference" else 1e-12
+    torch.testing.assert_close(operator.dense(), dense_hessian(params, terms), rtol=tolerance, atol=tolerance)
+
+
+def test_central_difference_is_scale_free(network):
+    params, terms = network
+    operator = HessianOperator(terms, params, "central_difference")
+    vector = random_start(operator.size, torch.Generator().manual_seed(3), dtype=DOUBLE)
+    for scale in (1e-20, 1e20):
+        torch.testing.assert_close(operator(scale * vector) / scale, operator(vector), rtol=1e-7, atol=1e-8)
+    assert operator(torch.zeros_like(vector)).norm() == 0.0
+
+
+def test_gradient_equals_autograd_and_chunks_do_not_matter(network):
+    params, terms = network
+    reference = torch.func.grad(lambda flat: sum(term(unflatten(flat, params)) for term in terms))(
+        flatten(params)
+    )
+    torch.testing.assert_close(gradient(terms, params), reference)
+    torch.testing.assert_close(HessianOperator(terms, params).gradient(), reference)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_linear_and_constant_terms_have_no_curvature(mode):
+    params = {"a": torch.ones(3, dtype=DOUBLE), "unused": torch.ones(2, dtype=DOUBLE)}
+    terms = [lambda p: p["a"].sum(), lambda p: (p["a"] * 0.0).sum() + 1.0]
+    product = HessianOperator(terms, params, mode)(torch.ones(5, dtype=DOUBLE))
+    assert product.norm() < 1e-8
+
+
+@pytest.mark.parametrize("mode", MODES[:2])
+def test_a_product_evaluates_the_loss_once(network, mode):
+    params, terms = network
+    calls = 0
+
+    def counted(p):
+        nonlocal calls
+        calls += 1
+        return terms[0](p)
+
+    HessianOperator([counted], params, mode)(flatten(params))
+    assert calls == 1
+
+
+def test_gauss_newton_products_equal_the_dense_matrix(network):
+    params, terms = network
+    reference = torch.zeros(flatten(params).numel(), flatten(params).numel(), dtype=DOUBLE)
+    for term in terms:
+        out = term.outputs(params)[0]
+        jacobian = torch.func.jacrev(
+            lambda flat, term=term: term.outputs(unflatten(flat, params))[0].flatten()
+        )(flatten(params))
+        curvature = torch.func.hessian(lambda flat, term=term, out=out: term.loss((flat.view_as(out),)))(
+            out.flatten()
+        )
+        reference += jacobian.T @ curvature @ jacobian
+    operator = GaussNewtonOperator(terms, params)
+    torch.testing.assert_close(operator.dense(), reference, rtol=1e-11, atol=1e-12)
+
+
+def test_gauss_newton_of_linear_outputs_is_the_hessian(generator):
+    params = {"w": torch.randn(3, generator=generator, dtype=DOUBLE)}
+    x = torch.randn(5, 3, generator=generator, dtype=DOUBLE)
+    term = CompositeTerm(lambda p: x @ p["w"], lambda out: torch.cosh(out).sum())
+    torch.testing.assert_close(GaussNewtonOperator([term], params).dense(), dense_hessian(params, [term]))
+
+
+def test_flatten_round_trip(network):
+    params, _ = network
+    back = unflatten(flatten(params), params)
+    assert list(back) == list(params)
+    assert all(torch.equal(back[key], params[key]) for key in params)
+    with pytest.raises(ValueError, match="want"):
+        unflatten(torch.zeros(3), params)
+    with pytest.raises(ValueError, match="no parameters"):
+        flatten({})
+
+
+def test_operators_refuse_nonsense(network):
+    params, terms = network
+    with pytest.raises(ValueError, match="mode"):
+        HessianOperator(terms, params, "sideways")
+    with pytest.raises(ValueError, match="terms"):
+        HessianOperator([], params)
+    with pytest.raises(ValueError, match="terms"):
+        GaussNewtonOperator([], params)
+
+
+def test_lanczos_finds_the_extreme_eigenvalues(generator):
+    matrix = torch.randn(40, 40, generator=generator, dtype=DOUBLE)
+    matrix = matrix + matrix.T
+    values = torch.linalg.eigvalsh(matrix)
+    full = lanczos(lambda v: matrix @ v, random_start(40, generator, dtype=DOUBLE), 100)
+    assert full.products == 40
+    assert full.smallest == pytest.approx(float(values[0]), rel=1e-10)
+    assert full.largest == pytest.approx(float(values[-1]), rel=1e-10)
+    few = lanczos(lambda v: matrix @ v, random_start(40, generator, dtype=DOUBLE), 12)
+    assert float(values[0]) - 1e-12 <= few.smallest and few.largest <= float(values[-1]) + 1e-12
+    for ritz, error in ((few.smallest, few.smallest_error), (few.largest, few.largest_error)):
+        assert float((values - ritz).abs().min()) <= error + 1e-12
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-6, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_lanczos_in_any_unit(scale, dtype, generator):
+    diagonal = torch.tensor([-1.0, 0.5, 2.0, 2.0, 7.0], dtype=dtype) * scale
+    spectrum = lanczos(lambda v: diagonal * v, random_start(5, generator, dtype=dtype), 5)
+    assert spectrum.smallest == pytest.approx(-scale, rel=1e-4)
+    assert spectrum.largest == pytest.approx(7 * scale, rel=1e-4)
+
+
+def test_lanczos_on_one_unknown_zero_and_non_finite_operators(generator):
+    one = lanczos(lambda v: -3.0 * v, torch.ones(1, dtype=DOUBLE), 10)
+    assert (one.smallest, one.largest, one.products) == (-3.0, -3.0, 1)
+    zero = lanczos(lambda v: 0.0 * v, torch.ones(4, dtype=DOUBLE), 10)
+    assert (zero.smallest, zero.largest) == (0.0, 0.0)
+    bad = lanczos(lambda v: math.nan * v, torch.ones(4, dtype=DOUBLE), 10)
+    assert not bad.finite and (bad.smallest, bad.largest) == (0.0, 0.0)
+    with pytest.raises(ValueError, match="non-zero"):
+        lanczos(lambda v: v, torch.zeros(2), 3)
+    with pytest.raises(ValueError, match="steps"):
+        lanczos(lambda v: v, torch.ones(2), 0)
+
+
+@pytest.mark.parametrize("low", [-5.0, -1e-3, 0.0, 1e-4, 1.0])
+def test_lanczos_damping_bounds_the_condition_number(low, generator):
+    values = torch.linspace(low, 10.0, 30, dtype=DOUBLE)
+    choice = LanczosDamping(max_condition=50.0, lanczos_steps=30).choose(
+        lambda v: values * v, values, generator
+    )
+    damped = values + choice.value
+    assert float(damped.min()) > 0.0
+    assert float(damped.max() / damped.min()) <= 50.0 * (1 + 1e-9)
+    assert choice.condition == pytest.approx(float(damped.max() / damped.min()), rel=1e-6)
+    assert choice.value >= 1.25 * max(0.0, -low) * (1 - 1e-9)
+
+
+def test_damping_of_a_non_finite_operator_is_its_minimum(generator):
+    choice = LanczosDamping(minimum=0.125).choose(
+        lambda v: v * math.nan, torch.ones(3, dtype=DOUBLE), generator
+    )
+    assert choice.value == 0.125
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: FixedDamping(-1.0),
+        lambda: FixedDamping(math.nan),
+        lambda: GaussNewtonDamping(math.inf),
+        lambda: LanczosDamping(max_condition=1.0),
+        lambda: LanczosDamping(lanczos_steps=0),
+    ],
+)
+def test_damping_refuses_nonsense(make):
+    with pytest.raises(ValueError, match="damping"):
+        make()
+
+
+@pytest.mark.parametrize(
+    "damping", [FixedDamping(0.7), LanczosDamping(), GaussNewtonDamping(0.2, lanczos_steps=4)]
+)
+def test_adjoint_solves_the_damped_system(network, damping, generator):
+    params, terms = network
+    b = gradient(terms, params)
+    solver = AdjointSolver(ConjugateGradient(), damping, rtol=1e-10, max_steps=500, sensitivity=True)
+    adjoint = solver.solve(terms, params, b, None, generator)
+    operator = solver.operator(terms, params)
+    matrix = dense(operator, b.numel(), dtype=DOUBLE)
+    eye = torch.eye(b.numel(), dtype=DOUBLE)
+    reference = torch.linalg.solve(matrix + adjoint.damping.value * eye, b)
+    assert adjoint.solution.status is Status.CONVERGED
+    torch.testing.assert_close(adjoint.vector, reference, rtol=1e-7, atol=1e-8)
+    doubled = torch.linalg.solve(matrix + 2 * adjoint.damping.value * eye, b)
+    expected = float((doubled - reference).norm() / reference.norm())
+    assert adjoint.sensitivity == pytest.approx(expected, rel=1e-6)
+
+
+def test_gauss_newton_damping_wants_composite_terms(network, generator):
+    params, _ = network
+    with pytest.raises(ValueError, match="CompositeTerm"):
+        AdjointSolver(damping=GaussNewtonDamping(1.0)).solve(
+            [lambda p: p["in"].sum()], params, flatten(params), None, generator
+        )
