@@ -55,11 +55,10 @@ class ResidualBlock(nn.Module):
 class TinyBackbone(nn.Module):
     """Four strided convolutions with a residual block at strides 8 and 16; 0.3 M parameters."""
 
-    channels = {8: 64, 16: 96}
-
     def __init__(self, strides: tuple[int, ...], activation: str) -> None:
         super().__init__()
-        widths = (3, 16, 32, self.channels[8], self.channels[16])
+        widths = (3, 16, 32, 64, 96)
+        self.channels = {8: widths[3], 16: widths[4]}
         self.strides = strides
         self.stages = nn.ModuleList()
         for level in range(4):

@@ -1,0 +1,98 @@
+import math
+
+import pytest
+import torch
+
+from neural_sim.detector.training import cached_features, mean_loss, train_detector
+from neural_sim.types import LabelledImages
+
+
+def train(detector, params, images, seed=5, **changes):
+    settings = {"epochs": 2, "batch_size": 3, "learning_rate": 1e-2} | changes
+    return train_detector(detector, params, images, torch.Generator().manual_seed(seed), **settings)
+
+
+@pytest.fixture
+def images(tools):
+    return tools.images(8, dtype=torch.float32)
+
+
+def test_same_seed_is_bit_identical(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    first, history = train(detector, start, images)
+    again, repeated = train(detector, start, images)
+    other, _ = train(detector, start, images, seed=6)
+    assert history == repeated
+    assert history.steps == 6
+    assert len(history.losses) == 2
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert any(not torch.equal(first[name], other[name]) for name in first)
+    assert list(first) == list(start)
+
+
+def test_all_parameters_are_trained_and_the_given_ones_kept(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    kept = {name: value.clone() for name, value in start.items()}
+    trained, _ = train(detector, start, images)
+    assert all(torch.equal(start[name], kept[name]) for name in start)
+    assert all(not torch.equal(trained[name], start[name]) for name in start)
+    assert not any(value.requires_grad for value in trained.values())
+
+
+def test_frozen_backbone_is_frozen_and_gives_the_same_loss(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    trained, history = train(detector, start, images, trainable_only=True)
+    backbone, trainable = detector.split(trained)
+    assert all(torch.equal(value, start[name]) for name, value in backbone.items())
+    assert all(not torch.equal(value, start[name]) for name, value in trainable.items())
+    assert history.losses[-1] < history.losses[0]
+    for cached, direct in zip(
+        cached_features(detector, backbone, images.images, 3),
+        detector.features(backbone, images.images),
+        strict=True,
+    ):
+        torch.testing.assert_close(cached, direct, rtol=1e-4, atol=1e-5)
+
+
+def test_training_overfits_a_few_images(tools, generator):
+    detector = tools.detector(channels=16)
+    images = tools.images(4, dtype=torch.float32)
+    start = detector.init(generator)
+    trained, history = train(detector, start, images, epochs=60, batch_size=4)
+    assert mean_loss(detector, trained, images) < 0.1 * mean_loss(detector, start, images)
+    assert history.losses[-1] < 0.2 * history.losses[0]
+
+
+def test_mean_loss_is_the_mean_over_images(tools, generator):
+    detector, images = tools.detector(), tools.images(5)
+    params = tools.noisy(detector.init(generator), generator)
+    backbone, trainable = detector.split(params)
+    targets = detector.assign(images.boxes, images.labels)
+    whole = detector.loss(trainable, detector.features(backbone, images.images), targets)
+    assert mean_loss(detector, params, images, batch_size=2) == pytest.approx(float(whole), rel=1e-10)
+
+
+def test_one_image_and_no_boxes_at_all(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    _, history = train(detector, start, images.select(slice(0, 1)), batch_size=1)
+    assert all(math.isfinite(loss) for loss in history.losses)
+    empty = LabelledImages(
+        images.images, torch.zeros(8, 0, 4), torch.zeros(8, 0, dtype=torch.long), images.bins
+    )
+    _, history = train(detector, start, empty)
+    assert all(math.isfinite(loss) for loss in history.losses)
+
+
+def test_nothing_to_train_on_is_refused(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    with pytest.raises(ValueError, match="train_detector"):
+        train(detector, start, images.select(slice(0, 0)))
+    with pytest.raises(ValueError, match="train_detector"):
+        train(detector, start, images, epochs=0)
+    with pytest.raises(ValueError, match="mean_loss"):
+        mean_loss(detector, start, images.select(slice(0, 0)))
