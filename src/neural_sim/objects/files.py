@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import trimesh
 
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.objects.repair import repair
+
+Y_UP_TO_Z_UP = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def file_digest(*paths: Path) -> str:
@@ -23,6 +29,7 @@ def file_digest(*paths: Path) -> str:
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
     """Read, repair and normalise a mesh file; several parts in it are joined.
 
+    glTF files (.glb) have +y up by their standard and are turned to +z up; others are taken as they are.
     ``transform`` leads back to the file's frame in metres. Raises ``ValueError`` with the file and the reason where
     it cannot be read or holds nothing to draw.
     """
@@ -43,7 +50,11 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
     mesh = repair(mesh, name, str(path))
     if metres_per_unit != 1.0:
         mesh.apply_scale(metres_per_unit)
-    return normalise(mesh, name, str(path), digest)
+    if path.suffix.lower() != ".glb":
+        return normalise(mesh, name, str(path), digest)
+    mesh.apply_transform(Y_UP_TO_Z_UP)
+    item = normalise(mesh, name, str(path), digest)
+    return replace(item, transform=np.linalg.inv(Y_UP_TO_Z_UP) @ item.transform)
 
 
 def choose(

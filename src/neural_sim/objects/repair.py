@@ -60,7 +60,11 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
     if not bad.any():
         return mesh
     log.warning(
-        "%s: object %r: %d of %d normals were not finite, recomputed", source, name, bad.sum(), len(bad)
+        "%s: object %r: %d of %d normals were not of finite unit length, recomputed",
+        source,
+        name,
+        bad.sum(),
+        len(bad),
     )
     # A mesh built anew has no normals from the file, so trimesh computes them from the faces.
     rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=mesh.visual.copy(), process=False)

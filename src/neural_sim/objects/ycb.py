@@ -34,13 +34,13 @@ class YCB:
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of mesh, material and texture files by object, without parsing them."""
-        return {
-            name: file_digest(path, path.with_suffix(".mtl"), path.with_name("texture_map.jpg"),
-                              path.with_name("texture_map.png"))
-            for name, path in self._files.items()
-        }  # fmt: skip
+        return {name: file_digest(path, *_companions(path)) for name, path in self._files.items()}
 
     def load(self) -> list[ObjectMesh]:
         """The objects, normalised, in the order of ``names``. Source units are metres."""
         digests = self.digests()
         return [load_file(path, name, digests[name]) for name, path in self._files.items()]
+
+
+def _companions(path: Path) -> list[Path]:
+    return sorted(other for other in path.parent.iterdir() if other.suffix in (".mtl", ".jpg", ".png"))

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neural_sim.cameras import rays
+from neural_sim.cameras import focal_length, rays
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.renderer.texture_sampling import Pyramid
 from neural_sim.types import PinholeCamera
 
+# Offsets from a pixel's centre, right and down: the usual rotated grid of OpenGL's 4x multisampling, which
+# pyrender uses, so that both renderers' silhouettes agree to a sample.
+EDGE_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+
 
 class RaycastRenderer:
-    """The same image as ``PyrenderRenderer`` without OpenGL: one ray a sample, textures filtered by footprint."""
+    """The same image as ``PyrenderRenderer`` without OpenGL: rays over embree, textures filtered by footprint."""
 
     name = "raycast"
 
@@ -54,15 +56,50 @@ class RaycastRenderer:
 def _cast(
     mesh: trimesh.Trimesh, surface: Surface, pyramid: Pyramid | None, camera: PinholeCamera, pose: Tensor
 ) -> Float[np.ndarray, "h w 4"]:
+    """Premultiplied RGBA: a ray through each pixel's centre, and four more where the silhouette runs."""
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
+    image = _trace(mesh, surface, pyramid, camera, origins, directions)
+    edge = _silhouette(image[:, 3].reshape(camera.height, camera.width) > 0.0).reshape(-1)
+    image[edge] = 0.0
+    for x, y in EDGE_SAMPLES:
+        shifted = _shifted(directions[edge], pose.numpy(), x / focal_length(camera), y / focal_length(camera))
+        image[edge] += _trace(mesh, surface, pyramid, camera, origins[edge], shifted) / len(EDGE_SAMPLES)
+    return image.reshape(camera.height, camera.width, 4)
+
+
+def _trace(
+    mesh: trimesh.Trimesh,
+    surface: Surface,
+    pyramid: Pyramid | None,
+    camera: PinholeCamera,
+    origins: np.ndarray,
+    directions: np.ndarray,
+) -> Float[np.ndarray, "rays 4"]:
+    image = np.zeros((len(origins), 4), dtype=np.float32)
+    if len(origins) == 0:
+        return image
     face = mesh.ray.intersects_first(origins, directions)
     hit = np.flatnonzero(face >= 0)
-    image = np.zeros((len(face), 4), dtype=np.float32)
     if len(hit):
-        colour = _colours(surface, pyramid, face[hit], origins[hit], directions[hit], camera)
-        image[hit, :3], image[hit, 3] = colour, 1.0
-    return image.reshape(camera.height, camera.width, 4)
+        image[hit, :3] = _colours(surface, pyramid, face[hit], origins[hit], directions[hit], camera)
+        image[hit, 3] = 1.0
+    return image
+
+
+def _silhouette(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels with both hit and empty ones among themselves and their eight neighbours."""
+    padded = np.pad(mask, 1, mode="edge")
+    height, width = mask.shape
+    near = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return np.any(near, axis=0) & ~np.all(near, axis=0)
+
+
+def _shifted(directions: np.ndarray, pose: np.ndarray, x: float, y: float) -> Float[np.ndarray, "rays 3"]:
+    """Unit directions moved by (x, y) on the image plane at distance 1, right and down."""
+    right, up, backward = pose[:3, 0], pose[:3, 1], pose[:3, 2]
+    on_plane = directions / -(directions @ backward)[:, None] + x * right - y * up
+    return on_plane / np.linalg.norm(on_plane, axis=1, keepdims=True)
 
 
 def _colours(
@@ -84,7 +121,7 @@ def _colours(
         first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
         uv_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
         texels = uv_area * pyramid.texels / np.maximum(area, 1e-12)
-        sample = 2.0 * math.tan(0.5 * camera.field_of_view) / camera.height * distance
+        sample = distance / focal_length(camera)
         # OpenGL's isotropic filter takes the longer side of the footprint, which a slanted face stretches.
         texels_a_side = np.sqrt(texels) * sample / np.maximum(np.abs(cosine), 0.05)
         colour = colour * pyramid.sample(np.einsum("nk,nkc->nc", weights, uv), np.log2(texels_a_side + 1e-12))
