@@ -24,6 +24,12 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
 
+REQUIRED: dict[str, tuple[str, ...]] = {
+    "images": ("id", "file_name"),
+    "categories": ("id", "name"),
+    "annotations": ("image_id", "category_id", "bbox"),
+}
+
 
 @dataclass(frozen=True)
 class CocoTarget:
@@ -153,9 +159,7 @@ def _read(path: Path) -> dict[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not readable as JSON ({error})") from error
-    required = {"images": ("id", "file_name"), "categories": ("id", "name")}
-    required["annotations"] = ("image_id", "category_id", "bbox")
-    for section, keys in required.items():
+    for section, keys in REQUIRED.items():
         entries = data.get(section) if isinstance(data, dict) else None
         if not isinstance(entries, list):
             raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
