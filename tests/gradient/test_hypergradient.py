@@ -2,123 +2,143 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 
 import pytest
 import torch
 
-from neural_sim import cameras
-from neural_sim.gradient.base import ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import Pathwise
+from neural_sim.gradient.stratified import importance_weights, stratified
+from neural_sim.gradient.tangents import moved_by, render_with_tangents
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import FixedDamping
-from neural_sim.types import PinholeCamera, Rays, SceneDraw
+from neural_sim.solver.damping import FixedDamping, LanczosDamping
+from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
-CAMERA = PinholeCamera(width=3, height=2, field_of_view=math.radians(40.0))
-RIDGE = 0.3
+EXACT = AdjointSolver(ConjugateGradient(), FixedDamping(0.0), rtol=1e-12, max_steps=200)
 
 
-def render_rays(rays: Rays):
-    """A smooth stand-in for a field: colour and opacity are waves of where the ray starts and goes."""
-    where = rays.origins + 2.0 * rays.directions
-    opacity = torch.sigmoid(where.sum(-1))
-    rgb = opacity[:, None] * (0.5 + 0.5 * torch.sin(2.0 * where + rays.directions.roll(1, -1)))
-    return rgb, opacity
-
-
-def render(draw: SceneDraw):
-    bundle = cameras.rays(CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
-    flat = Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3))
-    rgb, opacity = render_rays(flat)
-    return rgb.view(len(draw), 2, 3, 3), opacity.view(len(draw), 2, 3)
-
-
-class Bilevel:
-    """Ridge regression on rendered pixels: the inner minimiser has a closed form for every psi."""
-
-    def __init__(self, images: int = 7, bins: int = 4, seed: int = 0) -> None:
-        generator = torch.Generator().manual_seed(seed)
-
-        def draw(*shape: int):
-            return torch.randn(*shape, generator=generator, dtype=DOUBLE)
-
-        self.gumbel, self.within, self.other = draw(images, bins), draw(images), draw(images)
-        self.background, self.targets = draw(images, 3, 2, 3).sigmoid(), draw(images, 2)
-        self.val_images, self.val_targets = draw(5, 18), draw(5, 2)
-        self.psi = draw(bins)
-        self.centres = torch.arange(bins, dtype=DOUBLE) * (2 * math.pi / bins)
-
-    def relaxed(self, psi):
-        weights = torch.softmax((self.gumbel + torch.log_softmax(psi, -1)) / 0.7, -1)
-        phi = weights @ self.centres + 0.2 * self.within
-        return SceneDraw(phi, self.other * 0.3, 3.0 + 0.1 * torch.sin(phi), weights.argmax(-1))
-
-    def compose(self, rgb, opacity):
-        return rgb.permute(0, 3, 1, 2) + (1.0 - opacity[:, None]) * self.background
-
-    def images(self, psi):
-        return self.compose(*render(self.relaxed(psi)))
-
-    def loss_of(self, params, images, index):
-        residual = images.flatten(1) @ params["w"] + params["b"] - self.targets[index]
-        return 0.5 * residual.square().sum(-1)
-
-    def minimiser(self, psi):
-        design = torch.cat([self.images(psi).flatten(1), torch.ones(len(self.gumbel), 1, dtype=DOUBLE)], 1)
-        gram = design.T @ design / len(design) + RIDGE * torch.eye(19, dtype=DOUBLE)
-        solved = torch.linalg.solve(gram, design.T @ self.targets / len(design))
-        return {"w": solved[:-1], "b": solved[-1]}
-
-    def validation(self, params):
-        return torch.tanh(self.val_images @ params["w"] + params["b"] - self.val_targets).square().sum()
-
-    def object_images(self):
-        with torch.no_grad():
-            draw = self.relaxed(self.psi)
-            rgb, opacity = render(draw)
-            images = self.compose(rgb, opacity)
-        count = len(draw)
-        path = RenderedPath(self.relaxed, render_rays, self.compose, CAMERA, rgb, opacity)
-        weights = torch.full((count,), 1.0 / count, dtype=DOUBLE)
-        return ObjectImages(
-            self.psi, lambda psi: torch.log_softmax(psi, -1), images, torch.arange(count), weights, draw, path
-        )
-
-    def inner(self, images):
-        params = self.minimiser(self.psi)
-        weights = torch.full((len(images),), 1.0 / len(images), dtype=DOUBLE)
-        anchor = {name: torch.zeros_like(tensor) for name, tensor in params.items()}
-        return InnerProblem(
-            params, lambda p, rows: self.loss_of(p, images[rows], rows), weights, 3, RIDGE, anchor
-        )
-
-    def central_difference(self, step: float = 1e-5):
-        def outer(psi):
-            return self.validation(self.minimiser(psi))
-
-        basis = step * torch.eye(len(self.psi), dtype=DOUBLE)
-        return torch.stack([(outer(self.psi + e) - outer(self.psi - e)) / (2 * step) for e in basis])
+def solve(problem, inner, estimate, solver=EXACT):
+    return hypergradient(
+        inner, [problem.validation], {"can": estimate}, solver, torch.Generator().manual_seed(0)
+    )
 
 
 @pytest.mark.parametrize("patch_size", [1, 4, 1000])
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_pathwise_hypergradient_is_the_retrained_derivative(patch_size, mode):
-    problem = Bilevel()
+def test_pathwise_hypergradient_is_the_retrained_derivative(problem, patch_size, mode):
     batch = problem.object_images()
     settings = Pathwise(patch_size=patch_size, chunk_size=3, mode=mode)
     inner = problem.inner(batch.images)
-    result = hypergradient(
-        inner,
-        [problem.validation],
-        {"can": lambda v: settings.estimate(problem.loss_of, inner.params, v, batch)},
-        AdjointSolver(ConjugateGradient(), FixedDamping(0.0), rtol=1e-12, max_steps=200),
-        torch.Generator().manual_seed(0),
-    )
+    result = solve(problem, inner, lambda v: settings.estimate(problem.loss_of, inner.params, v, batch))
     assert result.solution.status.trusted
     assert result.stationarity < 1e-12
     torch.testing.assert_close(
         result.psi_gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10
     )
+
+
+def test_tangents_of_the_first_render_give_the_same_hypergradient(problem):
+    batch = problem.object_images()
+    names = moved_by(batch.path.relaxed, batch.psi)
+    assert names == ("phi", "distance")
+    maps, tangents = render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, names, 5)
+    path = dataclasses.replace(batch.path, rgb=maps.rgb, opacity=maps.opacity, tangents=tangents)
+    batch = dataclasses.replace(batch, path=path)
+    inner = problem.inner(batch.images)
+    result = solve(problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch))
+    torch.testing.assert_close(
+        result.psi_gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10
+    )
+
+
+def test_a_step_along_the_negative_hypergradient_lowers_the_validation_loss(problem):
+    batch = problem.object_images()
+    inner = problem.inner(batch.images)
+    result = solve(problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch))
+    slope = result.psi_gradients["can"]
+    before = problem.validation(problem.minimiser(problem.psi))
+    after = problem.validation(problem.minimiser(problem.psi - 1e-4 * slope / slope.norm()))
+    assert after < before
+
+
+def test_stratified_hypergradient_is_the_retrained_derivative_over_hard_bins(problem, generator):
+    """Images fixed in their bins; psi enters by the bins' weights alone, in training as in the derivative."""
+    bins = torch.tensor([0, 0, 1, 2, 2, 2, 3])
+    images = torch.rand(7, 3, 2, 3, generator=generator, dtype=DOUBLE)
+    design = torch.cat([images.flatten(1), torch.ones(7, 1, dtype=DOUBLE)], 1)
+
+    def log_probabilities(psi):
+        return torch.log(0.9 * torch.softmax(psi, -1) + 0.025)
+
+    def minimiser(psi):
+        weighted = design * importance_weights(log_probabilities(psi).exp(), bins)[:, None]
+        solved = torch.linalg.solve(
+            weighted.T @ design + 0.3 * torch.eye(19, dtype=DOUBLE), weighted.T @ problem.targets
+        )
+        return {"w": solved[:-1], "b": solved[-1]}
+
+    def losses(params, rows):
+        return problem.loss_of(params, images[rows], rows)
+
+    params = minimiser(problem.psi)
+    anchor = {name: torch.zeros_like(tensor) for name, tensor in params.items()}
+    weights = importance_weights(log_probabilities(problem.psi).exp(), bins)
+    inner = InnerProblem(params, losses, weights, 3, 0.3, anchor)
+
+    def estimate(vector):
+        along = scores(losses, params, vector, torch.arange(7))
+        return stratified(along, bins, problem.psi, log_probabilities)
+
+    result = solve(problem, inner, estimate)
+    basis = 1e-5 * torch.eye(4, dtype=DOUBLE)
+    outer = [
+        (problem.validation(minimiser(problem.psi + e)) - problem.validation(minimiser(problem.psi - e)))
+        / 2e-5
+        for e in basis
+    ]
+    assert result.stationarity < 1e-12
+    torch.testing.assert_close(result.psi_gradients["can"], torch.stack(outer), rtol=1e-7, atol=1e-10)
+
+
+def test_solver_and_damping_are_accounted_for(problem):
+    batch = problem.object_images()
+    inner = problem.inner(batch.images)
+    solver = AdjointSolver(ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-8, max_steps=100)
+    result = solve(
+        problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch), solver
+    )
+    assert result.solution.status is Status.CONVERGED
+    assert result.damping.condition <= 20.0 * (1 + 1e-6)
+    assert set(result.seconds) == {"validation", "solve", "mixed"}
+    assert bool((result.signal_to_noise["can"] >= 0).all())
+    again = hypergradient(
+        inner, [problem.validation], {}, solver, torch.Generator().manual_seed(0), result.solution.value
+    )
+    assert again.solution.warm_started and again.solution.steps <= 1
+
+
+def test_a_subset_stands_for_the_whole_in_hessian_products_only(problem):
+    inner = problem.inner(problem.object_images().images)
+    part = dataclasses.replace(inner, subset=torch.tensor([1, 4]))
+    value = sum(term(inner.params) for term in part.terms(part.subset)[:-1])
+    expected = inner.losses(inner.params, torch.tensor([1, 4])).mean()
+    torch.testing.assert_close(value, expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": torch.zeros(0)}, "weights"),
+        ({"chunk_size": 0}, "chunk_size"),
+        ({"proximal": -1.0}, "proximal"),
+        ({"anchor": None}, "anchor"),
+    ],
+)
+def test_inner_problem_refuses_nonsense(problem, change, message):
+    inner = problem.inner(problem.object_images().images)
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(inner, **change)

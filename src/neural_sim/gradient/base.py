@@ -5,7 +5,7 @@ No estimator knows of the implicit function theorem's minus sign; it is written 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,6 +16,8 @@ from torch import Tensor
 from neural_sim.types import PinholeCamera, Rays, SceneDraw
 
 Params = dict[str, Tensor]
+CONTINUOUS = ("phi", "rho", "distance")
+"""The numbers of a ``SceneDraw`` that images depend on smoothly."""
 
 
 class IndexedLoss(Protocol):
@@ -33,13 +35,22 @@ class ImageLoss(Protocol):
 
 
 @dataclass(frozen=True)
+class Maps:
+    """One array per rendered map, premultiplied colour and opacity: values, tangents or cotangents."""
+
+    rgb: Float[Tensor, "n h w 3"]
+    opacity: Float[Tensor, "n h w"]
+
+
+@dataclass(frozen=True)
 class RenderedPath:
     """How one object's images came from psi, so that the way can be walked again with derivatives.
 
     ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to
     premultiplied colour [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and
-    opacity maps to images with the nuisance bound. ``rgb`` and ``opacity`` are the first, derivative-free
-    render's.
+    opacity maps to images with the nuisance bound. ``rgb`` and ``opacity`` are the first render's.
+    ``tangents``, where that render carried them (forward mode), hold the maps' derivatives by the numbers of
+    the draw that psi moves.
     """
 
     relaxed: Callable[[Float[Tensor, "k"]], SceneDraw]
@@ -48,6 +59,7 @@ class RenderedPath:
     camera: PinholeCamera
     rgb: Float[Tensor, "n h w 3"]
     opacity: Float[Tensor, "n h w"]
+    tangents: Mapping[str, Maps] | None = None
 
 
 @dataclass(frozen=True)

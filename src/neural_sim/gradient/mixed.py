@@ -35,11 +35,10 @@ def scores(
     """
     _check(mode, chunk_size)
     along = _forward_scores if mode == "forward" else _reverse_scores
-    parts = [
-        along(lambda p, rows=rows: losses(p, rows), params, vector).detach()
-        for rows in index.split(chunk_size)
-    ]
-    return torch.cat(parts) if parts else index.new_zeros(0, dtype=next(iter(params.values())).dtype)
+    if not len(index):
+        return next(iter(params.values())).new_zeros(0)
+    parts = [along(lambda p, rows=rows: losses(p, rows), params, vector) for rows in index.split(chunk_size)]
+    return torch.cat(parts).detach()
 
 
 def image_cotangent(
@@ -59,6 +58,8 @@ def image_cotangent(
     """
     _check(mode, chunk_size)
     along = _forward_scores if mode == "forward" else _reverse_scores
+    if not len(images):
+        return torch.zeros_like(images)
     cotangents = []
     for chunk, rows, weight in zip(
         images.split(chunk_size), index.split(chunk_size), weights.split(chunk_size), strict=True
@@ -66,9 +67,9 @@ def image_cotangent(
         leaf = chunk.detach().requires_grad_()
         with torch.enable_grad():
             score = along(lambda p, leaf=leaf, rows=rows: loss_of(p, leaf, rows), params, vector)
-            (cotangent,) = torch.autograd.grad(score @ weight, leaf, materialize_grads=True)
+            (cotangent,) = torch.autograd.grad(score @ weight.to(score), leaf, materialize_grads=True)
         cotangents.append(cotangent.detach())
-    return torch.cat(cotangents) if cotangents else torch.zeros_like(images)
+    return torch.cat(cotangents)
 
 
 def _forward_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
@@ -85,7 +86,9 @@ def _reverse_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"
             values, list(leaves.values()), probe, create_graph=True, materialize_grads=True
         )
         # Linear in the probe, so that its derivative by the probe is the product J v itself.
-        along = sum((slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+        along = torch.stack(
+            [(slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True)]
+        ).sum()
         return torch.autograd.grad(along, probe, create_graph=True, materialize_grads=True)[0]
 
 

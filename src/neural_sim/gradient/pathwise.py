@@ -2,12 +2,13 @@
 
 First forward: images without derivatives (the caller's). Then v and the images' cotangents. Second forward:
 rays of one patch at a time, replayed from the same draw, each backward at once into the draw's few numbers
-per image. The chain from psi to the draw is walked once, at the end.
+per image. The chain from psi to the draw is walked once, at the end. Where the first render carried tangents
+(``tangents.py``), they are contracted instead, and there is no second forward.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +17,9 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.gradient.base import (
+    CONTINUOUS,
     ImageLoss,
+    Maps,
     MixedDerivative,
     ObjectImages,
     Params,
@@ -27,15 +30,6 @@ from neural_sim.gradient.mixed import Mode, image_cotangent
 from neural_sim.types import PinholeCamera, Rays, SceneDraw
 
 RenderRays = Callable[[Rays], tuple[Tensor, Tensor]]
-CONTINUOUS = ("phi", "rho", "distance")
-
-
-@dataclass(frozen=True)
-class MapCotangents:
-    """Cotangents of the rendered maps: premultiplied colour and opacity."""
-
-    rgb: Float[Tensor, "n h w 3"]
-    opacity: Float[Tensor, "n h w"]
 
 
 @dataclass(frozen=True)
@@ -65,17 +59,20 @@ class Pathwise:
             loss_of, params, vector, here.images, here.index, here.weights, self.chunk_size, self.mode
         )
         maps = map_cotangents(path, cotangent)
-        along_draw = draw_cotangents(path.render_rays, path.camera, here.draw, maps, self.patch_size)
+        if path.tangents is not None:
+            along_draw = contract(path.tangents, maps)
+        else:
+            along_draw = draw_cotangents(path.render_rays, path.camera, here.draw, maps, self.patch_size)
         return from_contributions(psi_contributions(path.relaxed, here.psi, along_draw))
 
 
-def map_cotangents(path: RenderedPath, image_cotangents: Float[Tensor, "n 3 h w"]) -> MapCotangents:
+def map_cotangents(path: RenderedPath, image_cotangents: Float[Tensor, "n 3 h w"]) -> Maps:
     """Image cotangents pulled back through the compositing onto the rendered maps."""
     rgb, opacity = path.rgb.detach().requires_grad_(), path.opacity.detach().requires_grad_()
     with torch.enable_grad():
         images = path.compose(rgb, opacity)
     pulled = torch.autograd.grad(images, (rgb, opacity), image_cotangents, materialize_grads=True)
-    return MapCotangents(*pulled)
+    return Maps(*pulled)
 
 
 def patch_rays(
@@ -90,7 +87,7 @@ def patch_rays(
 
 
 def draw_cotangents(
-    render_rays: RenderRays, camera: PinholeCamera, draw: SceneDraw, maps: MapCotangents, patch_size: int
+    render_rays: RenderRays, camera: PinholeCamera, draw: SceneDraw, maps: Maps, patch_size: int
 ) -> dict[str, Float[Tensor, "n"]]:
     """Cotangents of the draw's numbers, phi, rho and distance: the second forward and the only backward
     (Tools 2, 3).
@@ -101,7 +98,7 @@ def draw_cotangents(
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
     total = {name: torch.zeros_like(getattr(draw, name)) for name in CONTINUOUS}
-    for pixels in live.split(patch_size):
+    for pixels in live.split(patch_size) if len(live) else ():
         leaves = {name: getattr(draw, name).detach().requires_grad_() for name in CONTINUOUS}
         with torch.enable_grad():
             rendered = render_rays(patch_rays(camera, cameras.orbit(**leaves), pixels))
@@ -113,10 +110,18 @@ def draw_cotangents(
     return total
 
 
+def contract(tangents: Mapping[str, Maps], maps: Maps) -> dict[str, Float[Tensor, "n"]]:
+    """Cotangents of the draw's numbers: each image's tangents against the maps' cotangents, image by image."""
+    return {
+        name: (tangent.rgb * maps.rgb).sum((1, 2, 3)) + (tangent.opacity * maps.opacity).sum((1, 2))
+        for name, tangent in tangents.items()
+    }
+
+
 def psi_contributions(
     relaxed: Callable[[Float[Tensor, "k"]], SceneDraw],
     psi: Float[Tensor, "k"],
-    cotangents: dict[str, Float[Tensor, "n"]],
+    cotangents: Mapping[str, Float[Tensor, "n"]],
 ) -> Float[Tensor, "n k"]:
     """Every image's part in the derivative by psi: its draw's cotangents through the replayed relaxed draw
     (Tool 1).
@@ -126,7 +131,7 @@ def psi_contributions(
     leaf = psi.detach().requires_grad_()
     with torch.enable_grad():
         draw = relaxed(leaf)
-        along = sum(getattr(draw, name) * cotangents[name] for name in CONTINUOUS)
+        along = sum(getattr(draw, name) * cotangent for name, cotangent in cotangents.items())
     rows = torch.zeros(len(draw), psi.numel(), dtype=psi.dtype, device=psi.device)
     if not (isinstance(along, Tensor) and along.requires_grad):
         return rows  # nothing in this draw depends on psi

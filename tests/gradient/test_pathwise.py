@@ -1,0 +1,148 @@
+"""The paper's tools: patches, replay and the chain to psi, against plain autograd through everything."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from neural_sim import cameras
+from neural_sim.gradient.base import Maps, from_contributions
+from neural_sim.gradient.pathwise import (
+    Pathwise,
+    contract,
+    draw_cotangents,
+    map_cotangents,
+    patch_rays,
+    psi_contributions,
+)
+from neural_sim.gradient.tangents import moved_by, render_with_tangents
+
+DOUBLE = torch.float64
+
+
+@pytest.fixture
+def maps(problem, generator) -> Maps:
+    shape = (len(problem.gumbel), 2, 3)
+    return Maps(
+        torch.randn(*shape, 3, generator=generator, dtype=DOUBLE),
+        torch.randn(*shape, generator=generator, dtype=DOUBLE),
+    )
+
+
+@pytest.mark.parametrize("patch_size", [1, 2, 5, 6, 7, 41])
+def test_sum_over_patches_equals_the_whole_image(problem, maps, patch_size):
+    batch = problem.object_images()
+    whole = draw_cotangents(batch.path.render_rays, batch.path.camera, batch.draw, maps, 10**6)
+    patches = draw_cotangents(batch.path.render_rays, batch.path.camera, batch.draw, maps, patch_size)
+    for name in whole:
+        assert float((whole[name] - patches[name]).abs().max()) < 1e-10
+
+
+def test_patch_rays_are_the_cameras_rays(problem):
+    batch = problem.object_images()
+    poses = cameras.orbit(batch.draw.phi, batch.draw.rho, batch.draw.distance)
+    whole = cameras.rays(batch.path.camera, poses)
+    pixels = torch.tensor([0, 5, 6, 13, 41])
+    part = patch_rays(batch.path.camera, poses, pixels)
+    torch.testing.assert_close(part.origins, whole.origins.reshape(-1, 3)[pixels])
+    torch.testing.assert_close(part.directions, whole.directions.reshape(-1, 3)[pixels])
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_mixed_derivative_equals_autograd_through_everything(problem, generator, mode):
+    batch = problem.object_images()
+    params = {name: tensor + 0.1 for name, tensor in problem.minimiser(problem.psi).items()}
+    vector = {
+        name: torch.randn(tensor.shape, generator=generator, dtype=DOUBLE) for name, tensor in params.items()
+    }
+    weights = torch.rand(len(batch.images), generator=generator, dtype=DOUBLE)
+    batch = dataclasses.replace(batch, weights=weights)
+    psi = problem.psi.clone().requires_grad_()
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in params.items()}
+    loss = problem.loss_of(leaves, problem.images(psi), batch.index) @ weights
+    slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
+    along = sum((slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+    (reference,) = torch.autograd.grad(along, psi)
+    ours = Pathwise(patch_size=4, chunk_size=2, mode=mode).estimate(problem.loss_of, params, vector, batch)
+    torch.testing.assert_close(ours.value, reference, rtol=1e-10, atol=1e-12)
+
+
+def test_forward_mode_equals_reverse_mode(problem, maps):
+    batch = problem.object_images()
+    rendered, tangents = render_with_tangents(
+        batch.path.render_rays, batch.path.camera, batch.draw, patch_size=5
+    )
+    torch.testing.assert_close(rendered.rgb, batch.path.rgb)
+    torch.testing.assert_close(rendered.opacity, batch.path.opacity)
+    reverse = draw_cotangents(batch.path.render_rays, batch.path.camera, batch.draw, maps, 5)
+    for name, value in contract(tangents, maps).items():
+        assert float((value - reverse[name]).abs().max()) < 1e-8
+
+
+def test_a_render_without_tangents_is_the_plain_render(problem):
+    batch = problem.object_images()
+    rendered, tangents = render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, ())
+    torch.testing.assert_close(rendered.rgb, batch.path.rgb)
+    assert tangents == {}
+    with pytest.raises(ValueError, match="names"):
+        render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, ("bins",))
+
+
+def test_contributions_add_up_to_the_vector_jacobian_product(problem, generator):
+    cotangents = {
+        name: torch.randn(7, generator=generator, dtype=DOUBLE) for name in ("phi", "rho", "distance")
+    }
+    rows = psi_contributions(problem.relaxed, problem.psi, cotangents)
+    psi = problem.psi.clone().requires_grad_()
+    draw = problem.relaxed(psi)
+    total = (draw.phi * cotangents["phi"] + draw.distance * cotangents["distance"]).sum()
+    torch.testing.assert_close(rows.sum(0), torch.autograd.grad(total, psi)[0])
+    assert moved_by(problem.relaxed, problem.psi) == ("phi", "distance")
+
+
+def test_a_draw_that_does_not_depend_on_psi_gives_zero(problem):
+    held = problem.relaxed(problem.psi)
+    rows = psi_contributions(lambda psi: held, problem.psi, {"phi": torch.ones(7, dtype=DOUBLE)})
+    assert rows.shape == (7, 4) and rows.norm() == 0.0
+
+
+def test_pixels_without_cotangent_are_not_rendered(problem):
+    batch = problem.object_images()
+    seen = []
+
+    def render_rays(rays):
+        seen.append(len(rays.origins))
+        return batch.path.render_rays(rays)
+
+    maps = Maps(torch.zeros_like(batch.path.rgb), torch.zeros_like(batch.path.opacity))
+    still = draw_cotangents(render_rays, batch.path.camera, batch.draw, maps, 4)
+    assert seen == [] and all(value.norm() == 0.0 for value in still.values())
+    maps.opacity[2, 1, 0] = 1.0
+    draw_cotangents(render_rays, batch.path.camera, batch.draw, maps, 4)
+    assert seen == [1]
+
+
+def test_map_cotangents_are_the_compositing_adjoint(problem, generator):
+    path = problem.object_images().path
+    cotangent = torch.randn(7, 3, 2, 3, generator=generator, dtype=DOUBLE)
+    maps = map_cotangents(path, cotangent)
+    torch.testing.assert_close(maps.rgb, cotangent.permute(0, 2, 3, 1))
+    torch.testing.assert_close(maps.opacity, -(cotangent * problem.background).sum(1))
+
+
+def test_standard_error_is_that_of_a_sum():
+    rows = torch.tensor([[1.0, 2.0], [3.0, 2.0], [2.0, 2.0], [6.0, 2.0]], dtype=DOUBLE)
+    derivative = from_contributions(rows)
+    torch.testing.assert_close(derivative.standard_error[0], rows[:, 0].var().mul(4).sqrt())
+    assert derivative.standard_error[1] == 0.0 and derivative.signal_to_noise[1] == torch.inf
+    assert from_contributions(rows[:1]).signal_to_noise.tolist() == [0.0, 0.0]
+
+
+def test_settings_and_missing_paths_are_refused(problem):
+    with pytest.raises(ValueError, match="patch_size"):
+        Pathwise(patch_size=0)
+    batch = dataclasses.replace(problem.object_images(), path=None)
+    with pytest.raises(ValueError, match="path"):
+        Pathwise().estimate(problem.loss_of, {}, {}, batch)

@@ -1,0 +1,154 @@
+"""Stratified and leave-one-out estimators against exact enumeration over bins and over all draws."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+
+from neural_sim.gradient.reinforce import reinforce
+from neural_sim.gradient.stratified import allocate, importance_weights, stratified
+
+DOUBLE = torch.float64
+PSI = torch.tensor([0.3, -1.0, 0.8], dtype=DOUBLE)
+SCORES = torch.tensor([2.0, -1.0, 0.5], dtype=DOUBLE)
+
+
+def log_softmax(psi):
+    return torch.log_softmax(psi, -1)
+
+
+def floored(psi):
+    return torch.log(0.85 * torch.softmax(psi, -1) + 0.05)
+
+
+def exact(log_probabilities, means=SCORES, psi=PSI):
+    leaf = psi.clone().requires_grad_()
+    return torch.autograd.grad(log_probabilities(leaf).exp() @ means, leaf)[0]
+
+
+@pytest.mark.parametrize("log_probabilities", [log_softmax, floored])
+def test_stratified_is_exact_given_the_bins_means(log_probabilities):
+    bins = torch.tensor([0, 0, 1, 2, 2])
+    scores = SCORES[bins] + torch.tensor([0.7, -0.7, 0.0, 0.2, -0.2], dtype=DOUBLE)
+    found = stratified(scores, bins, PSI, log_probabilities, share=0.25)
+    torch.testing.assert_close(found.value, 0.25 * exact(log_probabilities))
+
+
+def test_stratified_equals_the_closed_form_in_logits():
+    bins = torch.tensor([0, 1, 2])
+    p = torch.softmax(PSI, -1)
+    found = stratified(SCORES, bins, PSI, log_softmax)
+    torch.testing.assert_close(found.value, p * (SCORES - p @ SCORES))
+    assert float(found.value.sum().abs()) < 1e-15
+
+
+def test_stratified_is_unbiased_and_its_standard_error_is_right(generator):
+    counts, spread = torch.tensor([3, 5, 4]), torch.tensor([0.5, 2.0, 1.0], dtype=DOUBLE)
+    bins = torch.arange(3).repeat_interleave(counts)
+    runs = [
+        stratified(
+            SCORES[bins] + spread[bins] * torch.randn(12, generator=generator, dtype=DOUBLE),
+            bins,
+            PSI,
+            log_softmax,
+        )
+        for _ in range(400)
+    ]
+    values = torch.stack([run.value for run in runs])
+    error = values.std(0)
+    assert bool(((values.mean(0) - exact(log_softmax)).abs() < 4 * error / 400**0.5).all())
+    predicted = torch.stack([run.standard_error for run in runs]).square().mean(0).sqrt()
+    # the sampled standard deviation of 400 runs is itself known to 1 / sqrt(800)
+    torch.testing.assert_close(predicted, error, rtol=4 / 800**0.5, atol=0.0)
+
+
+def test_a_bin_without_images_says_nothing():
+    bins = torch.tensor([0, 0, 2, 2])
+    scores = torch.tensor([1.0, 3.0, -1.0, 0.0], dtype=DOUBLE)
+    found = stratified(scores, bins, PSI, log_softmax)
+    p = torch.softmax(PSI, -1)
+    mean = (2.0 * p[0] - 0.5 * p[2]) / (p[0] + p[2])
+    means = torch.stack([torch.tensor(2.0, dtype=DOUBLE), mean, torch.tensor(-0.5, dtype=DOUBLE)])
+    torch.testing.assert_close(found.value, exact(log_softmax, means))
+    assert float(found.value[1].abs()) < 1e-15
+    assert bool((found.signal_to_noise == 0.0).all())
+
+
+@pytest.mark.parametrize("peak", [40.0, 800.0])
+def test_one_hot_p_gives_zero_and_no_nan(peak):
+    psi = torch.tensor([peak, 0.0, -peak], dtype=DOUBLE)
+    found = stratified(SCORES, torch.tensor([0, 1, 2]), psi, log_softmax)
+    assert bool(torch.isfinite(found.value).all()) and float(found.value.abs().max()) < 1e-15
+    assert not bool(found.signal_to_noise.isnan().any())
+
+
+def test_one_bin_has_no_derivative():
+    found = stratified(SCORES, torch.zeros(3, dtype=torch.long), torch.zeros(1, dtype=DOUBLE), log_softmax)
+    assert found.value.tolist() == [0.0] and found.signal_to_noise.tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("scores", "bins"),
+    [
+        (torch.ones(2), torch.zeros(3, dtype=torch.long)),
+        (torch.ones(0), torch.zeros(0, dtype=torch.long)),
+        (torch.ones(1), torch.tensor([3])),
+        (torch.ones(1), torch.tensor([-1])),
+    ],
+)
+def test_stratified_refuses_nonsense(scores, bins):
+    with pytest.raises(ValueError, match="stratified"):
+        stratified(scores, bins, PSI, log_softmax)
+
+
+@pytest.mark.parametrize(("total", "minimum"), [(3, 1), (10, 1), (10, 0), (17, 2), (100, 5)])
+def test_allocation_sums_and_follows_p(total, minimum):
+    p = torch.tensor([0.9, 0.02, 0.08], dtype=DOUBLE)
+    counts = allocate(p, total, minimum)
+    assert int(counts.sum()) == total and int(counts.min()) >= minimum
+    assert bool(((counts - minimum - p * (total - 3 * minimum)).abs() < 1.0).all())
+
+
+def test_allocation_refuses_nonsense():
+    with pytest.raises(ValueError, match="total"):
+        allocate(torch.full((4,), 0.25), 3)
+    with pytest.raises(ValueError, match="sum to 1"):
+        allocate(torch.tensor([0.5, 0.6]), 10)
+
+
+def test_importance_weights_restore_p():
+    p = torch.tensor([0.7, 0.1, 0.2], dtype=DOUBLE)
+    bins = torch.tensor([2, 0, 1, 1, 2, 2])
+    weights = importance_weights(p, bins, share=0.5)
+    mass = torch.zeros(3, dtype=DOUBLE).index_add_(0, bins, weights)
+    torch.testing.assert_close(mass, 0.5 * p)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("log_probabilities", [log_softmax, floored])
+def test_reinforce_is_unbiased_over_all_draws(count, log_probabilities):
+    p = log_probabilities(PSI).exp()
+    expectation = torch.zeros_like(PSI)
+    for outcome in itertools.product(range(3), repeat=count):
+        bins = torch.tensor(outcome)
+        found = reinforce(SCORES[bins], lambda psi, bins=bins: log_probabilities(psi)[bins], PSI, share=2.0)
+        expectation += p[bins].prod() * found.value
+    torch.testing.assert_close(expectation, 2.0 * exact(log_probabilities))
+
+
+def test_the_baseline_removes_a_constant():
+    bins = torch.tensor([0, 1, 2, 2])
+    for shift in (0.0, 1e3):
+        found = reinforce(SCORES[bins] + shift, lambda psi: log_softmax(psi)[bins], PSI)
+        torch.testing.assert_close(
+            found.value, reinforce(SCORES[bins], lambda psi: log_softmax(psi)[bins], PSI).value
+        )
+
+
+def test_reinforce_refuses_nonsense():
+    with pytest.raises(ValueError, match="at least 2"):
+        reinforce(SCORES[:1], lambda psi: log_softmax(psi)[:1], PSI)
+    with pytest.raises(ValueError, match="log-probabilities"):
+        reinforce(SCORES, lambda psi: log_softmax(psi)[:2], PSI)
