@@ -17,7 +17,7 @@ from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 _log = logging.getLogger(__name__)
 
-# Views rendered and composed together: bounds the memory, changes no pixel.
+# Views rendered and composed together, which bounds the memory. Part of what a seed means, so not a setting.
 CHUNK = 64
 
 
@@ -31,7 +31,8 @@ def render_target(
 ) -> LabelledImages:
     """Images of every object at its draw, object by object; labels are positions in ``objects``.
 
-    Float32 on the CPU. Images without a box are counted in the log. Raises ``ValueError`` for another number of draws than of objects, or none.
+    Float32 on the CPU. Images without a box are counted in the log. Raises ``ValueError`` for another number of
+    draws than of objects, or none.
     """
     if len(objects) != len(draws) or not objects:
         raise ValueError(

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.objects.mesh import ObjectMesh, normalise
+from neural_sim.parameter.pose import Pose
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.rendered import render_target
+from neural_sim.target.sets import RenderedTarget
+from neural_sim.types import PinholeCamera, SceneDraw
+
+CAMERA = PinholeCamera(32, 32, 0.7)
+
+
+class Sphere:
+    """The unit sphere's silhouette in closed form: half-opaque grey within its cone, whatever the mesh."""
+
+    name, supersample = "sphere", 1
+
+    def __init__(self) -> None:
+        self.calls: list[int] = []
+
+    def render(
+        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+    ) -> Float[Tensor, "n h w 4"]:
+        self.calls.append(len(camera_to_world))
+        distance = camera_to_world[:, :3, 3].norm(dim=-1).float()
+        focal = 0.5 * camera.height / np.tan(0.5 * camera.field_of_view)
+        radius = focal / (distance.square() - 1).sqrt()
+        centre = torch.arange(camera.height) + 0.5 - camera.height / 2
+        inside = (centre[:, None] ** 2 + centre**2).sqrt() < radius[:, None, None]
+        return torch.stack([0.5 * torch.ones_like(inside, dtype=torch.float32)] * 3 + [0.75 * inside], -1)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def meshes() -> dict[str, ObjectMesh]:
+    return {name: normalise(trimesh.creation.box(), name, "test") for name in ("can", "mug")}
+
+
+@pytest.fixture
+def synthesizer() -> Synthesizer:
+    return Synthesizer(ProceduralClutter(octaves=1, contrast=0.0, shapes=0, grain=0.0))
+
+
+def draw_at(distances: list[float]) -> SceneDraw:
+    distance = torch.tensor(distances)
+    zero = torch.zeros_like(distance)
+    return SceneDraw(zero + 1.0, zero, distance, torch.arange(len(distance)))
+
+
+def test_images_boxes_and_labels_of_spheres(
+    meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
+) -> None:
+    draws = [draw_at([2.5, 3.0, 4.0]), draw_at([3.5])]
+    made = render_target(list(meshes.values()), Sphere(), draws, CAMERA, synthesizer, generator)
+    assert made.labels[:, 0].tolist() == [0, 0, 0, 1]
+    assert made.bins.tolist() == [0, 1, 2, 0]
+    for row, distance in enumerate((2.5, 3.0, 4.0, 3.5)):
+        radius = 16 / np.tan(0.35) / (distance**2 - 1) ** 0.5
+        want = torch.tensor([16 - radius, 16 - radius, 16 + radius, 16 + radius]).clamp(0, 32)
+        assert (made.boxes[row, 0] - want).abs().max() <= 1.0
+        # Straight alpha: 0.75 of the object's 0.5 and a quarter of the plain background seen in the corner.
+        background = made.images[row, :, 0, 0]
+        torch.testing.assert_close(made.images[row, :, 16, 16], 0.375 + 0.25 * background)
+
+
+def test_many_views_come_in_chunks_and_lost_objects_without_boxes(
+    meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
+) -> None:
+    renderer = Sphere()
+    draws = [draw_at([3.0] * 70), draw_at([500.0])]
+    made = render_target(list(meshes.values()), renderer, draws, CAMERA, synthesizer, generator)
+    assert renderer.calls == [64, 6, 1]
+    assert made.labels[:, 0].tolist() == [0] * 70 + [-1]
+
+
+def test_a_draw_per_object_is_wanted(
+    meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
+) -> None:
+    with pytest.raises(ValueError, match="got 1 draws for 2 objects"):
+        render_target(list(meshes.values()), Sphere(), [draw_at([3.0])], CAMERA, synthesizer, generator)
+
+
+def test_sets_follow_the_target_distribution_and_share_nothing(
+    meshes: dict[str, ObjectMesh], synthesizer: Synthesizer
+) -> None:
+    pose = Pose(biased={"mug": {"target": {"dominant": 3}}})
+    target = RenderedTarget(val_per_object=30, test_per_object=20, test_per_biased_object=40)
+    made = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)
+    again = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)
+    other = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 6)
+    assert (len(made["val"]), len(made["test"])) == (60, 20 + 40)
+    assert torch.equal(made["test"].images, again["test"].images)
+    assert not torch.equal(made["val"].images, other["val"].images)
+    mug = made["test"].labels[:, 0] == 1
+    counts = torch.bincount(made["test"].bins[mug], minlength=8)
+    assert counts.max() >= 26  # 40 draws with probability 0.86: below 26 in one of a million runs
+    colours = {name: {tuple(c.tolist()) for c in part.images[:, :, 0, 0]} for name, part in made.items()}
+    assert not colours["val"] & colours["test"]
+
+
+def test_fewer_than_one_image_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"target\.val_per_object must be at least 1, got 0"):
+        RenderedTarget(val_per_object=0)
