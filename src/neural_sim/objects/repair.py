@@ -33,7 +33,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 
 
 def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    mesh = mesh.copy()
+    mesh = mesh.copy(include_cache=True)  # the cache holds normals that a file gave
     finite = np.isfinite(mesh.vertices).all(1)
     good = finite[mesh.faces].all(1)
     if good.any():
@@ -50,7 +50,7 @@ def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh
             source, name, int((~good).sum()), len(good),
         )  # fmt: skip
         mesh.update_faces(good)
-    mesh.remove_unreferenced_vertices()
+        mesh.remove_unreferenced_vertices()
     return mesh
 
 

@@ -32,8 +32,9 @@ class PyrenderRenderer:
     """Renders with pyrender's unlit pass over a surface whose light is baked into its vertices.
 
     pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each pixel
-    averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views; ``close``
-    frees it (so does the interpreter's exit). Needs PYOPENGL_PLATFORM set before this module is imported.
+    averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views and all
+    renderers of the process; the last ``close`` frees it (so does the interpreter's exit). Needs PYOPENGL_PLATFORM set
+    before this module is imported.
     """
 
     name = "pyrender"
@@ -43,8 +44,6 @@ class PyrenderRenderer:
             raise ValueError(f"renderer.supersample: want at least 1, got {supersample}")
         self.supersample = supersample
         self.lighting = Lighting() if lighting is None else lighting
-        self._context: pyrender.OffscreenRenderer | None = None
-        _open_renderers.add(self)
 
     def render(
         self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
@@ -55,7 +54,8 @@ class PyrenderRenderer:
         lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)
         eye = scene.add(lens, pose=np.eye(4))
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
-        context = self._sized_context(camera)
+        width, height = camera.width * self.supersample, camera.height * self.supersample
+        context = _shared_context(self, width, height)
         images = []
         for pose in camera_to_world.detach().cpu().double().numpy():
             scene.set_pose(eye, pose)
@@ -66,17 +66,10 @@ class PyrenderRenderer:
         return torch.from_numpy(np.stack(images))
 
     def close(self) -> None:
-        """Free the OpenGL context; a later ``render`` makes a new one."""
-        if self._context is not None:
-            self._context.delete()
-            self._context = None
-
-    def _sized_context(self, camera: PinholeCamera) -> pyrender.OffscreenRenderer:
-        width, height = camera.width * self.supersample, camera.height * self.supersample
-        if self._context is None:
-            self._context = pyrender.OffscreenRenderer(width, height)
-        self._context.viewport_width, self._context.viewport_height = width, height
-        return self._context
+        """Free the OpenGL context unless another renderer uses it; a later ``render`` makes a new one."""
+        _users.discard(self)
+        if not _users:
+            _free_context()
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
@@ -108,11 +101,24 @@ def _primitives(surface: Surface) -> pyrender.Mesh:
     return pyrender.Mesh(primitives=sides)
 
 
-_open_renderers: weakref.WeakSet[PyrenderRenderer] = weakref.WeakSet()
+# One context a process: freeing one of two EGL contexts ends the display they share, and with it the other.
+_context: pyrender.OffscreenRenderer | None = None
+_users: weakref.WeakSet[PyrenderRenderer] = weakref.WeakSet()
 
 
+def _shared_context(user: PyrenderRenderer, width: int, height: int) -> pyrender.OffscreenRenderer:
+    global _context
+    _users.add(user)
+    if _context is None:
+        _context = pyrender.OffscreenRenderer(width, height)
+    _context.viewport_width, _context.viewport_height = width, height
+    return _context
+
+
+# PyOpenGL's modules are gone by the time the garbage collector would get here.
 @atexit.register
-def _close_all() -> None:
-    # PyOpenGL's modules are gone by the time the garbage collector would get here.
-    for renderer in list(_open_renderers):
-        renderer.close()
+def _free_context() -> None:
+    global _context
+    if _context is not None:
+        _context.delete()
+        _context = None
