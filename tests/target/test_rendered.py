@@ -60,14 +60,17 @@ def test_images_boxes_and_labels_of_spheres(
 ) -> None:
     draws = [draw_at([2.5, 3.0, 4.0]), draw_at([3.5])]
     made = render_target(list(meshes.values()), Sphere(), draws, CAMERA, synthesizer, generator)
+    replayed = torch.Generator().manual_seed(0)
+    plain = torch.cat([synthesizer.draw_nuisance(n, CAMERA, replayed).backgrounds for n in (3, 1)])
     assert made.labels[:, 0].tolist() == [0, 0, 0, 1]
     assert made.bins.tolist() == [0, 1, 2, 0]
     for row, distance in enumerate((2.5, 3.0, 4.0, 3.5)):
         radius = 16 / np.tan(0.35) / (distance**2 - 1) ** 0.5
         want = torch.tensor([16 - radius, 16 - radius, 16 + radius, 16 + radius]).clamp(0, 32)
         assert (made.boxes[row, 0] - want).abs().max() <= 1.0
-        # Straight alpha: 0.75 of the object's 0.5 and a quarter of the plain background seen in the corner.
-        background = made.images[row, :, 0, 0]
+        background = plain[row, :, 0, 0]
+        torch.testing.assert_close(made.images[row, :, 0, 0], background)
+        # Straight alpha: 0.75 of the object's 0.5 and a quarter of what lies behind.
         torch.testing.assert_close(made.images[row, :, 16, 16], 0.375 + 0.25 * background)
 
 
