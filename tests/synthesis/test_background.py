@@ -86,6 +86,16 @@ def test_photo_crops_are_reproducible(photos: Path) -> None:
     assert draws[0].shape == (6, 3, 12, 20)
 
 
+def test_the_digest_follows_the_photos_not_their_place(
+    photos: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    first = PhotoFolder(photos).digest()
+    moved = photos.rename(tmp_path_factory.mktemp("elsewhere") / "photos")
+    assert PhotoFolder(moved).digest() == first
+    Image.new("RGB", (9, 9)).save(moved / "new.png")
+    assert PhotoFolder(moved).digest() != first
+
+
 def test_missing_empty_and_broken_photos_are_refused_with_their_path(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="nowhere"):
         PhotoFolder(tmp_path / "nowhere")

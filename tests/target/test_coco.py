@@ -5,11 +5,17 @@ from typing import Any
 
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
+from neural_sim.objects.mesh import normalise
+from neural_sim.parameter.pose import Pose
+from neural_sim.renderer.raycast import RaycastRenderer
+from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.coco import CocoTarget
-from neural_sim.types import LabelledImages
+from neural_sim.types import LabelledImages, PinholeCamera
 
 NAMES = ["can", "mug"]
 
@@ -87,6 +93,28 @@ def test_images_may_lie_elsewhere_and_be_limited(tmp_path: Path) -> None:
     assert len(CocoTarget(path, images=photos, limit=1).load(NAMES, 16, 16)) == 1
     with pytest.raises(ValueError, match=r"wide\.png \(named in .*labels\.json\): not a readable image"):
         CocoTarget(path).load(NAMES, 16, 16)
+
+
+def test_the_digest_follows_labels_and_photos(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    digests = [CocoTarget(path).digest(), CocoTarget(path, limit=1).digest()]
+    Image.new("RGB", (41, 20), "red").save(tmp_path / "wide.png")
+    digests.append(CocoTarget(path).digest())
+    write(tmp_path, annotations=[])
+    digests.append(CocoTarget(path).digest())
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
+
+
+def test_sets_split_the_file(tmp_path: Path) -> None:
+    camera, synthesizer = PinholeCamera(24, 16, 0.7), Synthesizer(ProceduralClutter())
+    meshes = {name: normalise(trimesh.creation.box(), name, "test") for name in NAMES}
+    target = CocoTarget(write(tmp_path), val_fraction=0.5)
+    made = target.sets(meshes, RaycastRenderer(), Pose(), camera, synthesizer, seed=3)
+    assert {name: part.images.shape for name, part in made.items()} == {
+        "val": (1, 3, 16, 24), "test": (1, 3, 16, 24),
+    }  # fmt: skip
+    assert {len(made[name].labels[made[name].present]) for name in made} == {0, 2}
 
 
 @pytest.mark.parametrize(

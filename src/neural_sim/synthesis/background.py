@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from pathlib import Path
 from typing import Protocol
@@ -159,6 +160,11 @@ class PhotoFolder:
             for index in (i for i, other in enumerate(chosen) if other == file):
                 images[index] = self._crop(photo, height, width, *uniform[index])
         return images
+
+    def digest(self) -> str:
+        """SHA-256 of the photographs' names and sizes in bytes, for store keys."""
+        lines = (f"{path.relative_to(self.root).as_posix()} {path.stat().st_size}\n" for path in self.files)
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def _crop(self, photo: Image.Image, height: int, width: int, u: float, v: float, w: float) -> Tensor:
         scale = min(photo.width / width, photo.height / height) * (self.smallest + (1.0 - self.smallest) * w)

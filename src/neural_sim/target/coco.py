@@ -72,8 +72,12 @@ class CocoTarget:
         return self._file.parent if self.images is None else Path(self.images).expanduser()
 
     def digest(self) -> str:
-        """SHA-256 of the annotations file, for store keys; photographs are taken not to change under one name."""
-        return hashlib.sha256(self._file.read_bytes()).hexdigest()
+        """SHA-256 of the annotations and of the photographs' sizes in bytes, for store keys."""
+        state = hashlib.sha256(self._file.read_bytes())
+        for entry in _read(self._file)["images"]:
+            path = self._folder / entry["file_name"]
+            state.update(f"{entry['file_name']} {path.stat().st_size if path.is_file() else None}\n".encode())
+        return state.hexdigest()
 
     def sets(
         self,
