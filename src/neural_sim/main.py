@@ -22,12 +22,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 if TYPE_CHECKING:
-    from neural_sim.pipeline import Experiment
+    from neural_sim.artifacts import Experiment
 
 _log = logging.getLogger(__name__)
 
 # Groups whose mapping names a class or function (``_target_``); the rest are plain settings.
-_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "damping")
+_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver")
 _SETTINGS = ("gradient", "outer", "training")
 
 
@@ -62,7 +62,7 @@ def build(config: DictConfig) -> Experiment:
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
     plain = {str(key): value for key, value in plain.items()}
     _check_top(plain)
-    from neural_sim.pipeline import Experiment
+    from neural_sim.artifacts import Experiment
 
     parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
     parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}

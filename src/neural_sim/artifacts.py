@@ -1,0 +1,277 @@
+"""What the stages of a run make, each made or found in the store when it is first asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neural_sim import codec
+from neural_sim.cameras import orbit
+from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.training import train_detector
+from neural_sim.field.base import RadianceField
+from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
+from neural_sim.gradient.estimators import Estimator
+from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.outer import SimulatorModule, learn_psi
+from neural_sim.parameter.pose import Pose
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.views import choose_mesh_renderer, render_views
+from neural_sim.settings import Outer, Training, Views
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.store import Entry, Store, code_version, tensor_digest
+from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All parts of a run, built and validated; ``config`` is what they were built from, for keys and reports."""
+
+    name: str
+    method: str
+    optimise: bool
+    seed: int
+    stages: tuple[str, ...]
+    store: Path
+    mlflow: str
+    progress: bool
+    accelerator: str
+    objects: Any
+    views: Views
+    field: FieldRecipe
+    renderer: NerfRenderer
+    pose: Pose
+    synthesis: Synthesizer
+    target: Any
+    detector: Callable[..., Detector]
+    training: Training
+    outer: Outer
+    solver: AdjointSolver
+    gradient: Estimator
+    config: dict[str, Any]
+
+
+@dataclass
+class Account:
+    """What a run cost and what it did not have to do."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+
+    def note(self, stage: str, entry: Entry, what: str) -> None:
+        if entry.found:
+            self.left_out.append({"stage": stage, "what": what, "why": "found in the store"})
+
+
+class Artifacts:
+    """Results of the stages. A result whose stage was not asked for must be in the store."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.x = experiment
+        self.store = Store(experiment.store)
+        self.account = Account()
+        self.names: list[str] = experiment.objects.names()
+        self.device = torch.device("cuda" if experiment.accelerator == "gpu" else "cpu")
+        unknown = set(experiment.pose.biased or {}) - set(self.names)
+        if unknown:
+            raise ValueError(f"parameter.pose.biased names {sorted(unknown)}, objects are {self.names}")
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        return self.x.objects.digests()
+
+    @cached_property
+    def meshes(self) -> dict[str, ObjectMesh]:
+        return {item.name: item for item in self.x.objects.load()}
+
+    @cached_property
+    def mesh_renderer(self) -> Any:
+        return choose_mesh_renderer(self.x.views.backend, self.x.views.supersample)
+
+    def _config(self, *groups: str) -> dict[str, Any]:
+        return {group: self.x.config[group] for group in groups}
+
+    def _fetch(self, stage: str, kind: str, what: str, key: dict[str, Any], make: Callable[[], Any]) -> Any:
+        """A result from the store, or made now if its stage is among those asked for."""
+
+        def make_if_asked() -> Any:
+            if stage not in self.x.stages:
+                raise ValueError(
+                    f"stages: {what} is not in {self.x.store}; run stage {stage} too (got {list(self.x.stages)})"
+                )
+            return make()
+
+        entry = self.store.fetch(kind, key, make_if_asked)
+        self.account.note(stage, entry, what)
+        return entry.value
+
+    # --- views and fields: per object, shared by all runs ---
+
+    def _views_key(self, name: str) -> dict[str, Any]:
+        version = code_version("objects", "renderer/mesh", "renderer/raycast", "renderer/views", "cameras")
+        return {"object": self.digests[name], **self._config("views"), "code": version}
+
+    def views(self, name: str) -> Any:
+        def make() -> Any:
+            views = self.x.views
+            generator = torch.Generator().manual_seed(views.seed)
+            uniform = torch.rand((3, views.count), generator=generator)
+            near, far = views.distance_range
+            distance = near + (far - near) * uniform[2]
+            poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], distance)
+            made = render_views(self.mesh_renderer, self.meshes[name], views.camera(views.image_size), poses)
+            return codec.pack_views(made)
+
+        key = self._views_key(name)
+        return self._fetch("views", "views", f"views of {name}", key, make)
+
+    def _field_key(self, name: str) -> dict[str, Any]:
+        version = code_version("field", "renderer/nerf", "cameras")
+        return {"views": self._views_key(name), **self._config("field"), "code": version}
+
+    def field(self, name: str) -> dict[str, Any]:
+        """State and history of one object's radiance field."""
+
+        def make() -> Any:
+            views = codec.unpack_views(self.views(name))
+            fitted, history = self.x.field.fit(views, self.x.views.held_out, self.device)
+            return {"field": field_state(fitted), "history": history}
+
+        key = self._field_key(name)
+        return self._fetch("field", "field", f"field of {name}", key, make)
+
+    @cached_property
+    def scene(self) -> Scene:
+        fields: tuple[RadianceField, ...] = tuple(
+            field_from_state(self.field(name)["field"]).to(self.device) for name in self.names
+        )
+        camera = self.x.views.camera(self.x.training.image_size)
+        return Scene(tuple(self.names), fields, self.x.renderer, camera, self.x.synthesis, self.x.pose)
+
+    # --- distributions and sets ---
+
+    def psi(self, which: str) -> Tensor:
+        """Configured logits of all objects: ``initial`` or ``target``."""
+        return torch.stack(
+            [self.x.pose.logits(self.x.pose.probabilities(which, name)) for name in self.names]
+        )
+
+    def _scene_key(self) -> dict[str, Any]:
+        parts = self._config("renderer", "parameter", "synthesis", "training")
+        version = code_version("field", "renderer/nerf", "parameter", "synthesis", "detector", "cameras")
+        return {
+            "fields": [self._field_key(n) for n in self.names],
+            "names": self.names,
+            **parts,
+            "code": version,
+        }
+
+    @cached_property
+    def targets(self) -> dict[str, LabelledImages]:
+        """The labelled target set, split into ``val`` (steers psi) and ``test`` (scored once)."""
+        camera = self.x.views.camera(self.x.training.image_size)
+
+        def make() -> Any:
+            made = self.x.target.sets(
+                self.meshes, self.mesh_renderer, self.x.pose, camera, self.x.synthesis, self.x.seed
+            )
+            return {name: codec.pack_images(images) for name, images in made.items()}
+
+        key = {
+            "objects": self.digests, "names": self.names, "seed": self.x.seed,
+            **self._config("target", "parameter", "synthesis", "views"), "size": self.x.training.image_size,
+            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "synthesis", "parameter"),
+        }  # fmt: skip
+        entry = self.store.fetch("target", key, make)
+        return {name: codec.unpack_images(held) for name, held in entry.value.items()}
+
+    # --- detectors ---
+
+    @cached_property
+    def detector(self) -> Detector:
+        return self.x.detector(num_classes=len(self.names), image_size=self.x.training.image_size)
+
+    def _generator(self, purpose: int) -> torch.Generator:
+        return torch.Generator().manual_seed(1_000_003 * (self.x.seed + 1) + purpose)
+
+    def _train_cold(self, psi: Tensor, epochs: int, purpose: int) -> Parameters:
+        """A detector from scratch on images from ``psi``; the same budget and seed whatever the method."""
+        generator = self._generator(purpose)
+        training = self.x.training
+        images = join(self.scene.training_set(psi, training.images_per_object, generator))
+        params, _ = train_detector(
+            self.detector, self.detector.init(generator), images, generator, epochs=epochs,
+            batch_size=training.batch_size, learning_rate=training.learning_rate,
+            weight_decay=training.weight_decay, progress=False,
+        )  # fmt: skip
+        return params
+
+    def _trained_key(self, psi: Tensor) -> dict[str, Any]:
+        return {
+            "scene": self._scene_key(),
+            **self._config("detector"),
+            "psi": tensor_digest([psi]),
+            "seed": self.x.seed,
+        }
+
+    def warm_start(self) -> Parameters:
+        psi = self.psi("initial")
+        return self._fetch(
+            "warm_start", "warm_start", "warm start", self._trained_key(psi),
+            lambda: self._train_cold(psi, self.x.training.warm_epochs, purpose=1),
+        )  # fmt: skip
+
+    def learned(self) -> dict[str, Any]:
+        """psi after the loop (``last``, ``best``) and its records; the initial psi where nothing is optimised."""
+        initial = self.psi("initial")
+        if not self.x.optimise:
+            return {"last": initial, "best": initial, "records": []}
+
+        def make() -> Any:
+            module = SimulatorModule(
+                self.scene, self.detector, self.warm_start(), initial, self.targets["val"], self.x.outer,
+                self.x.gradient, self.x.solver, self.x.training.batch_size, self.x.training.weight_decay,
+                self._generator(2),
+            )  # fmt: skip
+            found = learn_psi(module, self.x.progress)
+            records = [dataclasses.asdict(record) for record in found.records]
+            return {"last": found.last, "best": found.best, "records": records}
+
+        key = {
+            "warm_start": self._trained_key(initial), **self._config("target", "outer", "gradient", "solver"),
+            "code": code_version("outer", "gradient", "solver"),
+        }  # fmt: skip
+        return self._fetch("psi", "psi", "psi loop", key, make)
+
+    def training_images(self, psi: Tensor) -> list[RenderedObject]:
+        """The images that the scored detector trained on, drawn again from the same seed."""
+        return self.scene.training_set(psi, self.x.training.images_per_object, self._generator(3))
+
+    def scores(self, psi: Tensor, what: str) -> dict[str, Any]:
+        """AP on the test set of a detector trained cold on images from ``psi``, and its detections."""
+
+        def make() -> Any:
+            params = self._train_cold(psi, self.x.training.cold_epochs, purpose=3)
+            test = self.targets["test"]
+            detections = self.detector.predict(params, test.images)
+            return {"ap": evaluate(detections, test, self.names), "detections": detections}
+
+        key = {"trained": self._trained_key(psi), **self._config("target"), "code": code_version("target")}
+        return self._fetch("evaluate", "evaluate", f"detector trained on {what}", key, make)
+
+    def compared(self) -> dict[str, Tensor]:
+        """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
+        return {"ns": self.psi("initial"), "learned": self.learned()["last"], "matched": self.psi("target")}

@@ -1,0 +1,286 @@
+"""The psi loop of Eq. 1 as a LightningModule: render, train the detector, hypergradient, step psi; and again."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+
+import lightning.pytorch as pl
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.targets import Targets
+from neural_sim.detector.training import cached_features, train_detector
+from neural_sim.gradient.base import IndexedLoss, ObjectImages, RenderedPath
+from neural_sim.gradient.estimators import Estimator, Losses, Probes
+from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
+from neural_sim.settings import Outer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """What one outer iteration did; probabilities are those the images were drawn from, before the step."""
+
+    probabilities: list[list[float]]
+    entropies: list[float]
+    gradient_norms: list[float]
+    signal_to_noise: list[float]
+    validation_loss: float
+    training_loss: float
+    stationarity: float
+    solver_status: str
+    solver_steps: int
+    solver_residual: float
+    damping: float
+    curvature_min: float
+    curvature_max: float
+    images_without_box: int
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CachedSet:
+    """Features of a set's images under the frozen backbone, and their targets: all the predictor's loss needs."""
+
+    detector: Detector
+    features: tuple[Tensor, ...]
+    targets: Targets
+
+    @staticmethod
+    def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
+        features = cached_features(detector, backbone, images.images)
+        return CachedSet(detector, features, detector.assign(images.boxes, images.labels))
+
+    def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
+        """Losses of the images ``index``."""
+        rows = tuple(level[index] for level in self.features)
+        return self.detector.per_image_loss(params, rows, self.targets.select(index))
+
+    def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
+        """The mean loss as a sum over chunks."""
+        count = len(self.targets)
+        return [
+            lambda params, rows=rows: self.losses(params, rows).sum() / count
+            for rows in torch.arange(count).split(chunk_size)
+        ]
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
+    begin = time.perf_counter()
+    yield
+    seconds[phase] = seconds.get(phase, 0.0) + time.perf_counter() - begin
+
+
+class SimulatorModule(pl.LightningModule):
+    """psi as logits [objects, k], moved by the hypergradient; one training step is one outer iteration.
+
+    The detector goes on from ``params`` with its backbone frozen, ``settings.epochs`` epochs an iteration on freshly
+    drawn images. ``validation`` is the labelled target set; no step sees any other real image.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        detector: Detector,
+        params: Parameters,
+        psi: Float[Tensor, "objects k"],
+        validation: LabelledImages,
+        settings: Outer,
+        estimator: Estimator,
+        solver: AdjointSolver,
+        batch_size: int,
+        weight_decay: float,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.scene, self.detector, self.theta = scene, detector, params
+        self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
+        self.settings, self.estimator, self.solver = settings, estimator, solver
+        self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
+        self.records: list[IterationRecord] = []
+        self.best_psi, self.best_loss = self.psi.detach().clone(), math.inf
+        self._update_state = settings.update.start(self.psi)
+        self._backbone, _ = detector.split(params)
+        self._validation = CachedSet.of(detector, self._backbone, validation)
+        self._probe_set, self._probes = self._draw_probes()
+        self._adjoint: Tensor | None = None
+
+    def configure_optimizers(self) -> None:
+        return None
+
+    def train_dataloader(self) -> range:
+        return range(self.settings.iterations)
+
+    def training_step(self, batch: int, batch_idx: int) -> None:
+        seconds: dict[str, float] = {}
+        with _timed(seconds, "render"):
+            rendered = self.scene.training_set(
+                self.psi, self.settings.images_per_object, self.generator, self.estimator.relaxed
+            )
+            images = join(rendered)
+        with _timed(seconds, "train"):
+            training_loss = self._train(images)
+        with _timed(seconds, "features"):
+            cached = CachedSet.of(self.detector, self._backbone, images)
+        with _timed(seconds, "hypergradient"):
+            result = self._hypergradient(rendered, images, cached)
+        seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
+        self._record(result, images, training_loss, seconds)
+        gradient = torch.stack([result.psi_gradients[name] for name in self.scene.names])
+        log_p = self.scene.pose.log_probabilities(self.psi)
+        moved, self._update_state = self.settings.update.step(self.psi, log_p, gradient, self._update_state)
+        self.psi.data = moved
+
+    def _train(self, images: LabelledImages) -> float:
+        if self.settings.epochs == 0:
+            return math.nan
+        self.theta, history = train_detector(
+            self.detector,
+            self.theta,
+            images,
+            self.generator,
+            epochs=self.settings.epochs,
+            batch_size=self.batch_size,
+            learning_rate=self.settings.learning_rate,
+            weight_decay=self.weight_decay,
+            trainable_only=True,
+        )
+        return history.losses[-1]
+
+    def _hypergradient(
+        self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
+    ) -> Hypergradient:
+        _, trainable = self.detector.split(self.theta)
+        count = len(images)
+        weights = torch.full((count,), 1.0 / count)
+        inner = InnerProblem(trainable, cached.losses, weights)
+        probe_losses: IndexedLoss | None = self._probe_set.losses if self._probe_set else None
+        losses = Losses(cached.losses, self._losses_of_images(cached.targets), probe_losses)
+        estimates, first = {}, 0
+        for label, part in enumerate(rendered):
+            index = torch.arange(first, first + len(part.images))
+            first += len(part.images)
+            held = ObjectImages(
+                psi=self.psi[label].detach().to(part.rgb.dtype),
+                log_probabilities=self.scene.pose.log_probabilities,
+                images=part.images.images,
+                index=index,
+                weights=weights[index],
+                draw=part.draw,
+                path=self._path(label, part) if self.estimator.relaxed else None,
+            )
+            estimates[self.scene.names[label]] = self._bind(losses, held, self._probes.get(label))
+        result = hypergradient(
+            inner, self._validation.mean_terms(), estimates, self.solver, self.generator, self._adjoint
+        )
+        self._adjoint = result.solution.value
+        return result
+
+    def _bind(self, losses: Losses, held: ObjectImages, probes: Probes | None) -> Callable:
+        _, trainable = self.detector.split(self.theta)
+        return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
+
+    def _losses_of_images(self, targets: Targets) -> Callable[[Parameters, Tensor, Tensor], Tensor]:
+        def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
+            features = self.detector.features(self._backbone, chunk)
+            return self.detector.per_image_loss(params, features, targets.select(index))
+
+        return losses
+
+    def _path(self, label: int, part: RenderedObject) -> RenderedPath:
+        scene = self.scene
+
+        def compose(rgb: Tensor, opacity: Tensor) -> Tensor:
+            return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins).images
+
+        return RenderedPath(
+            relaxed=lambda psi: scene.pose.relaxed(psi, part.noise),
+            render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
+            compose=compose,
+            camera=scene.camera,
+            rgb=part.rgb,
+            opacity=part.opacity,
+        )
+
+    def _draw_probes(self) -> tuple[CachedSet | None, dict[int, Probes]]:
+        per_bin = self.estimator.probes_per_bin
+        if per_bin == 0:
+            return None, {}
+        drawn = [self.scene.probes(label, per_bin, self.generator) for label in range(len(self.scene.names))]
+        each = self.scene.pose.bins * per_bin
+        probes = {
+            label: Probes(torch.arange(each) + label * each, part.draw.bins)
+            for label, part in enumerate(drawn)
+        }
+        return CachedSet.of(self.detector, self._backbone, join(drawn)), probes
+
+    def _record(
+        self, result: Hypergradient, images: LabelledImages, training_loss: float, seconds: dict[str, float]
+    ) -> None:
+        log_p = self.scene.pose.log_probabilities(self.psi.detach())
+        _, trainable = self.detector.split(self.theta)
+        with torch.no_grad():
+            validation_loss = float(sum(term(trainable) for term in self._validation.mean_terms()))
+        if validation_loss < self.best_loss:
+            self.best_loss, self.best_psi = validation_loss, self.psi.detach().clone()
+        spectrum = result.damping.spectrum
+        noise = [float(result.signal_to_noise[name].median()) for name in self.scene.names]
+        record = IterationRecord(
+            probabilities=log_p.exp().tolist(),
+            entropies=(-(log_p.exp() * log_p).sum(-1)).tolist(),
+            gradient_norms=[float(result.psi_gradients[name].norm()) for name in self.scene.names],
+            signal_to_noise=noise,
+            validation_loss=validation_loss,
+            training_loss=training_loss,
+            stationarity=result.stationarity,
+            solver_status=result.solution.status.name,
+            solver_steps=result.solution.steps,
+            solver_residual=result.solution.residual,
+            damping=result.damping.value,
+            curvature_min=spectrum.smallest if spectrum else math.nan,
+            curvature_max=spectrum.largest if spectrum else math.nan,
+            images_without_box=int((~images.present.any(-1)).sum()),
+            seconds=seconds,
+        )
+        self.records.append(record)
+        _log.debug("psi iteration %d: %s", len(self.records), asdict(record))
+
+
+@dataclass(frozen=True)
+class LearnedPsi:
+    """The loop's outcome. ``last`` is what the method reports; ``best`` had the lowest validation loss."""
+
+    last: Float[Tensor, "objects k"]
+    best: Float[Tensor, "objects k"]
+    records: list[IterationRecord] = field(default_factory=list)
+
+
+def learn_psi(module: SimulatorModule, progress: bool) -> LearnedPsi:
+    """Run the loop to its budget through a Lightning Trainer that writes nothing."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="lightning")
+        trainer = pl.Trainer(
+            max_epochs=1,
+            accelerator="cpu" if module.psi.device.type == "cpu" else "gpu",
+            devices=1,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=progress,
+            enable_model_summary=False,
+        )
+        trainer.fit(module)
+    return LearnedPsi(module.psi.detach().clone(), module.best_psi, module.records)

@@ -1,0 +1,116 @@
+"""The stages of a run in their order, each skipped when its result is in the store."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tqdm import tqdm
+
+from neural_sim.artifacts import Artifacts, Experiment
+from neural_sim.report.run import RunResults, track, write_figures, write_results, write_training_set
+from neural_sim.report.tracking import tracking_uri
+from neural_sim.synthesis.scene import join
+
+_log = logging.getLogger(__name__)
+
+STAGES = ("views", "field", "warm_start", "psi", "evaluate", "report")
+
+
+class Pipeline:
+    """Walks the stages and reports."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.x = experiment
+        self.made = Artifacts(experiment)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count a stage's seconds if it is asked for."""
+        begin = time.perf_counter()
+        yield
+        self.made.account.seconds[name] = time.perf_counter() - begin
+        _log.info("%-10s %8.1f s", name, self.made.account.seconds[name])
+
+    def run_stage(self, name: str) -> None:
+        """Make or find a stage's results."""
+        if name in ("views", "field"):
+            for item in tqdm(self.made.names, desc=name, disable=not self.x.progress, leave=False):
+                getattr(self.made, name)(item)
+        elif name == "warm_start":
+            self.made.warm_start()
+        elif name == "psi":
+            self.made.learned()
+        elif name == "evaluate":
+            for what, psi in tqdm(
+                self.made.compared().items(), desc=name, disable=not self.x.progress, leave=False
+            ):
+                self.made.scores(psi, what)
+
+    def results(self) -> RunResults:
+        """What there is to report: a run without evaluation has no AP."""
+        learned = self.made.learned()
+        psi = {
+            "initial": self.made.psi("initial"),
+            "learned": learned["last"],
+            "target": self.made.psi("target"),
+        }
+        evaluated = "evaluate" in self.x.stages
+        scores = (
+            {what: self.made.scores(psi, what)["ap"] for what, psi in self.made.compared().items()}
+            if evaluated
+            else {}
+        )
+        return RunResults(
+            experiment=self.x.name,
+            method=self.x.method,
+            seed=self.x.seed,
+            names=self.made.names,
+            biased=sorted(self.x.pose.biased or {}),
+            probabilities={which: self.x.pose.log_probabilities(value).exp() for which, value in psi.items()},
+            records=learned["records"],
+            ap=scores,
+            fields={name: self.made.field(name)["history"] for name in self.made.names},
+            seconds=dict(self.made.account.seconds),
+            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            left_out=self.made.account.left_out,
+            config=self.x.config,
+        )
+
+    def report(self, folder: Path) -> None:
+        """Figures, the final training set, results.json, MLflow."""
+        results = self.results()
+        drawn = self.made.training_images(self.made.learned()["last"])
+        test = self.made.targets["test"]
+        detections = (
+            self.made.scores(self.made.learned()["last"], "learned")["detections"] if results.ap else []
+        )
+        write_figures(results, join(drawn), test, detections, folder / "figures")
+        write_training_set(drawn, self.made.names, folder / "training_set")
+        write_results(results, folder)
+        uri = tracking_uri(self.x.mlflow)
+        track(results, uri, folder)
+        print(results.summary())
+        print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
+
+
+def run(experiment: Experiment, folder: Path) -> float | None:
+    """Run the stages asked for, in order; the report lands in ``folder``.
+
+    Returns the AP of the detector trained on the learned distribution, which a sweep may optimise; None without one.
+    """
+    pipeline = Pipeline(experiment)
+    for name in STAGES[:-1]:
+        if name in experiment.stages:
+            with pipeline.stage(name):
+                pipeline.run_stage(name)
+    if "report" in experiment.stages:
+        with pipeline.stage("report"):
+            pipeline.report(folder)
+    if "evaluate" not in experiment.stages:
+        return None
+    return pipeline.made.scores(pipeline.made.learned()["last"], "learned")["ap"]["ap"]

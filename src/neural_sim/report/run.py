@@ -1,0 +1,204 @@
+"""What a run leaves in its folder: results.json, figures, the final training set in COCO form; and in MLflow."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neural_sim.parameter.distributions import total_variation
+from neural_sim.report import figures, tracking
+from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.scene import RenderedObject, join
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """Everything the report shows. Probabilities are [objects, k]; ``ap`` maps ns, learned, matched to scores."""
+
+    experiment: str
+    method: str
+    seed: int
+    names: Sequence[str]
+    biased: Sequence[str]
+    probabilities: Mapping[str, Tensor]
+    records: Sequence[Mapping[str, Any]]
+    ap: Mapping[str, Mapping[str, Any]]
+    fields: Mapping[str, Sequence[Mapping[str, float]]]
+    seconds: Mapping[str, float]
+    peak_memory_mb: float
+    left_out: Sequence[Mapping[str, str]]
+    config: Mapping[str, Any]
+
+    def document(self) -> dict[str, Any]:
+        """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
+        psi = {
+            name: {which: p[label].tolist() for which, p in self.probabilities.items()}
+            for label, name in enumerate(self.names)
+        }
+        return _finite(
+            {
+                "experiment": self.experiment,
+                "method": self.method,
+                "seed": self.seed,
+                "biased": list(self.biased),
+                "psi": psi,
+                "total_variation": self.total_variations(),
+                "ap": dict(self.ap),
+                "iterations": list(self.records),
+                "fields": {name: history[-1] for name, history in self.fields.items() if history},
+                "seconds": dict(self.seconds),
+                "peak_memory_mb": self.peak_memory_mb,
+                "left_out": list(self.left_out),
+            }
+        )
+
+    def total_variations(self) -> dict[str, dict[str, float]]:
+        """Distance of the initial and the learned distribution from the target, per object."""
+        target = self.probabilities["target"]
+        distances = {w: total_variation(self.probabilities[w], target) for w in ("initial", "learned")}
+        return {n: {w: float(d[i]) for w, d in distances.items()} for i, n in enumerate(self.names)}
+
+    def summary(self) -> str:
+        """The table printed at the end of a run."""
+        head = f"{'AP on the test set':<20}" + "".join(f"{name[:12]:>13}" for name in (*self.names, "mean"))
+        lines = [head]
+        for method, scores in self.ap.items():
+            values = [*(scores["per_class"][name] for name in self.names), scores["ap"]]
+            lines.append(f"{method:<20}" + "".join(f"{100 * value:>13.1f}" for value in values))
+        lines.append(f"{'distance to target':<20}")
+        distances = self.total_variations()
+        for which in ("initial", "learned"):
+            row = "".join(f"{distances[name][which]:>13.2f}" for name in self.names)
+            lines.append(f"  {which:<18}{row}")
+        spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
+        lines.append(f"seconds: {spent}; peak memory {self.peak_memory_mb:.0f} MB")
+        if self.left_out:
+            lines.append(f"left out: {len(self.left_out)} stage results found in the store")
+        return "\n".join(lines)
+
+
+def write_results(results: RunResults, folder: Path) -> Path:
+    """results.json in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "results.json"
+    path.write_text(json.dumps(results.document(), indent=1, allow_nan=False))
+    return path
+
+
+def write_figures(
+    results: RunResults,
+    drawn: LabelledImages,
+    test: LabelledImages,
+    detections: Sequence[Mapping[str, Tensor]],
+    folder: Path,
+) -> list[Path]:
+    """The run's figures as PNG files."""
+    names, made = list(results.names), []
+    target = {name: results.probabilities["target"][i].tolist() for i, name in enumerate(names)}
+    if results.records:
+        steps = [record["probabilities"] for record in results.records]
+        last = results.probabilities["learned"].tolist()
+        history = {name: [*(p[i] for p in steps), last[i]] for i, name in enumerate(names)}
+        title = f"{results.experiment}: learned pose distributions, {results.method}, seed {results.seed}"
+        made.append(figures.save(figures.psi_figure(history, target, title), folder / "psi.png"))
+    if results.ap:
+        made.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))
+    chosen = _spread(drawn, 32)
+    grid = figures.image_grid(
+        drawn.select(chosen), names, title="Training images drawn from the learned distribution"
+    )
+    made.append(figures.save(grid, folder / "training_images.png"))
+    if detections:
+        chosen = _spread(test, 32)
+        shown = [detections[int(i)] for i in chosen]
+        title = "Detections on the test set (dashed: truth)"
+        grid = figures.image_grid(test.select(chosen), names, predictions=shown, title=title)
+        made.append(figures.save(grid, folder / "detections.png"))
+    return made
+
+
+def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], folder: Path) -> Path:
+    """The final training set as COCO: images and a JSON that holds every image's pose."""
+    poses = {
+        key: torch.cat([getattr(part.draw, key) for part in parts])
+        for key in ("phi", "rho", "distance", "bins")
+    }
+    return write_coco(join(parts), list(names), folder, poses)
+
+
+def track(results: RunResults, uri: str, folder: Path) -> str:
+    """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
+    metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}
+    metrics["peak_memory_mb"] = results.peak_memory_mb
+    for which, scores in results.ap.items():
+        metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
+        metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
+    for name, distances in results.total_variations().items():
+        metrics |= {f"psi/{name}/distance_{which}": value for which, value in distances.items()}
+    return tracking.log_run(
+        uri,
+        results.experiment,
+        f"{results.method} seed {results.seed}",
+        {
+            "method": results.method,
+            "seed": str(results.seed),
+            "parameter": ",".join(results.config["parameter"]),
+            "biased": ",".join(results.biased),
+        },
+        tracking.flatten(results.config),
+        metrics,
+        _series(results),
+        folder,
+    )
+
+
+def _series(results: RunResults) -> dict[str, list[float]]:
+    series: dict[str, list[float]] = {}
+    for record in results.records:
+        for i, name in enumerate(results.names):
+            for b, p in enumerate(record["probabilities"][i]):
+                series.setdefault(f"psi/{name}/bin_{b + 1}", []).append(p)
+            series.setdefault(f"psi/{name}/entropy", []).append(record["entropies"][i])
+            series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
+        for key in (
+            "validation_loss",
+            "training_loss",
+            "stationarity",
+            "solver_steps",
+            "solver_residual",
+            "damping",
+        ):
+            series.setdefault(f"psi/{key}", []).append(record[key])
+        for phase, spent in record["seconds"].items():
+            series.setdefault(f"psi/seconds_{phase}", []).append(spent)
+    for name, history in results.fields.items():
+        for key in ("psnr", "ssim"):
+            series[f"field/{name}/{key}"] = [row[key] for row in history if key in row]
+    return series
+
+
+def _spread(images: LabelledImages, count: int) -> Tensor:
+    """Indices of up to ``count`` images spread over the set."""
+    return torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
+
+
+def _finite(tree: Any) -> Any:
+    """NaN and infinities as None, so that the file is JSON by the standard."""
+    if isinstance(tree, Mapping):
+        return {key: _finite(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [_finite(value) for value in tree]
+    if isinstance(tree, float) and not math.isfinite(tree):
+        return None
+    return tree

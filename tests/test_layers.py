@@ -1,0 +1,61 @@
+"""Rooms import only from the rooms before them, and each heavy library from its own place."""
+
+import ast
+from pathlib import Path
+
+import neural_sim
+
+PACKAGE = Path(neural_sim.__file__).parent
+ORDER = ("types", "cameras", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver",
+         "gradient", "settings", "outer", "store", "codec", "report", "artifacts", "pipeline", "main")  # fmt: skip
+TORCH_ONLY = ("types", "cameras", "solver")
+
+
+def _imports():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                modules = [node.module or ""]
+                if node.module == "neural_sim":
+                    modules = [f"neural_sim.{alias.name}" for alias in node.names]
+            else:
+                continue
+            for module in modules:
+                yield path.relative_to(PACKAGE), room, module
+
+
+def test_rooms_import_from_earlier_rooms_only():
+    for path, room, module in _imports():
+        if module.startswith("neural_sim.") and room != "__init__":
+            other = module.split(".")[1]
+            assert other in ORDER, f"{path} imports {module}, which has no place in the order"
+            assert ORDER.index(other) <= ORDER.index(room), f"{path} imports {module}, a later room"
+
+
+def test_heavy_libraries_stay_in_their_rooms():
+    homes = {
+        "pyrender": {"renderer/mesh.py"},
+        "matplotlib": {"report/figures.py"},
+        "mlflow": {"report/tracking.py"},
+        "hydra": {"main.py"},
+        "omegaconf": {"main.py"},
+    }
+    for path, _, module in _imports():
+        top = module.split(".")[0]
+        assert str(path) in homes.get(top, {str(path)}), f"{path} imports {module}"
+
+
+def test_types_cameras_and_solvers_know_only_torch():
+    standard = set(__import__("sys").stdlib_module_names)
+    for path, room, module in _imports():
+        top = module.split(".")[0]
+        if room in TORCH_ONLY and top != "neural_sim":
+            assert top in {"torch", "jaxtyping"} | standard, f"{path} imports {module}"
+
+
+def test_no_file_grows_over_300_lines():
+    long = [p.name for p in PACKAGE.rglob("*.py") if len(p.read_text().splitlines()) > 300]
+    assert not long
