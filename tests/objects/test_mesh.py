@@ -62,15 +62,14 @@ def test_meshes_with_nothing_to_draw_are_refused(faces):
         repair(trimesh.Trimesh(np.eye(3), faces, process=False), "thing", "bad.stl")
 
 
-def test_meshes_without_colour_or_texture_become_grey(caplog):
+def test_meshes_without_colour_or_texture_are_painted_plain(caplog):
     plain = repair(trimesh.creation.box(), "box", "plain.stl")
     assert set(map(tuple, plain.visual.vertex_colors)) == {repair_module.GREY}
     lost = trimesh.creation.box()
-    lost.visual = trimesh.visual.TextureVisuals(
-        uv=np.zeros((8, 2)), material=trimesh.visual.material.SimpleMaterial(image=None)
-    )
-    assert set(map(tuple, repair(lost, "box", "lost.obj").visual.vertex_colors)) == {repair_module.GREY}
-    assert "plain.stl" in caplog.text and "lost.obj" in caplog.text and "texture is missing" in caplog.text
+    material = trimesh.visual.material.SimpleMaterial(image=None, diffuse=(10, 200, 30, 255))
+    lost.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    assert set(map(tuple, repair(lost, "box", "lost.obj").visual.vertex_colors)) == {(10, 200, 30, 255)}
+    assert "plain.stl" in caplog.text and "lost.obj" in caplog.text and "no texture" in caplog.text
 
 
 def test_huge_meshes_are_warned_about(caplog, monkeypatch):

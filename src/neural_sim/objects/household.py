@@ -116,7 +116,7 @@ def drill(generator: torch.Generator) -> trimesh.Trimesh:
     return assemble(parts)
 
 
-_FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
+_FACES: tuple[str, ...] = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def _blue_side(emblem: Colour, band: Colour, generator: torch.Generator) -> Print:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.visual import ColorVisuals, TextureVisuals
 
 DEGENERATE_EXTENT = 1e-9
 
@@ -57,11 +58,12 @@ def content_digest(mesh: trimesh.Trimesh) -> str:
     state.update(np.ascontiguousarray(np.round(mesh.vertices, 9), dtype="<f8").tobytes())
     state.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     visual = mesh.visual
-    image = getattr(getattr(visual, "material", None), "image", None)
-    if visual.kind == "texture" and image is not None:
-        state.update(np.ascontiguousarray(visual.uv, dtype="<f8").tobytes())
-        state.update(np.asarray(image.convert("RGB")).tobytes())
-    elif visual.kind in ("vertex", "face"):
-        colours = visual.vertex_colors if visual.kind == "vertex" else visual.face_colors
+    if isinstance(visual, TextureVisuals):
+        image = getattr(visual.material, "image", None)
+        if image is not None:
+            state.update(np.ascontiguousarray(visual.uv, dtype="<f8").tobytes())
+            state.update(np.asarray(image.convert("RGB")).tobytes())
+    elif isinstance(visual, ColorVisuals) and visual.kind is not None:
+        colours = visual.face_colors if visual.kind == "face" else visual.vertex_colors
         state.update(np.ascontiguousarray(colours).tobytes())
     return state.hexdigest()

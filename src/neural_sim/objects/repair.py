@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 
 import numpy as np
 import trimesh
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 log = logging.getLogger(__name__)
 
@@ -17,8 +20,8 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     """A copy fit for rendering: finite normals, no degenerate faces, some colour. Every mend is a logged warning.
 
     Normals that are not finite are recomputed from the faces; a mesh without colours, or whose texture is missing,
-    becomes grey; one of more than ``HUGE_FACES`` faces is only warned about. Raises ``ValueError`` naming ``source``
-    where no face or no finite vertex is left.
+    is painted in its material's colour or grey; one of more than ``HUGE_FACES`` faces is only warned about. Raises
+    ``ValueError`` naming ``source`` where no face or no finite vertex is left.
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
@@ -34,10 +37,10 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 
 def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     mesh = mesh.copy(include_cache=True)  # the cache holds normals that a file gave
-    finite = np.isfinite(mesh.vertices).all(1)
-    good = finite[mesh.faces].all(1)
+    vertices = np.asarray(mesh.vertices)
+    good = np.isfinite(vertices[mesh.faces]).all(axis=(1, 2))
     if good.any():
-        corners = np.asarray(mesh.vertices)[mesh.faces]
+        corners = vertices[mesh.faces]
         doubled = np.linalg.norm(
             np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
         )
@@ -61,13 +64,11 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
         return mesh
     log.warning(
         "%s: object %r: %d of %d normals were not of finite unit length, recomputed",
-        source,
-        name,
-        bad.sum(),
-        len(bad),
-    )
+        source, name, int(bad.sum()), len(bad),
+    )  # fmt: skip
     # A mesh built anew has no normals from the file, so trimesh computes them from the faces.
-    rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=mesh.visual.copy(), process=False)
+    rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    rebuilt.visual = copy.deepcopy(mesh.visual)
     fresh = np.array(rebuilt.vertex_normals)
     lost = ~np.isfinite(fresh).all(1) | (np.linalg.norm(fresh, axis=1) < 0.5)
     fresh[lost] = (0.0, 0.0, 1.0)
@@ -76,21 +77,31 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
 
 
 def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    visual = mesh.visual
-    if visual.kind == "texture":
+    visual, paint = mesh.visual, GREY
+    if isinstance(visual, TextureVisuals):
         material = visual.material
-        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        image = (
+            material.baseColorTexture
+            if isinstance(material, PBRMaterial)
+            else getattr(material, "image", None)
+        )
         if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
-            uv = np.asarray(visual.uv)
-            if not np.isfinite(uv).all():
-                log.warning("%s: object %r: texture coordinates that are not finite set to 0", source, name)
-                visual.uv = np.nan_to_num(uv, nan=0.0, posinf=0.0, neginf=0.0)
-            return mesh
-        log.warning("%s: object %r: its texture is missing, painted grey", source, name)
-    elif visual.kind in ("vertex", "face"):
+            return _with_finite_uv(mesh, visual, name, source)
+        if np.asarray(material.main_color)[:3].any():  # black is what files without any colour come out as
+            paint = tuple(int(value) for value in np.asarray(material.main_color)[:4])
+        log.warning("%s: object %r: no texture to draw (missing?), painted plain %s", source, name, paint[:3])
+    elif isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):
         return mesh
     else:
         log.warning("%s: object %r has no colours, painted grey", source, name)
-    colours = np.tile(np.array(GREY, dtype=np.uint8), (len(mesh.vertices), 1))
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
+    colours = np.tile(np.array(paint, dtype=np.uint8), (len(mesh.vertices), 1))
+    mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
+    return mesh
+
+
+def _with_finite_uv(mesh: trimesh.Trimesh, visual: TextureVisuals, name: str, source: str) -> trimesh.Trimesh:
+    uv = np.asarray(visual.uv)
+    if not np.isfinite(uv).all():
+        log.warning("%s: object %r: texture coordinates that are not finite set to 0", source, name)
+        visual.uv = np.nan_to_num(uv, nan=0.0, posinf=0.0, neginf=0.0)
     return mesh

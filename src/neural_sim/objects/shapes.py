@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import SimpleMaterial
 
 from neural_sim.objects.texture import Print, atlas
 
@@ -100,9 +102,7 @@ def assemble(parts: list[Part]) -> trimesh.Trimesh:
         faces.append(part.faces + count)
         uv.append(part.uv * scale + offset)
         count += len(part.vertices)
-    visual = trimesh.visual.TextureVisuals(
-        uv=np.concatenate(uv), material=trimesh.visual.material.SimpleMaterial(image=image)
-    )
+    visual = TextureVisuals(uv=np.concatenate(uv), material=SimpleMaterial(image=image))
     return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), visual=visual, process=False)
 
 

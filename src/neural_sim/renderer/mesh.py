@@ -59,8 +59,9 @@ class PyrenderRenderer:
         images = []
         for pose in camera_to_world.detach().cpu().double().numpy():
             scene.set_pose(eye, pose)
-            premultiplied, _ = context.render(scene, flags=flags)
-            images.append(straight_alpha(premultiplied / np.float32(255.0), self.supersample))
+            # Returns colour and depth, or None for flags that are not used here.
+            rendered = context.render(scene, flags=flags)[0]  # pyright: ignore[reportOptionalSubscript]
+            images.append(straight_alpha(np.asarray(rendered) / np.float32(255.0), self.supersample))
         if not images:
             return torch.zeros(0, camera.height, camera.width, 4)
         return torch.from_numpy(np.stack(images))

@@ -8,6 +8,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from neural_sim.renderer.lighting import Lighting, lambert
 
@@ -43,29 +45,32 @@ def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
     if not (np.isfinite(vertices).all() and np.isfinite(normals).all()):
         raise ValueError("renderer: the mesh has vertices or normals that are not finite; repair it first")
     faces = np.asarray(mesh.faces, dtype=np.int64)
-    if mesh.visual.kind == "face":  # one colour a face: corners can no longer be shared
-        albedo = np.repeat(np.asarray(mesh.visual.face_colors)[:, :3] / 255.0, 3, axis=0)
+    visual = mesh.visual
+    uv = texture = None
+    if isinstance(visual, ColorVisuals) and visual.kind == "face":  # corners can no longer be shared
+        albedo = np.repeat(np.asarray(visual.face_colors)[:, :3] / 255.0, 3, axis=0)
         vertices, normals = vertices[faces].reshape(-1, 3), normals[faces].reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
-        uv = texture = None
+    elif isinstance(visual, TextureVisuals):
+        albedo, uv, texture = _textured(visual, len(vertices))
+    elif isinstance(visual, ColorVisuals):
+        albedo = np.asarray(visual.vertex_colors)[:, :3] / 255.0
     else:
-        albedo, uv, texture = _albedo(mesh)
+        raise ValueError(f"renderer: want a mesh with colours or a texture, got {type(visual).__name__}")
     front, back = lambert(normals, lighting), lambert(-normals, lighting)
     return Surface(vertices, faces, albedo, front, back, uv, texture)
 
 
-def _albedo(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    visual = mesh.visual
-    if visual.kind == "texture" and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
-        material = visual.material
-        image = getattr(material, "image", None)
-        factor = np.ones(3)
-        if isinstance(material, trimesh.visual.material.PBRMaterial):
-            image = material.baseColorTexture
-            if material.baseColorFactor is not None:
-                factor = np.asarray(material.baseColorFactor)[:3] / 255.0
-        if isinstance(image, Image.Image):
-            albedo = np.broadcast_to(factor, (len(mesh.vertices), 3))
-            return albedo, np.asarray(visual.uv, dtype=np.float64), np.asarray(image.convert("RGB"))
-    colours = visual.to_color() if visual.kind == "texture" else visual
-    return np.asarray(colours.vertex_colors)[:, :3] / 255.0, None, None
+def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Albedo, uv and texture; a material without an image has only its one colour."""
+    material = visual.material
+    image, factor = getattr(material, "image", None), np.ones(3)
+    if isinstance(material, PBRMaterial):
+        image = material.baseColorTexture
+        if material.baseColorFactor is not None:
+            factor = np.asarray(material.baseColorFactor)[:3] / 255.0
+    if isinstance(image, Image.Image) and visual.uv is not None and len(visual.uv) == count:
+        albedo = np.broadcast_to(factor, (count, 3))
+        return albedo, np.asarray(visual.uv, dtype=np.float64), np.asarray(image.convert("RGB"))
+    colour = np.asarray(material.main_color)[:3] / 255.0
+    return np.broadcast_to(colour, (count, 3)), None, None
