@@ -1,0 +1,274 @@
+"""The estimators on the real rooms: pose parameter, grid field, renderer, composition and detector, in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import scipy.optimize
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from neural_sim import cameras
+from neural_sim.detector.retinanet import Detector
+from neural_sim.field.grid import GridField
+from neural_sim.gradient.base import ObjectImages, RenderedPath
+from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.mixed import image_cotangent, scores
+from neural_sim.gradient.pathwise import Pathwise, contract, draw_cotangents, map_cotangents
+from neural_sim.gradient.tangents import moved_by, render_with_tangents
+from neural_sim.parameter.pose import Pose
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import FixedDamping, LanczosDamping
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.hvp import HessianOperator, gradient
+from neural_sim.solver.minres import MinimumResidual
+from neural_sim.solver.operator import Shifted
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera, Rays
+
+DOUBLE = torch.float64
+COUNT = 4
+CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.0))
+
+
+class Rooms:
+    """Four images of one textured block, their detector, and everything between psi and their losses."""
+
+    def __init__(self) -> None:
+        generator = torch.Generator().manual_seed(5)
+        self.field = GridField().double().eval()
+        self.field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6, dtype=DOUBLE), 0.3)
+        with torch.no_grad():
+            self.field.table.copy_(
+                torch.randn(self.field.table.shape, generator=generator, dtype=DOUBLE) + 1.0
+            )
+        self.field.requires_grad_(False)
+        self.pose = Pose(bins=4, temperature=0.8)
+        self.psi = torch.randn(4, generator=generator, dtype=DOUBLE)
+        self.noise = self.pose.draw_noise(COUNT, generator, DOUBLE)
+        self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+        self.nuisance = self.synthesizer.draw_nuisance(COUNT, CAMERA, generator)
+        self.detector = Detector(2, 32, anchor_sizes=((10,), (18,)), channels=8, head_convs=1)
+        params = {name: value.double() for name, value in self.detector.init(generator).items()}
+        self.backbone, self.trainable = self.detector.split(params)
+        flat = flatten(self.trainable)
+        noise = torch.randn(2, flat.numel(), generator=generator, dtype=DOUBLE)
+        self.trainable = unflatten(flat + 0.05 * noise[0], self.trainable)
+        self.vector = unflatten(noise[1], self.trainable)
+        labelled = self.compose(*self.render(self.psi))
+        self.images, self.targets = labelled.images, self.detector.assign(labelled.boxes, labelled.labels)
+        self.features = self.detector.features(self.backbone, self.images)
+
+    def render_rays(self, rays: Rays):
+        return NerfRenderer(termination=0.0).render_rays(self.field, rays)
+
+    def render(self, psi):
+        draw = self.pose.relaxed(psi, self.noise)
+        bundle = cameras.rays(CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
+        rgb, opacity = self.render_rays(Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)))
+        return rgb.view(COUNT, 32, 32, 3), opacity.view(COUNT, 32, 32)
+
+    def compose(self, rgb, opacity):
+        return self.synthesizer.compose(rgb, opacity, self.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
+
+    def loss_of(self, params, images, index):
+        features = self.detector.features(self.backbone, images)
+        return self.detector.per_image_loss(params, features, self.targets.select(index))
+
+    def losses(self, params, index):
+        features = [level[index] for level in self.features]
+        return self.detector.per_image_loss(params, features, self.targets.select(index))
+
+    def object_images(self) -> ObjectImages:
+        with torch.no_grad():
+            draw = self.pose.relaxed(self.psi, self.noise)
+            rgb, opacity = self.render(self.psi)
+        path = RenderedPath(
+            relaxed=lambda psi: self.pose.relaxed(psi, self.noise),
+            render_rays=self.render_rays,
+            compose=lambda rgb, opacity: self.compose(rgb, opacity).images,
+            camera=CAMERA,
+            rgb=rgb,
+            opacity=opacity,
+        )
+        weights = torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE)
+        return ObjectImages(
+            self.psi, self.pose.log_probabilities, self.images, torch.arange(COUNT), weights, draw, path
+        )
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Rooms:
+    return Rooms()
+
+
+def test_pathwise_equals_autograd_through_every_room(rooms):
+    psi = rooms.psi.clone().requires_grad_()
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in rooms.trainable.items()}
+    images = rooms.compose(*rooms.render(psi)).images
+    loss = rooms.loss_of(leaves, images, torch.arange(COUNT)).mean()
+    slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
+    along = sum((slope * rooms.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+    (reference,) = torch.autograd.grad(along, psi)
+    ours = Pathwise(patch_size=700, chunk_size=3).estimate(
+        rooms.loss_of, rooms.trainable, rooms.vector, rooms.object_images()
+    )
+    assert float(reference.norm()) > 0.0
+    torch.testing.assert_close(ours.value, reference, rtol=1e-9, atol=1e-12)
+
+
+def test_patches_and_tangents_agree_on_the_field(rooms):
+    batch = rooms.object_images()
+    cotangent = image_cotangent(
+        rooms.loss_of, rooms.trainable, rooms.vector, batch.images, batch.index, batch.weights
+    )
+    maps = map_cotangents(batch.path, cotangent)
+    whole = draw_cotangents(rooms.render_rays, CAMERA, batch.draw, maps, 10**6)
+    patches = draw_cotangents(rooms.render_rays, CAMERA, batch.draw, maps, 500)
+    _, tangents = render_with_tangents(rooms.render_rays, CAMERA, batch.draw, patch_size=500)
+    forward = contract(tangents, maps)
+    for name, value in whole.items():
+        assert float((patches[name] - value).abs().max()) < 1e-10
+        assert float((forward[name] - value).abs().max()) < 1e-8
+    assert moved_by(batch.path.relaxed, rooms.psi) == ("phi",)
+
+
+def test_tangents_replace_the_second_render(rooms):
+    batch = rooms.object_images()
+    names = moved_by(batch.path.relaxed, rooms.psi)
+    _, tangents = render_with_tangents(rooms.render_rays, CAMERA, batch.draw, names)
+
+    def refuse(rays):
+        raise AssertionError("rendered twice")
+
+    path = dataclasses.replace(batch.path, tangents=tangents, render_rays=refuse)
+    arguments = (rooms.loss_of, rooms.trainable, rooms.vector)
+    forward = Pathwise().estimate(*arguments, dataclasses.replace(batch, path=path))
+    reverse = Pathwise().estimate(*arguments, batch)
+    assert float((forward.value - reverse.value).abs().max()) < 1e-8
+
+
+def test_scores_of_the_detector_agree_in_both_modes_and_with_features_cached(rooms):
+    index = torch.arange(COUNT)
+    forward = scores(rooms.losses, rooms.trainable, rooms.vector, index, 3, "forward")
+    reverse = scores(rooms.losses, rooms.trainable, rooms.vector, index, 3, "reverse")
+    torch.testing.assert_close(forward, reverse)
+    mean = gradient([lambda params: rooms.losses(params, index).mean()], rooms.trainable)
+    assert float(forward.mean()) == pytest.approx(float(mean @ flatten(rooms.vector)), rel=1e-10)
+
+
+def test_hessian_products_of_the_detector_agree_and_are_cheap(rooms):
+    term = [lambda params: rooms.losses(params, torch.arange(COUNT)).mean()]
+    vector = flatten(rooms.vector)
+    with FlopCounterMode(display=False) as one_gradient:
+        gradient(term, rooms.trainable)
+    products = {}
+    for mode in ("reverse_over_reverse", "forward_over_reverse", "central_difference"):
+        operator = HessianOperator(term, rooms.trainable, mode)
+        with FlopCounterMode(display=False) as cost:
+            products[mode] = operator(vector)
+        assert cost.get_total_flops() <= 3 * one_gradient.get_total_flops(), mode
+    exact = products["reverse_over_reverse"]
+    torch.testing.assert_close(products["forward_over_reverse"], exact, rtol=1e-9, atol=1e-10)
+    assert float((products["central_difference"] - exact).norm() / exact.norm()) < 1e-5
+
+
+def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(rooms):
+    """The whole of Eq. 2 on a detector's indefinite Hessian, against a tight solve by another method."""
+    inner = InnerProblem(rooms.trainable, rooms.losses, torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE))
+    validation = [lambda params: rooms.losses(params, torch.tensor([1, 3])).mean()]
+    batch = rooms.object_images()
+    estimates = {"can": lambda v: Pathwise().estimate(rooms.loss_of, rooms.trainable, v, batch)}
+    solver = AdjointSolver(
+        ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-4, retain_graph=True
+    )
+    result = hypergradient(inner, validation, estimates, solver, torch.Generator().manual_seed(0))
+    assert result.solution.status.trusted and result.solution.products <= 40
+    assert result.damping.spectrum.smallest < 0.0 < result.damping.value
+    operator = Shifted(
+        HessianOperator(inner.terms(), rooms.trainable, retain_graph=True), result.damping.value
+    )
+    tight = MinimumResidual().solve(operator, gradient(validation, rooms.trainable), rtol=1e-8, max_steps=200)
+    assert tight.status.trusted
+    expected = -estimates["can"](unflatten(tight.value, rooms.trainable)).value
+    error = (result.psi_gradients["can"] - expected).norm() / expected.norm()
+    assert float(error) < 1e-2
+
+
+def last_layers(rooms):
+    """The predictor's last two convolutions as the inner parameters, and losses of any images under them."""
+    small = {
+        name: value
+        for name, value in rooms.trainable.items()
+        if ".cls_logits." in name or ".bbox_reg." in name
+    }
+
+    def loss_of(params, images, index):
+        return rooms.loss_of({**rooms.trainable, **params}, images, index)
+
+    return small, loss_of
+
+
+def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms):
+    """Poses move the images, a proximal inner problem is retrained on them by Newton's method; sign included."""
+    anchor, loss_of = last_layers(rooms)
+    proximal, every = 0.5, torch.arange(COUNT)
+    weights = torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE)
+    val_images = rooms.images.flip(-1).roll(3, -2)
+
+    def inner_problem(params, images):
+        return InnerProblem(
+            params, lambda p, rows: loss_of(p, images[rows], rows), weights, 32, proximal, anchor
+        )
+
+    def minimiser(images, params):
+        """L-BFGS to the neighbourhood, Newton to stationarity."""
+        terms = inner_problem(params, images).terms()
+
+        def value_and_slope(flat):
+            point = unflatten(torch.from_numpy(flat), params)
+            return float(sum(term(point) for term in terms)), gradient(terms, point).numpy()
+
+        start = flatten(params).numpy()
+        found = scipy.optimize.minimize(
+            value_and_slope, start, jac=True, method="L-BFGS-B", options={"maxiter": 500, "gtol": 1e-5}
+        )
+        params = unflatten(torch.from_numpy(found.x), params)
+        for _ in range(6):
+            slope = gradient(terms, params)
+            if float(slope.norm()) < 1e-11:
+                break
+            hessian = HessianOperator(terms, params, retain_graph=True)
+            step = ConjugateGradient().solve(hessian, slope, rtol=1e-5, max_steps=200)
+            params = unflatten(flatten(params) - step.value, params)
+        return params
+
+    def validation(params):
+        return loss_of(params, val_images, every).mean()
+
+    batch = rooms.object_images()
+    params = minimiser(batch.images, anchor)
+    estimates = {"can": lambda v: Pathwise().estimate(loss_of, params, v, batch)}
+    solver = AdjointSolver(
+        ConjugateGradient(), FixedDamping(0.0), rtol=1e-10, max_steps=300, retain_graph=True
+    )
+    result = hypergradient(
+        inner_problem(params, batch.images), [validation], estimates, solver, torch.Generator().manual_seed(0)
+    )
+    assert result.solution.status.trusted and result.stationarity < 1e-10
+    slopes = []
+    for direction in 1e-4 * torch.eye(4, dtype=DOUBLE):
+        ends = []
+        for psi in (rooms.psi + direction, rooms.psi - direction):
+            with torch.no_grad():
+                images = rooms.compose(*rooms.render(psi)).images
+            ends.append(validation(minimiser(images, params)))
+        slopes.append(float(ends[0] - ends[1]) / 2e-4)
+    reference = torch.tensor(slopes, dtype=DOUBLE)
+    error = float((result.psi_gradients["can"] - reference).norm() / reference.norm())
+    assert error < 1e-3
