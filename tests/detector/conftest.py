@@ -15,6 +15,7 @@ def make_detector(**changes) -> Detector:
         "num_classes": CLASSES,
         "image_size": SIZE,
         "anchor_sizes": ((8, 12), (16, 24)),
+        "anchor_reference": SIZE,
         "channels": 8,
         "head_convs": 1,
     }

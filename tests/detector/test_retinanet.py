@@ -33,6 +33,12 @@ def test_anchors_are_torchvisions(tools):
     assert detector.anchors_per_level == [32, 8]
 
 
+def test_anchors_grow_with_the_image(tools):
+    small, large = tools.detector(), tools.detector(image_size=64)
+    assert len(large.anchors) == 4 * len(small.anchors)
+    assert torch.equal(large.anchors[:2], 2 * small.anchors[:2])
+
+
 @pytest.mark.parametrize("activation", ["relu", "silu"])
 def test_loss_is_torchvisions(tools, generator, images, activation):
     detector = tools.detector(box_loss="l1", activation=activation)

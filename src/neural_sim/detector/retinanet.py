@@ -6,59 +6,24 @@ values always come in as an argument, so that training losses can be differentia
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 from torchvision.models.detection._utils import BoxCoder
 from torchvision.models.detection.anchor_utils import AnchorGenerator
-from torchvision.models.detection.retinanet import RetinaNetHead
-from torchvision.ops import FeaturePyramidNetwork, batched_nms, clip_boxes_to_image
+from torchvision.ops import batched_nms, clip_boxes_to_image
 
-from neural_sim.detector.backbones import (
-    ACTIVATIONS,
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    build_backbone,
-    group_norm,
-    set_activation,
-)
+from neural_sim.detector.backbones import ACTIVATIONS, build_backbone
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.losses import BOX_LOSSES, box_loss, focal_loss
+from neural_sim.detector.network import NormalisedBackbone, build_predictor, fixed_anchors
 from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
 
 Parameters = dict[str, Tensor]
 ARCHITECTURES = {"tiny": (8, 16), "resnet18": (4, 8, 16, 32), "resnet50": (4, 8, 16, 32)}
-
-
-class _Backbone(nn.Module):
-    """Names the backbone's parameters ``backbone.*``."""
-
-    def __init__(self, backbone: nn.Module) -> None:
-        super().__init__()
-        self.backbone = backbone
-
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        mean = images.new_tensor(IMAGENET_MEAN).view(3, 1, 1)
-        std = images.new_tensor(IMAGENET_STD).view(3, 1, 1)
-        # A third faster on a CPU than the default layout, in both directions.
-        return self.backbone(((images - mean) / std).contiguous(memory_format=torch.channels_last))
-
-
-class _Predictor(nn.Module):
-    """The feature pyramid and the head shared by its levels; parameters ``fpn.*`` and ``head.*``."""
-
-    def __init__(self, fpn: FeaturePyramidNetwork, head: RetinaNetHead) -> None:
-        super().__init__()
-        self.fpn = fpn
-        self.head = head
-
-    def forward(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
-        pyramid = self.fpn(OrderedDict((str(level), x) for level, x in enumerate(features)))
-        return self.head(list(pyramid.values()))
 
 
 class Detector:
@@ -74,7 +39,9 @@ class Detector:
         box_loss: ``pseudo_huber`` or ``l1`` (torchvision's own).
         box_loss_delta: scale of the pseudo-Huber loss, in encoded units.
         strides: of the pyramid's levels, from 4, 8, 16 and 32 (tiny: 8 and 16).
-        anchor_sizes: per level, side of the square of an anchor's area in pixels.
+        anchor_sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side
+            is ``anchor_reference``; they scale with the image's.
+        anchor_reference: that side in pixels.
         aspect_ratios: of every anchor, height / width.
         channels: of the pyramid and the head, a multiple of 8.
         head_convs: convolutions in each branch of the head, 1 to 4.
@@ -98,6 +65,7 @@ class Detector:
         box_loss_delta: float = 0.1,
         strides: Sequence[int] = (8, 16),
         anchor_sizes: Sequence[Sequence[float]] = ((22, 28, 36), (46, 58, 74)),
+        anchor_reference: float = 96,
         aspect_ratios: Sequence[float] = (1.0,),
         channels: int = 48,
         head_convs: int = 2,
@@ -121,6 +89,7 @@ class Detector:
             channels=(channels, channels >= 8 and channels % 8 == 0, "a positive multiple of 8"),
             head_convs=(head_convs, 1 <= head_convs <= 4, "1 to 4"),
             prior_probability=(prior_probability, 0 < prior_probability < 1, "inside (0, 1)"),
+            anchor_reference=(anchor_reference, anchor_reference > 0, "above 0"),
             anchor_sizes=(anchor_sizes, len(anchor_sizes) == len(strides), "one list for each stride"),
             foreground_iou=(foreground_iou, background_iou <= foreground_iou <= 1, "background_iou up to 1"),
         )
@@ -132,7 +101,8 @@ class Detector:
             )
         )
         self.num_classes = num_classes
-        self.image_size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+        self.image_size = (height, width)
         self.box_loss, self.box_loss_delta = box_loss, box_loss_delta
         self.focal_alpha, self.focal_gamma = focal_alpha, focal_gamma
         self.prior_probability = prior_probability
@@ -140,10 +110,11 @@ class Detector:
         self.score_threshold, self.nms_iou = score_threshold, nms_iou
         self.max_detections, self.max_candidates = max_detections, max_candidates
         backbone = build_backbone(architecture, strides, activation, weights)
-        sizes = tuple(tuple(level) for level in anchor_sizes)
+        scale = min(self.image_size) / anchor_reference
+        sizes = tuple(tuple(scale * size for size in level) for level in anchor_sizes)
         generator = AnchorGenerator(sizes, (tuple(aspect_ratios),) * len(sizes))
-        self._backbone = _Backbone(backbone)
-        self._predictor = _build_predictor(
+        self._backbone = NormalisedBackbone(backbone)
+        self._predictor = build_predictor(
             [backbone.channels[stride] for stride in strides],
             channels,
             generator.num_anchors_per_location(),
@@ -152,7 +123,7 @@ class Detector:
             activation,
         )
         self._pretrained = weights is not None
-        self.anchors, self.anchors_per_level = _fixed_anchors(generator, self.image_size, strides)
+        self.anchors, self.anchors_per_level = fixed_anchors(generator, self.image_size, strides)
 
     def init(self, generator: torch.Generator) -> Parameters:
         """Fresh parameters in float32 on the CPU; pretrained backbones keep their weights.
@@ -267,33 +238,3 @@ def _check(**conditions: tuple[object, bool, str]) -> None:
     for key, (got, holds, wanted) in conditions.items():
         if not holds:
             raise ValueError(f"detector.{key}: want {wanted}, got {got!r}")
-
-
-def _build_predictor(
-    in_channels: list[int],
-    channels: int,
-    anchors: list[int],
-    num_classes: int,
-    head_convs: int,
-    activation: str,
-) -> _Predictor:
-    if len(set(anchors)) != 1:
-        raise ValueError(f"detector.anchor_sizes: want equally many sizes on every level, got {anchors}")
-    fpn = FeaturePyramidNetwork(in_channels, channels, norm_layer=group_norm)
-    head = RetinaNetHead(channels, anchors[0], num_classes, norm_layer=group_norm)
-    for branch in (head.classification_head, head.regression_head):
-        branch.conv = branch.conv[:head_convs]
-    predictor = _Predictor(fpn, head)
-    set_activation(predictor, activation)
-    return predictor
-
-
-def _fixed_anchors(
-    generator: AnchorGenerator, image_size: tuple[int, int], strides: tuple[int, ...]
-) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
-    """Anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
-    # A strided convolution of padding 1 leaves ceil(size / 2) pixels.
-    grids = [[-(-side // stride) for side in image_size] for stride in strides]
-    steps = [[torch.tensor(stride), torch.tensor(stride)] for stride in strides]
-    levels = generator.grid_anchors(grids, steps)
-    return torch.cat(levels), [len(level) for level in levels]
