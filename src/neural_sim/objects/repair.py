@@ -38,13 +38,13 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     mesh = mesh.copy(include_cache=True)  # the cache holds normals that a file gave
     vertices = np.asarray(mesh.vertices)
-    good = np.isfinite(vertices[mesh.faces]).all(axis=(1, 2))
+    good = np.isfinite(vertices[mesh.faces].sum(axis=(1, 2)))
     if good.any():
         corners = vertices[mesh.faces]
         doubled = np.linalg.norm(
             np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
         )
-        good &= np.nan_to_num(doubled) > 0.0
+        good = good & (np.nan_to_num(doubled) > 0.0)
     if not good.any():
         raise ValueError(f"{source}: object {name!r} has no face of positive area with finite vertices")
     if not good.all():
