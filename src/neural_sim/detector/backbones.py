@@ -98,10 +98,8 @@ class ResNetBackbone(nn.Module):
             body.load_state_dict(load_weights(architecture, weights), strict=False)
         # Weights were trained with ReLU and keep it.
         set_activation(body, activation if weights is None else "relu")
-        widths = [
-            layer[-1].conv1.in_channels for layer in (body.layer1, body.layer2, body.layer3, body.layer4)
-        ]
-        self.channels = dict(zip((4, 8, 16, 32), widths, strict=True))
+        widening = 4 if architecture == "resnet50" else 1
+        self.channels = {4: 64 * widening, 8: 128 * widening, 16: 256 * widening, 32: 512 * widening}
         self.strides = strides
         self.body = body
 
@@ -146,8 +144,12 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
-) -> nn.Module:
-    """The backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output."""
+) -> TinyBackbone | ResNetBackbone:
+    """The backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
+
+    Raises:
+        ValueError: for weights that do not exist or do not fit.
+    """
     if architecture == "tiny":
         if weights is not None:
             raise ValueError(f"detector.weights: tiny has no published weights, got {weights!r}, want null")
