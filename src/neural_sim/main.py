@@ -7,6 +7,7 @@ Heavy imports happen inside functions, so that ``--help`` answers at once.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import types
 import typing
@@ -23,6 +24,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 if TYPE_CHECKING:
     from neural_sim.artifacts import Experiment
+
+# Spinning OpenMP threads starve each other where processes share cores (sweeps, tests); read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _log = logging.getLogger(__name__)
 

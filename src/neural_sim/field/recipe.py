@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from neural_sim.field.base import RadianceField
-from neural_sim.field.fitting import Fitting
+from neural_sim.field.objective import Fitting
 from neural_sim.field.training import KINDS, fit_field
 from neural_sim.types import PosedViews
 
