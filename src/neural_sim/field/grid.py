@@ -10,7 +10,7 @@ from torch.nn import functional
 from neural_sim.field.base import PackedSamples, RadianceField
 from neural_sim.field.interpolation import CORNERS, interpolate, interpolate_for_training, trilinear_weights
 from neural_sim.field.marching import SampleCollector, lookup, march
-from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, subdivide, vertices
+from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, dilate, subdivide, vertices
 from neural_sim.types import Rays
 
 EMPTY_DENSITY = -1e4
@@ -18,16 +18,22 @@ EMPTY_DENSITY = -1e4
 
 
 class GridField(RadianceField):
-    """Trilinear features over occupied cells; sigma = softplus(raw) / cell edge, so raw is free of the grid's scale.
+    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, so raw is free of the grid's scale.
 
     ``features`` numbers per vertex make the colour: with ``head_width`` 0 the first three pass a sigmoid (no view
     dependence; a Lambertian object under a fixed light needs none), otherwise a head of one hidden layer sees them and
-    the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the raw
-    density of a new field. A new field holds the cube [-1, 1]^3 in one cell; ``reset`` gives it its occupancy.
+    the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the
+    softplus' argument in a new field; ``density_gain`` lets density learn that much faster than colour. A new field
+    holds the cube [-1, 1]^3 in one cell; ``reset`` gives it its occupancy.
     """
 
     def __init__(
-        self, features: int = 3, head_width: int = 0, step_cells: float = 0.5, initial_density: float = -3.0
+        self,
+        features: int = 3,
+        head_width: int = 0,
+        step_cells: float = 1.0,
+        initial_density: float = -3.0,
+        density_gain: float = 4.0,
     ) -> None:
         super().__init__()
         if features < 3:
@@ -38,6 +44,7 @@ class GridField(RadianceField):
             )
         self.features, self.head_width = features, head_width
         self.step_cells, self.initial_density = step_cells, initial_density
+        self.density_gain = density_gain
         self.head: nn.Module | None = None
         if head_width:
             self.head = nn.Sequential(
@@ -61,6 +68,7 @@ class GridField(RadianceField):
             "head_width": self.head_width,
             "step_cells": self.step_cells,
             "initial_density": self.initial_density,
+            "density_gain": self.density_gain,
         }
 
     @property
@@ -76,19 +84,23 @@ class GridField(RadianceField):
         """Start over with these cells: raw density ``initial_density``, features 0."""
         coordinates = self._set_cells(occupied, origin, cell)
         table = self.table.new_zeros(len(coordinates) + 1, 1 + self.features)
-        table[:, 0] = self.initial_density
+        table[:, 0] = self.initial_density / self.density_gain
         table[-1, 0] = EMPTY_DENSITY
         self.table = nn.Parameter(table)
 
     @torch.no_grad()
     def keep(self, cells: Bool[Tensor, "cells"], refine: bool) -> None:
-        """Drop the occupied cells not in ``cells``; with ``refine``, halve the edge of the rest and interpolate."""
-        occupied = self.occupied.clone()
-        occupied[self.occupied] = cells
-        occupied, origin = crop(occupied, self.origin, float(self.cell))
-        cell = float(self.cell)
+        """Drop the occupied cells not in ``cells``, but for neighbours of those that stay.
+
+        With ``refine`` the cells' edge is halved first, so that the margin of neighbours is thinner, and the table is
+        interpolated.
+        """
+        wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, float(self.cell)
+        wanted[occupied] = cells
         if refine:
-            occupied, cell = subdivide(occupied), cell / 2.0
+            wanted, occupied, cell = subdivide(wanted), subdivide(occupied), cell / 2.0
+        occupied = occupied & (dilate(wanted.to(self.table.dtype)) > 0)
+        occupied, origin = crop(occupied, self.origin, cell)
         before, table, old_cell, old_origin = self.occupancy, self.table, float(self.cell), self.origin
         corners = self.corners
         coordinates = self._set_cells(occupied, origin, cell)
@@ -122,11 +134,15 @@ class GridField(RadianceField):
             return interpolate_for_training(self.table, corners, weights)
         return interpolate(self.table, corners, weights)
 
+    def density(self, raw: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples"]:
+        """Density sigma, per object radius, of table rows."""
+        return functional.softplus(self.density_gain * raw[:, 0]) / float(self.cell)
+
     def decode(
         self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         """Density and colour of table rows."""
-        sigma = functional.softplus(raw[:, 0]) / float(self.cell)
+        sigma = self.density(raw)
         if self.head is None:
             return sigma, torch.sigmoid(raw[:, 1:4])
         return sigma, torch.sigmoid(self.head(torch.cat([raw[:, 1:], directions], -1)))
@@ -161,7 +177,7 @@ class GridField(RadianceField):
             weights = trilinear_weights(position - position.floor())
             density = self.table[:, :1].contiguous()
             raw = interpolate(density, corners, weights)[:, 0]
-            optical[where] = functional.softplus(raw) * self.step_cells
+            optical[where] = functional.softplus(self.density_gain * raw) * self.step_cells
             optical = optical.view_as(distance)
             inclusive = optical.cumsum(1) + depth.index_select(0, ray)[:, None]
             collector.add(ray, distance, torch.where(inclusive - optical < deepest, cell, -1))
@@ -175,7 +191,7 @@ class GridField(RadianceField):
 def _interpolate_from(
     local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
 ) -> Float[Tensor, "vertices channels"]:
-    """Values of an old table at grid vertices, each taken from whichever of its eight neighbouring cells is occupied."""
+    """Values of an old table at grid vertices, each from whichever of its eight neighbouring cells is occupied."""
     result = table.new_zeros(len(local), table.shape[1])
     missing = torch.arange(len(local), device=local.device)
     for corner in CORNERS:

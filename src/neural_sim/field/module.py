@@ -10,7 +10,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader
 
-from neural_sim.field.fitting import Fitting, expected_error
+from neural_sim.field.objective import Fitting, expected_error
 from neural_sim.field.scores import score_views
 from neural_sim.types import PosedViews
 
@@ -72,9 +72,8 @@ class RadianceFieldModule(lightning.LightningModule):
 
     def training_step(self, batch: Any, batch_index: int) -> None:
         optimizer = self.optimizers(use_pl_optimizer=False)
-        rays = self.fitting.batch()
-        renderings = self.fitting.render(rays)
-        loss = torch.stack([expected_error(rendering, rays.pixels) for rendering in renderings]).sum()
+        renderings, pixels = self.fitting.render()
+        loss = torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         for group in optimizer.param_groups:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
 from pathlib import Path
 
 import lightning
 import torch
 
 from neural_sim.field.base import RadianceField
-from neural_sim.field.fitting import Fitting
 from neural_sim.field.grid import GridField
+from neural_sim.field.mlp import MLPField
 from neural_sim.field.module import Progress, RadianceFieldModule
+from neural_sim.field.objective import Fitting
 from neural_sim.types import PosedViews
 
-KINDS: dict[str, type[RadianceField]] = {"GridField": GridField}
+KINDS: dict[str, type[RadianceField]] = {"GridField": GridField, "MLPField": MLPField}
 
 
 def fit_field(

@@ -1,0 +1,199 @@
+"""The radiance field of the paper: NeRF's network (Mildenhall et al. 2020), coarse and fine."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neural_sim.cameras import unit_sphere_span
+from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.quadrature import render_weights
+from neural_sim.types import Rays
+
+SKIP_LAYER = 4
+"""The layer that sees the encoded position again (NeRF, Fig. 7)."""
+
+
+def positional_encoding(
+    values: Float[Tensor, "samples 3"], frequencies: int
+) -> Float[Tensor, "samples encoded"]:
+    """The values and sin, cos of 2^k pi times them for k < ``frequencies`` (NeRF, Eq. 4)."""
+    scales = torch.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
+    angles = (values[:, None, :] * scales[:, None]).flatten(1)
+    return torch.cat([values, angles.sin(), angles.cos()], -1)
+
+
+class NerfNetwork(nn.Module):
+    """Position to density, position and direction to colour. All sizes are NeRF's by default."""
+
+    def __init__(self, width: int, depth: int, position_frequencies: int, direction_frequencies: int) -> None:
+        super().__init__()
+        self.position_frequencies, self.direction_frequencies = position_frequencies, direction_frequencies
+        position, direction = 3 + 6 * position_frequencies, 3 + 6 * direction_frequencies
+        inputs = [position] + [width + (position if layer == SKIP_LAYER else 0) for layer in range(depth - 1)]
+        self.trunk = nn.ModuleList(nn.Linear(size, width) for size in inputs)
+        self.sigma = nn.Linear(width, 1)
+        self.bottleneck = nn.Linear(width, width)
+        self.colour = nn.Sequential(
+            nn.Linear(width + direction, width // 2), nn.ReLU(), nn.Linear(width // 2, 3)
+        )
+
+    def forward(
+        self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        encoded = positional_encoding(positions, self.position_frequencies)
+        hidden = encoded
+        for layer, linear in enumerate(self.trunk):
+            if layer == SKIP_LAYER + 1:
+                hidden = torch.cat([encoded, hidden], -1)
+            hidden = torch.relu(linear(hidden))
+        # Softplus instead of NeRF's ReLU (as in mip-NeRF): a ReLU that starts below zero everywhere never learns.
+        sigma = nn.functional.softplus(self.sigma(hidden)[:, 0])
+        view = positional_encoding(directions, self.direction_frequencies)
+        colour = self.colour(torch.cat([self.bottleneck(hidden), view], -1))
+        return sigma, torch.sigmoid(colour)
+
+
+class MLPField(RadianceField):
+    """Two networks: the coarse one says where along a ray the fine one is asked.
+
+    ``query`` is the fine network's. ``coarse_samples`` uniform samples span the ray's part in the unit sphere;
+    ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at the even quantiles so that
+    ``sample`` is deterministic. ``density_scale`` multiplies softplus, per object radius.
+    """
+
+    def __init__(
+        self,
+        width: int = 256,
+        depth: int = 8,
+        position_frequencies: int = 10,
+        direction_frequencies: int = 4,
+        coarse_samples: int = 64,
+        fine_samples: int = 128,
+        density_scale: float = 10.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        sizes = (width, depth, coarse_samples, fine_samples)
+        if min(sizes) < 2 or min(position_frequencies, direction_frequencies) < 0 or density_scale <= 0.0:
+            raise ValueError(
+                "MLPField: want width, depth, coarse_samples, fine_samples >= 2, frequencies >= 0 and density_scale > 0; "
+                f"got {sizes}, {(position_frequencies, direction_frequencies)} and {density_scale}"
+            )
+        self._settings: dict[str, object] = {
+            "width": width,
+            "depth": depth,
+            "position_frequencies": position_frequencies,
+            "direction_frequencies": direction_frequencies,
+            "coarse_samples": coarse_samples,
+            "fine_samples": fine_samples,
+            "density_scale": density_scale,
+            "seed": seed,
+        }
+        self.coarse_samples, self.fine_samples, self.density_scale = (
+            coarse_samples,
+            fine_samples,
+            density_scale,
+        )
+        self.coarse = NerfNetwork(width, depth, position_frequencies, direction_frequencies)
+        self.fine = NerfNetwork(width, depth, position_frequencies, direction_frequencies)
+        _initialise(self, torch.Generator().manual_seed(seed))
+
+    def settings(self) -> dict[str, object]:
+        return dict(self._settings)
+
+    def query(
+        self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        sigma, rgb = self.fine(positions, directions)
+        return sigma * self.density_scale, rgb
+
+    def query_coarse(
+        self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        """``query`` of the coarse network."""
+        sigma, rgb = self.coarse(positions, directions)
+        return sigma * self.density_scale, rgb
+
+    @torch.no_grad()
+    def sample(self, rays: Rays, termination: float) -> PackedSamples:
+        """See the base class; nothing is left out, whatever ``termination``: samples follow the weights already."""
+        coarse = self.sample_coarse(rays, None)
+        return self.sample_fine(rays, coarse, None)
+
+    @torch.no_grad()
+    def sample_coarse(self, rays: Rays, generator: torch.Generator | None) -> PackedSamples:
+        """Stratified distances in the unit sphere, at the strata's middles without a generator."""
+        near, far = unit_sphere_span(Rays(rays.origins.detach(), rays.directions.detach()))
+        hit = (far > near).nonzero()[:, 0]
+        near, far = near[hit, None], far[hit, None]
+        edges = torch.linspace(0.0, 1.0, self.coarse_samples + 1, dtype=near.dtype, device=near.device)
+        edges = near + (far - near) * edges
+        place = _offsets((len(hit), self.coarse_samples), edges, generator)
+        return _pack(edges[:, :-1] + place * edges.diff(dim=1), edges.diff(dim=1), hit, len(rays.origins))
+
+    @torch.no_grad()
+    def sample_fine(
+        self, rays: Rays, coarse: PackedSamples, generator: torch.Generator | None
+    ) -> PackedSamples:
+        """Coarse distances joined with new ones where the coarse weights are; each sample owns the ray round it.
+
+        A ray has coarse_samples + fine_samples samples or, where it misses the unit sphere, none.
+        """
+        positions = rays.origins.detach().index_select(0, coarse.ray)
+        directions = rays.directions.detach().index_select(0, coarse.ray)
+        positions = positions + directions * coarse.distance[:, None]
+        sigma, _ = self.query_coarse(positions, directions)
+        weights = render_weights(sigma, coarse).view(-1, self.coarse_samples)
+        middle, width = coarse.distance.view_as(weights), coarse.width.view_as(weights)
+        low, total = middle[:, :1] - 0.5 * width[:, :1], width.sum(1, keepdim=True)
+        edges = torch.cat([low, low + width.cumsum(1)], 1)
+        even = (torch.arange(self.fine_samples, dtype=low.dtype, device=low.device)).expand(len(low), -1)
+        quantiles = (even + _offsets(even.shape, low, generator)) / self.fine_samples
+        fine = inverse_cumulative(edges, weights + 1e-5, quantiles)
+        distance = torch.cat([middle, fine], 1).sort(dim=1).values
+        between = 0.5 * (distance[:, 1:] + distance[:, :-1])
+        bounds = torch.cat([edges[:, :1], between, edges[:, :1] + total], 1)
+        hit = (coarse.starts.diff() > 0).nonzero()[:, 0]
+        return _pack(distance, bounds.diff(dim=1).clamp_min(0.0), hit, len(rays.origins))
+
+
+def inverse_cumulative(
+    edges: Float[Tensor, "rays edges"],
+    weights: Float[Tensor, "rays bins"],
+    quantiles: Float[Tensor, "rays samples"],
+) -> Float[Tensor, "rays samples"]:
+    """Where the piecewise uniform density ``weights`` between ``edges`` reaches the given quantiles."""
+    cumulative = nn.functional.pad(weights.cumsum(1), (1, 0))
+    cumulative = cumulative / cumulative[:, -1:]
+    right = torch.searchsorted(cumulative, quantiles.contiguous(), right=True).clamp(1, weights.shape[1])
+    left = right - 1
+    start, end = cumulative.gather(1, left), cumulative.gather(1, right)
+    share = ((quantiles - start) / (end - start).clamp_min(1e-12)).clamp(0.0, 1.0)
+    low, high = edges.gather(1, left), edges.gather(1, right)
+    return low + share * (high - low)
+
+
+def _offsets(shape: torch.Size | tuple[int, int], like: Tensor, generator: torch.Generator | None) -> Tensor:
+    if generator is None:
+        return like.new_full(tuple(shape), 0.5)
+    return torch.rand(shape, generator=generator, device=generator.device).to(like)
+
+
+def _pack(distance: Tensor, width: Tensor, hit: Tensor, rays: int) -> PackedSamples:
+    each = distance.shape[1]
+    counts = torch.zeros(rays, dtype=torch.int64, device=distance.device)
+    counts[hit] = each
+    starts = nn.functional.pad(counts.cumsum(0), (1, 0))
+    return PackedSamples(hit.repeat_interleave(each), distance.flatten(), width.flatten(), starts)
+
+
+def _initialise(module: nn.Module, generator: torch.Generator) -> None:
+    """He-uniform weights and zero biases (torch's own initialiser draws from the global generator)."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            bound = (6.0 / layer.in_features) ** 0.5
+            with torch.no_grad():
+                layer.weight.copy_((torch.rand(layer.weight.shape, generator=generator) * 2.0 - 1.0) * bound)
+                layer.bias.zero_()
