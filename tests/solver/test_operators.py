@@ -181,7 +181,7 @@ def test_lanczos_on_one_unknown_zero_and_non_finite_operators(generator):
 def test_lanczos_damping_bounds_the_condition_number(low, generator):
     values = torch.linspace(low, 10.0, 30, dtype=DOUBLE)
     choice = LanczosDamping(max_condition=50.0, lanczos_steps=30).choose(
-        lambda v: values * v, values, generator
+        lambda v: values * v, torch.ones(30, dtype=DOUBLE), generator
     )
     damped = values + choice.value
     assert float(damped.min()) > 0.0
@@ -237,3 +237,34 @@ def test_gauss_newton_damping_wants_composite_terms(network, generator):
         AdjointSolver(damping=GaussNewtonDamping(1.0)).solve(
             [lambda p: p["in"].sum()], params, flatten(params), None, generator
         )
+
+
+@pytest.mark.parametrize("start", ["rhs", "random"])
+def test_damping_is_raised_until_conjugate_gradients_hold(start, generator):
+    """One negative eigenvalue among very many near zero: too few Lanczos steps do not see it."""
+    values = torch.cat(
+        [torch.linspace(0.0, 1e-2, 397, dtype=DOUBLE), torch.tensor([-2.0, 60.0, 150.0], dtype=DOUBLE)]
+    )
+    params = {"w": torch.zeros(400, dtype=DOUBLE)}
+    terms = [lambda p: 0.5 * (values * p["w"].square()).sum()]
+    b = torch.randn(400, generator=generator, dtype=DOUBLE)
+    damping = LanczosDamping(lanczos_steps=2, start=start)
+    adjoint = AdjointSolver(ConjugateGradient(), damping, rtol=1e-8).solve(terms, params, b, None, generator)
+    assert adjoint.raises >= 1
+    assert adjoint.solution.status is Status.CONVERGED
+    torch.testing.assert_close(adjoint.vector, b / (values + adjoint.damping.value), rtol=1e-6, atol=1e-7)
+    fixed = AdjointSolver(ConjugateGradient(), FixedDamping(0.1), rtol=1e-8).solve(
+        terms, params, b, None, generator
+    )
+    assert (
+        fixed.solution.status is Status.NEGATIVE_CURVATURE
+        and fixed.raises == 0
+        and fixed.damping.value == 0.1
+    )
+
+
+def test_damping_of_a_zero_right_hand_side(network, generator):
+    params, terms = network
+    zero = torch.zeros_like(flatten(params))
+    adjoint = AdjointSolver().solve(terms, params, zero, None, generator)
+    assert adjoint.solution.status is Status.CONVERGED and adjoint.vector.norm() == 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +17,14 @@ from neural_sim.solver.damping import Damped, Damping, LanczosDamping
 from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, Mode, Term
 from neural_sim.solver.operator import Matvec, Shifted, norm
-from neural_sim.solver.solution import Solution
+from neural_sim.solver.solution import Solution, Status
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solved vector with its account.
+    """The solved vector with its account. ``raises`` counts how often lambda had to be raised.
 
     ``sensitivity`` is ``|v(2 lambda) - v(lambda)| / |v(lambda)|``, nan if not asked for. Not a bias: an
     indefinite H has poles in lambda.
@@ -29,6 +32,7 @@ class Adjoint:
 
     solution: Solution
     damping: Damped
+    raises: int
     sensitivity: float
     seconds: float
 
@@ -43,11 +47,12 @@ class AdjointSolver:
 
     Args:
         linear: the linear solver.
-        damping: the choice of lambda; a Gauss-Newton damping also swaps the operator and needs
-        ``CompositeTerm`` s. mode: how Hessian products are made, see ``HessianOperator``.
+        damping: the choice of lambda; a Gauss-Newton one also swaps the operator and needs ``CompositeTerm``
+        s. mode: how Hessian products are made, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the gradient's graph between products: faster, memory of all chunks at once.
-        sensitivity: also solve at 2 lambda, to see how much v hangs on the damping (twice the cost).
+        max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never
+        is). sensitivity: also solve at 2 lambda, to see how much v hangs on the damping (twice the cost).
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -56,6 +61,7 @@ class AdjointSolver:
     rtol: float = 1e-2
     max_steps: int = 40
     retain_graph: bool = False
+    max_raises: int = 3
     sensitivity: bool = False
 
     def solve(
@@ -66,8 +72,8 @@ class AdjointSolver:
         x0: Float[Tensor, "n"] | None,
         generator: torch.Generator,
     ) -> Adjoint:
-        """v for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds Lanczos' start
-        vector.
+        """v for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds a random
+        Lanczos start.
 
         Raises ``ValueError`` for a Gauss-Newton damping on terms that are not ``CompositeTerm`` s.
         """
@@ -75,10 +81,18 @@ class AdjointSolver:
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
         solution = self.linear.solve(Shifted(operator, damped.value), b, x0, self.rtol, self.max_steps)
+        raises = 0
+        while solution.status is Status.NEGATIVE_CURVATURE and raises < self.max_raises:
+            raised = self.damping.raised(damped, solution.curvature[0] - damped.value)
+            if raised is None:
+                break
+            logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
+            damped, start, raises = raised, solution.value, raises + 1
+            solution = self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
         sensitivity = (
             self._sensitivity(operator, damped.value, b, solution) if self.sensitivity else float("nan")
         )
-        return Adjoint(solution, damped, sensitivity, time.perf_counter() - began)
+        return Adjoint(solution, damped, raises, sensitivity, time.perf_counter() - began)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
         """The undamped curvature operator that the damping asks for."""

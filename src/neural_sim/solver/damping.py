@@ -6,7 +6,7 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from neural_sim.solver.operator import Matvec
 
 logger = logging.getLogger(__name__)
 Curvature = Literal["hessian", "gauss_newton"]
+Start = Literal["rhs", "random"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,12 @@ class Damping(abc.ABC):
     curvature: ClassVar[Curvature] = "hessian"
 
     @abc.abstractmethod
-    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        """lambda for ``matvec`` on vectors of the size, dtype and device of ``like``."""
+    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        """lambda for ``matvec`` and the right-hand side ``b``."""
+
+    def raised(self, damped: Damped, lowest: float) -> Damped | None:
+        """A larger lambda after a solve met the curvature ``lowest`` < -lambda, or None: this choice stands."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -56,8 +61,8 @@ class FixedDamping(Damping):
     def __post_init__(self) -> None:
         _check("fixed", self.value, self.lanczos_steps)
 
-    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        return Damped(self.value, _estimate(matvec, like, self.lanczos_steps, generator))
+    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
 @dataclass(frozen=True)
@@ -65,14 +70,21 @@ class LanczosDamping(Damping):
     """lambda past the most negative curvature, and large enough for a wanted condition number.
 
     With the Ritz value lowered by its own error bound, ``m = smallest - error``:
-    ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``;
-    the last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
+    ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
+    last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
+
+    ``start``: from ``rhs``, the Krylov space is the one that conjugate gradients search, and lambda past its
+    smallest Ritz value is what keeps their first ``lanczos_steps`` steps from breaking down; ``random`` looks
+    for the spectrum's own ends, but a detector's few negative eigenvalues hide among many near zero: on a
+    tiny RetinaNet 12 steps saw -0.01 where lambda_min was -2.4. Where a longer solve still meets negative
+    curvature, lambda is raised past it.
     """
 
     margin: float = 0.25
     max_condition: float = 1e3
     minimum: float = 1e-6
     lanczos_steps: int = 12
+    start: Start = "rhs"
 
     def __post_init__(self) -> None:
         _check("lanczos", self.minimum, self.lanczos_steps)
@@ -81,21 +93,30 @@ class LanczosDamping(Damping):
                 "lanczos damping: want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
                 f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
             )
+        if self.start not in get_args(Start):
+            raise ValueError(f"lanczos damping: start must be one of {get_args(Start)}, got {self.start!r}")
 
-    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        spectrum = lanczos(
-            matvec,
-            random_start(like.numel(), generator, dtype=like.dtype, device=like.device),
-            self.lanczos_steps,
-        )
-        if not spectrum.finite:
+    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        # A zero or non-finite right-hand side has no Krylov space; its solve has a status of its own.
+        usable = bool(torch.isfinite(b).all()) and bool(b.any())
+        if self.start == "rhs" and usable:
+            spectrum = lanczos(matvec, b, self.lanczos_steps)
+        else:
+            spectrum = _estimate(matvec, b, self.lanczos_steps, generator)
+        if spectrum is None or not spectrum.finite:
             logger.warning(
                 "damping: the operator is not finite; lambda falls to its minimum, %g", self.minimum
             )
             return Damped(self.minimum, spectrum)
-        low = spectrum.smallest - spectrum.smallest_error
-        bounded = (spectrum.largest - self.max_condition * low) / (self.max_condition - 1.0)
-        return Damped(max(self.minimum, (1.0 + self.margin) * max(0.0, -low), bounded), spectrum)
+        return Damped(self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest), spectrum)
+
+    def raised(self, damped: Damped, lowest: float) -> Damped:
+        largest = damped.spectrum.largest if damped.spectrum is not None else 0.0
+        return Damped(max(2.0 * damped.value, self._past(lowest, largest)), damped.spectrum)
+
+    def _past(self, low: float, largest: float) -> float:
+        bounded = (largest - self.max_condition * low) / (self.max_condition - 1.0)
+        return max(self.minimum, (1.0 + self.margin) * max(0.0, -low), bounded)
 
 
 @dataclass(frozen=True)
@@ -111,8 +132,8 @@ class GaussNewtonDamping(Damping):
     def __post_init__(self) -> None:
         _check("gauss_newton", self.value, self.lanczos_steps)
 
-    def choose(self, matvec: Matvec, like: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        return Damped(self.value, _estimate(matvec, like, self.lanczos_steps, generator))
+    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
+        return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
 def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generator) -> Spectrum | None:
