@@ -1,0 +1,75 @@
+"""What a run leaves: results.json by the standard, figures, the training set, MLflow."""
+
+import json
+
+import pytest
+import torch
+from mlflow import MlflowClient
+
+from neural_sim.report import tracking
+from neural_sim.report.run import RunResults, track, write_figures, write_results
+from neural_sim.types import LabelledImages
+
+
+@pytest.fixture
+def results():
+    uniform = torch.full((2, 4), 0.25, dtype=torch.float64)
+    peaked = torch.tensor([[0.85, 0.05, 0.05, 0.05], [0.25] * 4], dtype=torch.float64)
+    record = {
+        "probabilities": uniform.tolist(), "entropies": [1.0, 1.0], "gradient_norms": [0.1, 0.2],
+        "validation_loss": 0.5, "training_loss": float("nan"), "stationarity": 1.0, "solver_steps": 3,
+        "solver_residual": 0.01, "damping": 2.0, "seconds": {"render": 0.5},
+    }  # fmt: skip
+    scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"a": 0.6, "b": float("nan")}, "per_class_ap50": {}}
+    return RunResults(
+        "pose_gap", "neural_sim", 3, ("a", "b"), ("a",),
+        {"initial": uniform, "learned": peaked, "target": peaked}, [record, record],
+        {"ns": scores, "learned": scores, "matched": scores}, {"a": [{"psnr": 30.0, "ssim": 0.9}], "b": []},
+        {"psi": 1.5}, 512.0, [{"stage": "views", "what": "views of a", "why": "found in the store"}],
+        {"seed": 3, "parameter": {"pose": {"bins": 4}}},
+    )  # fmt: skip
+
+
+def test_results_are_json_by_the_standard(results, tmp_path):
+    held = json.loads(write_results(results, tmp_path).read_text(), parse_constant=pytest.fail)
+    assert held["ap"]["ns"]["per_class"]["b"] is None
+    assert held["total_variation"]["a"] == {"initial": pytest.approx(0.6), "learned": 0.0}
+    assert held["psi"]["a"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
+
+
+def test_summary_names_every_method_and_object(results):
+    text = results.summary()
+    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan"):
+        assert word in text
+
+
+def test_figures_are_written(results, tmp_path):
+    images = LabelledImages(
+        torch.rand(3, 3, 16, 16), torch.tensor([[[2.0, 2, 9, 9]]] * 3), torch.tensor([[0], [1], [-1]]), torch.zeros(3).long()
+    )
+    nothing = {"boxes": torch.zeros(0, 4), "scores": torch.zeros(0), "labels": torch.zeros(0).long()}
+    found = {"boxes": torch.tensor([[2.0, 2, 9, 9]]), "scores": torch.tensor([0.9]), "labels": torch.tensor([1])}
+    made = write_figures(results, images, images, [found, nothing, found], tmp_path)
+    assert {path.name for path in made} == {"psi.png", "ap.png", "training_images.png", "detections.png"}
+    assert all(path.read_bytes()[:4] == b"\x89PNG" and path.stat().st_size > 5000 for path in made)
+
+
+def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
+    uri = tracking.tracking_uri(str(tmp_path / "deep" / "mlflow.db"))
+    (tmp_path / "run").mkdir()
+    write_results(results, tmp_path / "run")
+    run = MlflowClient(uri).get_run(track(results, uri, tmp_path / "run"))
+    assert run.info.status == "FINISHED" and run.data.tags["method"] == "neural_sim"
+    assert run.data.params["parameter.pose.bins"] == "4"
+    assert run.data.metrics["evaluate/learned/ap"] == 0.5
+    assert "evaluate/ns/ap_b" not in run.data.metrics
+    steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/bin_1")
+    assert [point.step for point in steps] == [0, 1]
+    assert [item.path for item in MlflowClient(uri).list_artifacts(run.info.run_id)] == ["results.json"]
+
+
+def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path):
+    assert tracking.tracking_uri("http://localhost:5000") == "http://localhost:5000"
+    assert tracking.tracking_uri("outputs/mlflow.db").startswith("sqlite:////")
+    with pytest.raises(ValueError, match=r"paths\.mlflow"):
+        tracking.tracking_uri("")

@@ -1,0 +1,110 @@
+"""The psi loop on a small scene: it replays, records, and moves psi against the derivative."""
+
+import math
+
+import pytest
+import torch
+
+from neural_sim.detector.retinanet import Detector
+from neural_sim.field.grid import GridField
+from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.outer import CachedSet, SimulatorModule, learn_psi
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.update import Mirror
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.settings import Outer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import LanczosDamping
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+CAMERA = PinholeCamera(32, 32, math.radians(40.0))
+
+
+def _block(seed):
+    field = GridField().eval()
+    field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
+    noise = torch.randn(field.table.shape, generator=torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        field.table.copy_(noise + 1.0)
+    return field.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+    return Scene(("a", "b"), (_block(1), _block(2)), NerfRenderer(), CAMERA, synthesizer, Pose(bins=4))
+
+
+def _module(scene, estimator, iterations=2):
+    generator = torch.Generator().manual_seed(0)
+    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    validation = join(scene.training_set(torch.zeros(2, 4), 3, generator))
+    solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
+    return SimulatorModule(
+        scene, detector, detector.init(generator), torch.zeros(2, 4), validation,
+        Outer(Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6),
+        estimator, solver, batch_size=4, weight_decay=0.0, generator=generator,
+    )  # fmt: skip
+
+
+ESTIMATORS = [PathwiseEstimator(), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
+def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
+    module = _module(scene, estimator)
+    learned = learn_psi(module, progress=False)
+    assert len(learned.records) == 2
+    first = learned.records[0]
+    assert first.probabilities == [[0.25] * 4] * 2
+    assert first.entropies == pytest.approx([math.log(4)] * 2)
+    assert math.isfinite(first.validation_loss) and first.damping > 0
+    assert {"render", "train", "hypergradient", "hypergradient_solve"} <= set(first.seconds)
+    assert torch.isfinite(learned.last).all() and (learned.last != 0).any()
+    assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()
+
+
+def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
+    runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
+    assert torch.equal(*runs)
+
+
+def test_the_backbone_stays_frozen(scene):
+    module = _module(scene, ReinforceEstimator())
+    before = {name: value.clone() for name, value in module.detector.split(module.theta)[0].items()}
+    learn_psi(module, False)
+    after = module.detector.split(module.theta)[0]
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
+    generator = torch.Generator().manual_seed(3)
+    psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
+    part = scene.draw(1, psi, 4, generator, relaxed=True)
+    draw = scene.pose.relaxed(psi, part.noise)
+    torch.testing.assert_close(draw.phi, part.draw.phi)
+    again = scene.synthesizer.compose(part.rgb, part.opacity, part.nuisance, 1, part.draw.bins)
+    assert torch.equal(again.images, part.images.images) and torch.equal(again.boxes, part.images.boxes)
+
+
+def test_probes_cover_every_bin_equally(scene):
+    part = scene.probes(0, 3, torch.Generator().manual_seed(0))
+    assert part.draw.bins.tolist() == [b for b in range(4) for _ in range(3)]
+    assert torch.equal(scene.pose.bin_of(part.draw), part.draw.bins)
+
+
+def test_cached_losses_equal_losses_from_images(scene):
+    generator = torch.Generator().manual_seed(0)
+    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    backbone, trainable = detector.split(detector.init(generator))
+    images = join(scene.training_set(torch.zeros(2, 4), 4, generator))
+    cached = CachedSet.of(detector, backbone, images)
+    targets = detector.assign(images.boxes, images.labels)
+    direct = detector.per_image_loss(trainable, detector.features(backbone, images.images), targets)
+    torch.testing.assert_close(cached.losses(trainable, torch.arange(8)), direct, rtol=1e-4, atol=1e-5)
+    total = sum(term(trainable) for term in cached.mean_terms(chunk_size=3))
+    torch.testing.assert_close(total, direct.mean(), rtol=1e-4, atol=1e-5)
