@@ -248,7 +248,7 @@ def test_damping_is_raised_until_conjugate_gradients_hold(start, generator):
     params = {"w": torch.zeros(400, dtype=DOUBLE)}
     terms = [lambda p: 0.5 * (values * p["w"].square()).sum()]
     b = torch.randn(400, generator=generator, dtype=DOUBLE)
-    damping = LanczosDamping(lanczos_steps=2, start=start)
+    damping = LanczosDamping(max_condition=1e3, lanczos_steps=2, start=start)
     adjoint = AdjointSolver(ConjugateGradient(), damping, rtol=1e-8).solve(terms, params, b, None, generator)
     assert adjoint.raises >= 1
     assert adjoint.solution.status is Status.CONVERGED

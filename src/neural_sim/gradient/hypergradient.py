@@ -37,7 +37,7 @@ class InnerProblem:
     params: Params
     losses: IndexedLoss
     weights: Float[Tensor, "N"]
-    chunk_size: int = 32
+    chunk_size: int = 64
     proximal: float = 0.0
     anchor: Params | None = None
     subset: Tensor | None = None
@@ -75,7 +75,7 @@ class Hypergradient:
     """``dL_val/dpsi`` per object with everything needed to judge it.
 
     ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
-    ``seconds`` by phase: validation, solve, mixed.
+    ``seconds`` by phase: validation, solve, mixed. ``raises`` counts how often lambda had to be raised.
     """
 
     psi_gradients: dict[str, Float[Tensor, "k"]]
@@ -86,6 +86,7 @@ class Hypergradient:
     stationarity: float
     validation_norm: float
     seconds: dict[str, float] = field(default_factory=dict)
+    raises: int = 0
 
 
 def hypergradient(
@@ -128,6 +129,7 @@ def hypergradient(
         stationarity=stationarity,
         validation_norm=norm(right_hand_side),
         seconds=seconds,
+        raises=adjoint.raises,
     )
 
 

@@ -81,7 +81,7 @@ class LanczosDamping(Damping):
     """
 
     margin: float = 0.25
-    max_condition: float = 1e3
+    max_condition: float = 100.0
     minimum: float = 1e-6
     lanczos_steps: int = 12
     start: Start = "rhs"
