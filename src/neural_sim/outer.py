@@ -167,7 +167,9 @@ class SimulatorModule(pl.LightningModule):
         _, trainable = self.detector.split(self.theta)
         count = len(images)
         weights = torch.full((count,), 1.0 / count)
-        inner = InnerProblem(trainable, cached.losses, weights)
+        wanted = self.settings.curvature_images
+        subset = torch.randperm(count, generator=self.generator)[:wanted] if 0 < wanted < count else None
+        inner = InnerProblem(trainable, cached.losses, weights, subset=subset)
         probe_losses: IndexedLoss | None = self._probe_set.losses if self._probe_set else None
         losses = Losses(cached.losses, self._losses_of_images(cached.targets), probe_losses)
         estimates, first = {}, 0

@@ -67,14 +67,19 @@ class Training:
 
 @dataclass(frozen=True)
 class Outer:
-    """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps."""
+    """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
+
+    ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them).
+    """
 
     update: Update
     iterations: int = 10
     images_per_object: int = 50
     epochs: int = 2
     learning_rate: float = 5e-4
+    curvature_images: int = 64
 
     def __post_init__(self) -> None:
         _at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
         _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
+        _at_least("outer", 0, curvature_images=self.curvature_images)
