@@ -18,7 +18,7 @@ EMPTY_DENSITY = -1e4
 
 
 class GridField(RadianceField):
-    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, so raw is free of the grid's scale.
+    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, whatever the grid's scale.
 
     ``features`` numbers per vertex make the colour: with ``head_width`` 0 the first three pass a sigmoid (no view
     dependence; a Lambertian object under a fixed light needs none), otherwise a head of one hidden layer sees them and
@@ -33,7 +33,7 @@ class GridField(RadianceField):
         head_width: int = 0,
         step_cells: float = 1.0,
         initial_density: float = -3.0,
-        density_gain: float = 4.0,
+        density_gain: float = 2.0,
     ) -> None:
         super().__init__()
         if features < 3:

@@ -78,7 +78,7 @@ class MLPField(RadianceField):
         sizes = (width, depth, coarse_samples, fine_samples)
         if min(sizes) < 2 or min(position_frequencies, direction_frequencies) < 0 or density_scale <= 0.0:
             raise ValueError(
-                "MLPField: want width, depth, coarse_samples, fine_samples >= 2, frequencies >= 0 and density_scale > 0; "
+                "MLPField: want width, depth, coarse_samples, fine_samples >= 2, frequencies >= 0, density_scale > 0; "
                 f"got {sizes}, {(position_frequencies, direction_frequencies)} and {density_scale}"
             )
         self._settings: dict[str, object] = {
