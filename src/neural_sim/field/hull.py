@@ -19,10 +19,11 @@ COARSEST = 32
 def visual_hull(
     views: PosedViews, resolution: int, alpha_threshold: float = 0.004
 ) -> tuple[Bool[Tensor, "nx ny nz"], Float[Tensor, "3"], float]:
-    """Occupied cells of the cube [-1, 1]^3 cut into ``resolution`` (32 times a power of two) along each edge.
+    """Cells of the unit sphere that the object may occupy; the cube [-1, 1]^3 has ``resolution`` along each edge.
 
-    A cell goes when some view that sees its centre has no pixel above ``alpha_threshold`` within the circle that
-    the cell can cover, so the hull is never too small. Returns cells, origin and edge length in object radii.
+    ``resolution`` is 32 times a power of two. A cell goes when some view that sees its centre has no pixel above
+    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small. Returns cells,
+    origin and edge length in object radii.
     Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
     """
     if resolution < COARSEST or resolution & (resolution - 1):
@@ -35,7 +36,10 @@ def visual_hull(
         cell = 2.0 / size
         where = occupied.nonzero()
         centres = origin + (where.to(pose.dtype) + 0.5) * cell
-        kept = where[_inside_all(views, centres, 0.5 * math.sqrt(3.0) * cell, alpha_threshold)]
+        radius = 0.5 * math.sqrt(3.0) * cell
+        in_sphere = centres.norm(dim=-1) < 1.0 + radius
+        where, centres = where[in_sphere], centres[in_sphere]
+        kept = where[_inside_all(views, centres, radius, alpha_threshold)]
         if not len(kept):
             raise ValueError(
                 f"visual_hull: the silhouettes of {len(views)} views share no cell; check alpha and poses"

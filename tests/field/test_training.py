@@ -1,0 +1,109 @@
+"""Fitting from posed views: it learns, the same seed gives the same bits, and bad input is refused."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from neural_sim import cameras
+from neural_sim.field.fitting import GridFitting
+from neural_sim.field.grid import GridField
+from neural_sim.field.hull import visual_hull
+from neural_sim.field.mlp import MLPField, inverse_cumulative
+from neural_sim.field.mlp_fitting import MLPFitting
+from neural_sim.field.training import fit_field, load_field, save_field
+from neural_sim.types import PinholeCamera, PosedViews, Rays
+
+RADIUS = 0.6
+
+
+def ball_views(count: int = 14, size: int = 24) -> PosedViews:
+    """An opaque ball of radius 0.6 whose colour is its surface normal, in closed form."""
+    generator = torch.Generator().manual_seed(5)
+    height, turn = torch.rand(2, count, generator=generator)
+    pose = cameras.orbit(torch.arccos(1.0 - 2.0 * height), 2.0 * math.pi * turn, torch.full((count,), 2.8))
+    camera = PinholeCamera(size, size, math.radians(40.0))
+    bundle = cameras.rays(camera, pose)
+    near, far = cameras.unit_sphere_span(bundle, RADIUS)
+    normal = (bundle.origins + near[..., None] * bundle.directions) / RADIUS
+    hit = (far > near)[..., None].float()
+    return PosedViews(torch.cat([(0.5 + 0.5 * normal) * hit, hit], -1), pose, camera)
+
+
+def fitting(**changes: int) -> GridFitting:
+    settings = {"resolution": 64, "prune_rays": 1000, "batch_rays": 512, **changes}
+    return GridFitting(GridField(), refine_steps=(25,), **settings)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_hull_holds_the_object_and_little_more() -> None:
+    occupied, origin, cell = visual_hull(ball_views(), 64)
+    distance = (origin + (occupied.nonzero() + 0.5) * cell).norm(dim=-1)
+    volume = 4.0 / 3.0 * math.pi * RADIUS**3
+    grid = torch.stack(torch.meshgrid(*[torch.arange(64)] * 3, indexing="ij"), -1)
+    inside = (origin + (grid + 0.5) * cell).norm(dim=-1) < RADIUS
+    assert bool(occupied[inside].all())
+    assert distance.max() < 1.03 and len(distance) * cell**3 < 3.0 * volume
+
+
+def test_contradicting_silhouettes_are_refused() -> None:
+    views = ball_views()
+    with pytest.raises(ValueError, match="share no cell"):
+        visual_hull(PosedViews(views.images * 0.0, views.camera_to_world, views.camera), 32)
+
+
+def test_a_grid_field_learns_the_ball_bit_for_bit_the_same() -> None:
+    runs = [
+        fit_field(
+            ball_views(), fitting(), torch.Generator().manual_seed(0), steps=60, held_out=2, score_every=20
+        )
+        for _ in range(2)
+    ]
+    history = runs[0][1]
+    assert [row["step"] for row in history] == [20, 40, 60]
+    assert history[-1]["psnr"] > 20.0 and history[-1]["psnr"] > history[0]["psnr"]
+    first, second = (field.state_dict() for field, _ in runs)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_network_field_learns_and_survives_saving(tmp_path: Path) -> None:
+    field = MLPField(width=32, depth=6, position_frequencies=3, coarse_samples=12, fine_samples=8)
+    views = ball_views(8, 16)
+    recipe = MLPFitting(field, batch_rays=128, learning_rate=3e-3)
+    generator = torch.Generator().manual_seed(0)
+    fitted, history = fit_field(views, recipe, generator, steps=60, held_out=1, score_every=10)
+    assert history[-1]["psnr"] > history[0]["psnr"] + 1.0
+    save_field(fitted, tmp_path / "field.pt")
+    loaded = load_field(tmp_path / "field.pt")
+    where = torch.rand(20, 3, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(fitted.query(where, where)[1], loaded.query(where, where)[1])
+
+
+def test_network_samples_are_sorted_repeat_and_cover_the_sphere() -> None:
+    field = MLPField(width=16, depth=2, coarse_samples=8, fine_samples=8)
+    rays = Rays(torch.tensor([[0.0, 0.0, 3.0], [0.0, 3.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]] * 2))
+    samples = field.sample(rays, 0.0)
+    assert samples.starts.tolist() == [0, 16, 16]
+    assert (
+        bool((samples.distance.diff() >= 0).all())
+        and 2.0 < samples.distance.min() < samples.distance.max() < 4.0
+    )
+    assert samples.width.sum().item() == pytest.approx(2.0, abs=1e-5)
+    assert torch.equal(samples.distance, field.sample(rays, 0.0).distance)
+
+
+def test_inverse_cumulative_inverts_a_two_step_density() -> None:
+    edges = torch.tensor([[0.0, 1.0, 3.0]], dtype=torch.float64)
+    weights = torch.tensor([[3.0, 1.0]], dtype=torch.float64)
+    quantiles = torch.tensor([[0.375, 0.75, 0.875]], dtype=torch.float64)
+    assert inverse_cumulative(edges, weights, quantiles)[0].tolist() == pytest.approx([0.5, 1.0, 2.0])
+
+
+def test_bad_budgets_are_refused() -> None:
+    generator = torch.Generator()
+    with pytest.raises(ValueError, match="held_out"):
+        fit_field(ball_views(3), fitting(), generator, steps=1, held_out=3)
+    with pytest.raises(ValueError, match="steps"):
+        fit_field(ball_views(3), fitting(), generator, steps=0)
+    with pytest.raises(ValueError, match="batch_rays"):
+        fitting(batch_rays=0)
