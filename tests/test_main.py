@@ -31,7 +31,9 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     assert "mlflow ui --backend-store-uri sqlite:///" in done.stdout
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert {"experiment", "method", "seed", "psi", "ap", "seconds", "peak_memory_mb", "left_out"} <= set(results)
+    assert {"experiment", "method", "seed", "psi", "ap", "seconds", "peak_memory_mb", "left_out"} <= set(
+        results
+    )
     assert set(results["ap"]) == {"ns", "learned", "matched"}
     assert set(results["psi"]["pitcher"]) == {"initial", "learned", "target"}
     for distribution in results["psi"]["pitcher"].values():
@@ -46,7 +48,9 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     assert again.returncode == 0, again.stderr[-3000:]
     repeated = json.loads((tmp_path / "run" / "results.json").read_text())
     assert repeated["ap"] == results["ap"] and repeated["psi"] == results["psi"]
-    assert {"views", "field", "warm_start", "psi", "evaluate"} <= {left["stage"] for left in repeated["left_out"]}
+    assert {"views", "field", "warm_start", "psi", "evaluate"} <= {
+        left["stage"] for left in repeated["left_out"]
+    }
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,17 @@ def test_experiments_set_no_key_that_a_scale_sets():
 
 
 def _choices():
-    for group in ("objects", "field", "detector", "solver", "gradient", "baseline", "synthesis", "target", "scale"):
+    for group in (
+        "objects",
+        "field",
+        "detector",
+        "solver",
+        "gradient",
+        "baseline",
+        "synthesis",
+        "target",
+        "scale",
+    ):
         for path in sorted((CONF / group).glob("*.yaml")):
             yield group, path.stem
 

@@ -207,9 +207,9 @@ class Artifacts:
     def _generator(self, purpose: int) -> torch.Generator:
         return torch.Generator().manual_seed(1_000_003 * (self.x.seed + 1) + purpose)
 
-    def _train_cold(self, psi: Tensor, epochs: int, purpose: int) -> Parameters:
+    def _train_cold(self, psi: Tensor, epochs: int) -> Parameters:
         """A detector from scratch on images from ``psi``; the same budget and seed whatever the method."""
-        generator = self._generator(purpose)
+        generator = self._generator(1)
         training = self.x.training
         images = join(self.scene.training_set(psi, training.images_per_object, generator))
         params, _ = train_detector(
@@ -228,11 +228,12 @@ class Artifacts:
         }
 
     def warm_start(self) -> Parameters:
-        psi = self.psi("initial")
-        return self._fetch(
-            "warm_start", "warm_start", "warm start", self._trained_key(psi),
-            lambda: self._train_cold(psi, self.x.training.warm_epochs, purpose=1),
-        )  # fmt: skip
+        """The detector that the psi loop goes on from; with equal epochs it is also the one scored as ``ns``."""
+        return self._detector(self.psi("initial"), self.x.training.warm_epochs, "warm_start", "warm start")
+
+    def _detector(self, psi: Tensor, epochs: int, stage: str, what: str) -> Parameters:
+        key = {**self._trained_key(psi), "epochs": epochs}
+        return self._fetch(stage, "detector", what, key, lambda: self._train_cold(psi, epochs))
 
     def learned(self) -> dict[str, Any]:
         """psi after the loop (``last``, ``best``) and its records; the initial psi where nothing is optimised."""
@@ -258,19 +259,20 @@ class Artifacts:
 
     def training_images(self, psi: Tensor) -> list[RenderedObject]:
         """The images that the scored detector trained on, drawn again from the same seed."""
-        return self.scene.training_set(psi, self.x.training.images_per_object, self._generator(3))
+        return self.scene.training_set(psi, self.x.training.images_per_object, self._generator(1))
 
     def scores(self, psi: Tensor, what: str) -> dict[str, Any]:
         """AP on the test set of a detector trained cold on images from ``psi``, and its detections."""
 
         def make() -> Any:
-            params = self._train_cold(psi, self.x.training.cold_epochs, purpose=3)
+            what_trained = f"detector trained on {what}"
+            params = self._detector(psi, self.x.training.cold_epochs, "evaluate", what_trained)
             test = self.targets["test"]
             detections = self.detector.predict(params, test.images)
             return {"ap": evaluate(detections, test, self.names), "detections": detections}
 
         key = {"trained": self._trained_key(psi), **self._config("target"), "code": code_version("target")}
-        return self._fetch("evaluate", "evaluate", f"detector trained on {what}", key, make)
+        return self._fetch("evaluate", "evaluate", f"scores of the detector trained on {what}", key, make)
 
     def compared(self) -> dict[str, Tensor]:
         """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import lightning.pytorch as pl
 import torch
@@ -23,10 +22,9 @@ from neural_sim.gradient.estimators import Estimator, Losses, Probes
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.types import LabelledImages
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,11 @@ class SimulatorModule(pl.LightningModule):
         self._update_state = settings.update.start(self.psi)
         self._backbone, _ = detector.split(params)
         self._validation = CachedSet.of(detector, self._backbone, validation)
-        self._probe_set, self._probes = self._draw_probes()
+        self._probe_set: CachedSet | None = None
+        self._probes: dict[int, Probes] = {}
+        self._pool: ImagePool | None = None
+        if settings.pool_per_bin and not estimator.relaxed:
+            self._pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self._adjoint: Tensor | None = None
 
     def configure_optimizers(self) -> None:
@@ -128,10 +130,10 @@ class SimulatorModule(pl.LightningModule):
     def training_step(self, batch: int, batch_idx: int) -> None:
         seconds: dict[str, float] = {}
         with _timed(seconds, "render"):
-            rendered = self.scene.training_set(
-                self.psi, self.settings.images_per_object, self.generator, self.estimator.relaxed
-            )
+            rendered = self._draw_images()
             images = join(rendered)
+        with _timed(seconds, "probes"):
+            self._draw_probes()
         with _timed(seconds, "train"):
             training_loss = self._train(images)
         with _timed(seconds, "features"):
@@ -204,13 +206,15 @@ class SimulatorModule(pl.LightningModule):
         return losses
 
     def _path(self, label: int, part: RenderedObject) -> RenderedPath:
-        scene = self.scene
+        scene, noise = self.scene, part.noise
+        if noise is None:
+            raise ValueError("pathwise: these images were not drawn from psi afresh")
 
         def compose(rgb: Tensor, opacity: Tensor) -> Tensor:
             return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins).images
 
         return RenderedPath(
-            relaxed=lambda psi: scene.pose.relaxed(psi, part.noise),
+            relaxed=lambda psi: scene.pose.relaxed(psi, noise),
             render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
             compose=compose,
             camera=scene.camera,
@@ -218,17 +222,25 @@ class SimulatorModule(pl.LightningModule):
             opacity=part.opacity,
         )
 
-    def _draw_probes(self) -> tuple[CachedSet | None, dict[int, Probes]]:
+    def _draw_images(self) -> list[RenderedObject]:
+        count, labels = self.settings.images_per_object, range(len(self.scene.names))
+        if self._pool is None:
+            return self.scene.training_set(self.psi, count, self.generator, self.estimator.relaxed)
+        return [self._pool.draw(label, self.psi[label], count, self.generator) for label in labels]
+
+    def _draw_probes(self) -> None:
+        """New probes each iteration, so that what is peculiar to some does not push psi the same way every time."""
         per_bin = self.estimator.probes_per_bin
         if per_bin == 0:
-            return None, {}
-        drawn = [self.scene.probes(label, per_bin, self.generator) for label in range(len(self.scene.names))]
+            return
+        source = self._pool.every_bin if self._pool else self.scene.probes
+        drawn = [source(label, per_bin, self.generator) for label in range(len(self.scene.names))]
         each = self.scene.pose.bins * per_bin
-        probes = {
-            label: Probes(torch.arange(each) + label * each, part.draw.bins)
+        self._probes = {
+            label: Probes(torch.arange(each) + label * each, self.scene.pose.bin_of(part.draw))
             for label, part in enumerate(drawn)
         }
-        return CachedSet.of(self.detector, self._backbone, join(drawn)), probes
+        self._probe_set = CachedSet.of(self.detector, self._backbone, join(drawn))
 
     def _record(
         self, result: Hypergradient, images: LabelledImages, training_loss: float, seconds: dict[str, float]
@@ -259,7 +271,6 @@ class SimulatorModule(pl.LightningModule):
             seconds=seconds,
         )
         self.records.append(record)
-        _log.debug("psi iteration %d: %s", len(self.records), asdict(record))
 
 
 @dataclass(frozen=True)

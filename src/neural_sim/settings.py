@@ -69,7 +69,9 @@ class Training:
 class Outer:
     """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
 
-    ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them).
+    ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
+    poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
+    estimator, which replays exact draws, always renders.
     """
 
     update: Update
@@ -78,8 +80,9 @@ class Outer:
     epochs: int = 2
     learning_rate: float = 5e-4
     curvature_images: int = 64
+    pool_per_bin: int = 24
 
     def __post_init__(self) -> None:
         _at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
         _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
-        _at_least("outer", 0, curvature_images=self.curvature_images)
+        _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)

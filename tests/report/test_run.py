@@ -45,10 +45,17 @@ def test_summary_names_every_method_and_object(results):
 
 def test_figures_are_written(results, tmp_path):
     images = LabelledImages(
-        torch.rand(3, 3, 16, 16), torch.tensor([[[2.0, 2, 9, 9]]] * 3), torch.tensor([[0], [1], [-1]]), torch.zeros(3).long()
+        torch.rand(3, 3, 16, 16),
+        torch.tensor([[[2.0, 2, 9, 9]]] * 3),
+        torch.tensor([[0], [1], [-1]]),
+        torch.zeros(3).long(),
     )
     nothing = {"boxes": torch.zeros(0, 4), "scores": torch.zeros(0), "labels": torch.zeros(0).long()}
-    found = {"boxes": torch.tensor([[2.0, 2, 9, 9]]), "scores": torch.tensor([0.9]), "labels": torch.tensor([1])}
+    found = {
+        "boxes": torch.tensor([[2.0, 2, 9, 9]]),
+        "scores": torch.tensor([0.9]),
+        "labels": torch.tensor([1]),
+    }
     made = write_figures(results, images, images, [found, nothing, found], tmp_path)
     assert {path.name for path in made} == {"psi.png", "ap.png", "training_images.png", "detections.png"}
     assert all(path.read_bytes()[:4] == b"\x89PNG" and path.stat().st_size > 5000 for path in made)

@@ -52,15 +52,17 @@ class PathwiseEstimator:
 
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Mean scores of every bin from probes drawn once and kept, see :mod:`gradient.stratified`.
+    """Mean scores of every bin from images drawn from it on purpose, see :mod:`gradient.stratified`.
 
-    With the backbone frozen the probes' features never change, so an outer iteration pays one Jacobian-vector
-    product over the predictor for them and renders none.
+    An outer iteration pays one Jacobian-vector product over the predictor for its probes. ``shrink`` scales each
+    component by max(0, 1 - 1 / snr^2), the positive-part rule of James and Stein (1961), so that components that
+    cannot be told from noise do not move psi.
     """
 
     relaxed: ClassVar[bool] = False
     probes_per_bin: int = 8
     chunk_size: int = 64
+    shrink: bool = True
 
     def __post_init__(self) -> None:
         if self.probes_per_bin < 1:
@@ -74,9 +76,13 @@ class StratifiedEstimator:
             raise ValueError("stratified: got no probes, which this estimator scores")
         along = scores(losses.probes, params, vector, probes.index, self.chunk_size)
         share = float(images.weights.sum())
-        return stratified(
+        found = stratified(
             along.to(images.psi.dtype), probes.bins, images.psi, images.log_probabilities, share
         )
+        if not self.shrink:
+            return found
+        kept = (1.0 - found.signal_to_noise.square().clamp_min(1e-12).reciprocal()).clamp_min(0.0)
+        return MixedDerivative(found.value * kept, found.standard_error)
 
 
 @dataclass(frozen=True)

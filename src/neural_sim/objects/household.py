@@ -1,9 +1,9 @@
 """The six procedural household objects: what they look like, and which of their sides look alike.
 
-The pitcher's +x side is the can's label but for two marks; its -x side has the handle and a print of its own. The
-drill's -x side is the tall box's front but for two marks; its +x side has grip and chuck, which lie within 45 degrees
-behind the housing and so never show from -x. Numbers are in units of the body's radius or half height; the loader
-normalises afterwards.
+The pitcher's +x side is the can's label but for the place of its bar; its -x side has the handle and a print of
+its own. The drill's -x side is the tall box's front but for the colours of two marks; its +x side has grip and chuck,
+which lie within 45 degrees behind the housing and so never show from -x. Numbers are in units of the body's radius or
+half height; the loader normalises afterwards.
 """
 
 from __future__ import annotations
@@ -24,18 +24,21 @@ GREY: Colour = (178, 180, 184)
 DARK_GREY: Colour = (92, 94, 98)
 BLACK: Colour = (28, 28, 30)
 YELLOW: Colour = (244, 200, 36)
-GREEN: Colour = (36, 150, 70)
-ORANGE: Colour = (240, 120, 24)
+VIOLET: Colour = (60, 30, 110)
+AMBER: Colour = (242, 172, 36)
 
-# The marks that tell the look-alike sides apart. Discs are about a quarter of the object wide.
-CAN_EMBLEM, PITCHER_EMBLEM = RED, GREEN
-CAN_BAND, PITCHER_BAND = WHITE, YELLOW
-BOX_EMBLEM, DRILL_EMBLEM = NAVY, GREEN
-BOX_BAND, DRILL_BAND = YELLOW, WHITE
+# What tells the look-alike sides apart: the place of the label's bar, and the colours of the drill's marks. Chosen on
+# seeds 100 and 101 so that a handful of images is too few to learn it and some dozens are enough.
+CAN_EMBLEM = PITCHER_EMBLEM = RED
+CAN_BAND = PITCHER_BAND = WHITE
+BOX_EMBLEM, DRILL_EMBLEM = NAVY, VIOLET
+BOX_BAND, DRILL_BAND = YELLOW, AMBER
+
+CAN_HEADER, PITCHER_HEADER = 0.68, 0.3  # where the label's navy bar begins: over the emblem, or under it
 
 CAN_HALF_HEIGHT = 1.5  # of its radius
-PITCHER_TAPER = 0.93  # top radius over bottom radius
-PITCHER_SPOUT = 0.16
+PITCHER_TAPER = 0.97  # top radius over bottom radius
+PITCHER_SPOUT = 0.08
 HANDLE_REACH = 0.40  # beyond the body: hidden from the other side within 45 degrees while below sqrt(2) - 1
 BOX_HALF = (0.30, 0.74, 1.0)  # tall box and drill housing: half depth, half width, half height
 FLAT_HALF = (0.74, 0.95, 0.32)
@@ -43,7 +46,7 @@ FLAT_HALF = (0.74, 0.95, 0.32)
 
 def can(generator: torch.Generator) -> trimesh.Trimesh:
     """A blue cylinder with a label on +x, small print on -x, and a tab on its lid."""
-    side = _blue_side(CAN_EMBLEM, CAN_BAND, generator)
+    side = _blue_side(CAN_EMBLEM, CAN_BAND, CAN_HEADER, generator)
     side.rectangle(0.0, 0.3, 0.16, 0.7, WHITE)
     side.rectangle(0.84, 0.3, 1.0, 0.7, WHITE)
     side.text_lines((0.02, 0.34, 0.15, 0.66), 5, NAVY, generator)
@@ -55,11 +58,11 @@ def can(generator: torch.Generator) -> trimesh.Trimesh:
 
 def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
     """The can's look on +x with a small spout; a white handle over a yellow print on -x."""
-    side = _blue_side(PITCHER_EMBLEM, PITCHER_BAND, generator)
-    for x0, x1 in ((0.0, 0.2), (0.8, 1.0)):
+    side = _blue_side(PITCHER_EMBLEM, PITCHER_BAND, PITCHER_HEADER, generator)
+    for x0, x1 in ((0.0, 0.12), (0.88, 1.0)):  # no wider: the print must not show from +x either
         side.rectangle(x0, 0.12, x1, 0.88, YELLOW)
-    side.text_lines((0.06, 0.2, 0.18, 0.8), 4, DARK_RED, generator)
-    side.text_lines((0.82, 0.2, 0.94, 0.8), 4, DARK_RED, generator)
+    side.text_lines((0.04, 0.2, 0.11, 0.8), 4, DARK_RED, generator)
+    side.text_lines((0.89, 0.2, 0.96, 0.8), 4, DARK_RED, generator)
     h = CAN_HALF_HEIGHT
     profile = [(0.0, -h), (1.0, -h), (PITCHER_TAPER, h), (0.0, h)]
     body = [_spouted(part, h) for part in _with_lids(profile, side, PITCHER_EMBLEM, PITCHER_BAND)]
@@ -106,7 +109,7 @@ def drill(generator: torch.Generator) -> trimesh.Trimesh:
     """A red housing like the tall box from -x; black grip, yellow collar and dark chuck on +x."""
     depth, width, height = BOX_HALF
     panels = _box_prints(generator)
-    panels["-x"] = _red_front(DRILL_EMBLEM, DRILL_BAND, generator)
+    panels["-x"] = _red_front(DRILL_EMBLEM, DRILL_BAND, generator).turned()  # cameras at -x are upside down
     panels["+x"] = _plain(RED, [])
     parts = box(*_bounds(BOX_HALF), panels)
     grip = Print(64, 64, BLACK)
@@ -119,15 +122,16 @@ def drill(generator: torch.Generator) -> trimesh.Trimesh:
 _FACES: tuple[str, ...] = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
-def _blue_side(emblem: Colour, band: Colour, generator: torch.Generator) -> Print:
+def _blue_side(emblem: Colour, band: Colour, header: float, generator: torch.Generator) -> Print:
     """A cylinder's side: blue, the white label with header, emblem and small print on +x, a band round the foot."""
     side = Print(512, 256, BLUE)
     side.rectangle(0.0, 0.04, 1.0, 0.17, band)
     side.rectangle(0.3, 0.24, 0.7, 0.84, WHITE)
-    side.rectangle(0.3, 0.68, 0.7, 0.78, NAVY)
-    side.disc(0.5, 0.46, 0.1, 0.19, emblem)
-    side.text_lines((0.32, 0.27, 0.38, 0.64), 5, DARK_GREY, generator)
-    side.text_lines((0.62, 0.27, 0.68, 0.64), 5, DARK_GREY, generator)
+    side.rectangle(0.3, header, 0.7, header + 0.1, NAVY)
+    low = 0.27 if header > 0.5 else header + 0.13
+    side.disc(0.5, low + 0.19, 0.1, 0.19, emblem)
+    side.text_lines((0.32, low, 0.38, low + 0.37), 5, DARK_GREY, generator)
+    side.text_lines((0.62, low, 0.68, low + 0.37), 5, DARK_GREY, generator)
     return side
 
 

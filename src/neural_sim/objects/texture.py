@@ -46,6 +46,12 @@ class Print:
             top = y1 - row * pitch
             self.rectangle(x0, top - 0.55 * pitch, x0 + length * (x1 - x0), top, colour)
 
+    def turned(self) -> Print:
+        """The same print upside down."""
+        other = Print(*self._image.size, (0, 0, 0))
+        other._image.paste(self._image.rotate(180))
+        return other
+
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         return np.asarray(self._image)
 

@@ -19,10 +19,13 @@ from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 @dataclass(frozen=True)
 class RenderedObject:
-    """One object's images with all that made them: replaying ``noise`` and ``nuisance`` gives them again."""
+    """One object's images with all that made them: replaying ``noise`` and ``nuisance`` gives them again.
+
+    ``noise`` is None for images that were not drawn from psi afresh.
+    """
 
     images: LabelledImages
-    noise: PoseNoise
+    noise: PoseNoise | None
     draw: SceneDraw
     nuisance: Nuisance
     rgb: Float[Tensor, "n h w 3"]

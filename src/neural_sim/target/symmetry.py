@@ -1,0 +1,70 @@
+"""Which pose bins an object's symmetry makes the same, so that mass in any of them counts as mass in each."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.cameras import orbit
+from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.parameter.pose import Pose, PoseNoise
+from neural_sim.renderer.views import MeshRenderer
+from neural_sim.types import PinholeCamera
+
+# Per offset within the bin and second angle: as they are, or mirrored about their middle.
+ALIGNMENTS = ((False, False), (True, False), (False, True), (True, True))
+
+
+def equivalent_bins(
+    item: ObjectMesh,
+    renderer: MeshRenderer,
+    pose: Pose,
+    camera: PinholeCamera,
+    samples: int = 6,
+    tolerance: float = 0.01,
+) -> list[list[int]]:
+    """Groups of bins (from 0) whose views agree, as lists that cover all bins.
+
+    Two bins belong together when, under one of four alignments of the angles within them, the mean absolute difference
+    of their premultiplied views over the pixels that either covers is below ``tolerance``. Views of every bin use the
+    same ``samples`` offsets and second angles at the middle distance.
+    """
+    views = [_views(item, renderer, pose, camera, b, samples) for b in range(pose.bins)]
+    groups: list[list[int]] = []
+    for b in range(pose.bins):
+        home = next((group for group in groups if _same(views[group[0]][0], views[b], tolerance)), None)
+        if home is None:
+            groups.append([b])
+        else:
+            home.append(b)
+    return groups
+
+
+def _views(
+    item: ObjectMesh, renderer: MeshRenderer, pose: Pose, camera: PinholeCamera, bin_index: int, samples: int
+) -> list[Float[Tensor, "samples h w 4"]]:
+    """Views of one bin under every alignment."""
+    offsets = (torch.arange(samples) + 0.5) / samples
+    other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
+    made = []
+    for mirror_offset, mirror_other in ALIGNMENTS:
+        noise = PoseNoise(
+            gumbel=torch.zeros(samples, pose.bins),
+            within=1.0 - offsets if mirror_offset else offsets,
+            other=1.0 - other if mirror_other else other,
+            distance=torch.full((samples,), 0.5),
+        )
+        draw = pose.at_bins(torch.full((samples,), bin_index), noise)
+        rgba = renderer.render(item.mesh, camera, orbit(draw.phi, draw.rho, draw.distance))
+        made.append(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1))
+    return made
+
+
+def _same(reference: Tensor, candidates: list[Tensor], tolerance: float) -> bool:
+    return any(_difference(reference, candidate) < tolerance for candidate in candidates)
+
+
+def _difference(a: Tensor, b: Tensor) -> float:
+    covered = (a[..., 3] > 0) | (b[..., 3] > 0)
+    return float((a - b).abs().mean(-1)[covered].mean()) if bool(covered.any()) else 0.0
