@@ -12,7 +12,14 @@ from pathlib import Path
 from tqdm import tqdm
 
 from neural_sim.artifacts import Artifacts, Experiment
-from neural_sim.report.run import RunResults, track, write_figures, write_results, write_training_set
+from neural_sim.report.run import (
+    RunResults,
+    track,
+    write_detections,
+    write_figures,
+    write_results,
+    write_training_set,
+)
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.synthesis.scene import join
 
@@ -91,6 +98,9 @@ class Pipeline:
         )
         write_figures(results, join(drawn), test, detections, folder / "figures")
         write_training_set(drawn, self.made.names, folder / "training_set")
+        if results.ap:
+            scored = {which: self.made.scores(psi, which) for which, psi in self.made.compared().items()}
+            write_detections(test, {which: held["detections"] for which, held in scored.items()}, folder)
         write_results(results, folder)
         uri = tracking_uri(self.x.mlflow)
         track(results, uri, folder)

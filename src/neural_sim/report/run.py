@@ -137,6 +137,34 @@ def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], fo
     return write_coco(join(parts), list(names), folder, poses)
 
 
+def write_detections(
+    test: LabelledImages, detections: Mapping[str, Sequence[Mapping[str, Tensor]]], folder: Path
+) -> Path:
+    """detections.json: the test set's boxes (``truth``) and every detector's detections, as COCO result rows."""
+    truth = [
+        {"boxes": b[k], "labels": n[k]} for b, n, k in zip(test.boxes, test.labels, test.present, strict=True)
+    ]
+    rows = {"images": len(test), "truth": _rows(truth)}
+    rows |= {which: _rows(found) for which, found in detections.items()}
+    path = folder / "detections.json"
+    path.write_text(json.dumps(rows))
+    return path
+
+
+def _rows(images: Sequence[Mapping[str, Tensor]]) -> list[dict[str, Any]]:
+    """One row a box: image_id from 0, category_id from 1, bbox as (x, y, width, height) in pixels, score."""
+    rows = []
+    for index, image in enumerate(images):
+        scores = image.get("scores", torch.ones(len(image["labels"])))
+        for box, label, score in zip(
+            image["boxes"].tolist(), image["labels"].tolist(), scores.tolist(), strict=True
+        ):
+            x0, y0, x1, y1 = (round(side, 3) for side in box)
+            row = {"image_id": index, "category_id": label + 1, "bbox": [x0, y0, x1 - x0, y1 - y0]}
+            rows.append({**row, "score": round(score, 5)})
+    return rows
+
+
 def track(results: RunResults, uri: str, folder: Path) -> str:
     """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
     metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}

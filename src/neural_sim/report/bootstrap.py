@@ -1,0 +1,78 @@
+"""Average precision under image weights: the same matches resampled, without evaluating anew.
+
+A detection's match depends on its own image only. Drawing images with replacement therefore only changes how often
+each detection and each box counts, and AP is a weighted sum over the detections in the order of their scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torchvision.ops import box_iou
+
+from neural_sim.types import LabelledImages
+
+# In float32, as torchmetrics hands them on: a recall of exactly 0.28 falls on one side or the other of 0.28.
+THRESHOLDS = torch.linspace(0.5, 0.95, 10).double().numpy()
+RECALLS = torch.linspace(0.0, 1.0, 101).double().numpy()
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Detections of one class over a set, best first, and whether each is right at each of the COCO overlaps."""
+
+    image: Int[np.ndarray, "detections"]
+    correct: Bool[np.ndarray, "detections thresholds"]
+    boxes_per_image: Int[np.ndarray, "images"]
+
+
+def match(predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int) -> Matches:
+    """Greedy matching by COCO's rules: an image's best detection first, each to the free box it overlaps most."""
+    rows, scores, correct, counts = [], [], [], []
+    for index, found in enumerate(predictions):
+        truth = images.boxes[index][images.labels[index] == label]
+        counts.append(len(truth))
+        mine = found["labels"] == label
+        order = found["scores"][mine].argsort(descending=True, stable=True)[:100]
+        overlap = box_iou(found["boxes"][mine][order].float(), truth.float()).numpy()
+        rows += [index] * len(order)
+        scores += found["scores"][mine][order].tolist()
+        correct += list(_greedy(overlap))
+    best_first = np.argsort(-np.asarray(scores), kind="stable")
+    table = np.asarray(correct, dtype=bool).reshape(len(rows), len(THRESHOLDS))
+    return Matches(np.asarray(rows, dtype=int)[best_first], table[best_first], np.asarray(counts))
+
+
+def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, "detections thresholds"]:
+    correct = np.zeros((overlap.shape[0], len(THRESHOLDS)), dtype=bool)
+    for t, threshold in enumerate(THRESHOLDS):
+        free = np.ones(overlap.shape[1], dtype=bool)
+        for d, row in enumerate(overlap):
+            candidates = np.where(free, row, -1.0)
+            if candidates.size and candidates.max() >= threshold:
+                free[candidates.argmax()] = False
+                correct[d, t] = True
+    return correct
+
+
+def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | None = None) -> float:
+    """AP over the COCO overlaps with 101 recalls; ``weights`` say how often each image counts. nan without a box."""
+    weights = np.ones(len(matches.boxes_per_image)) if weights is None else weights
+    boxes = float((weights * matches.boxes_per_image).sum())
+    if boxes == 0.0:
+        return float("nan")
+    each = weights[matches.image][:, None]
+    right = (each * matches.correct).cumsum(0)
+    total = each.cumsum(0)
+    precision = np.maximum.accumulate((right / np.maximum(total, 1e-12))[::-1])[::-1]
+    recall = right / boxes
+    values = []
+    for t in range(len(THRESHOLDS)):
+        at = np.searchsorted(recall[:, t], RECALLS, side="left")
+        values.append(precision[at[at < len(recall)], t].sum() / len(RECALLS))
+    return float(np.mean(values))
