@@ -11,6 +11,7 @@ import os
 import sys
 import types
 import typing
+import warnings
 from collections.abc import Mapping
 from inspect import signature
 from pathlib import Path
@@ -61,7 +62,7 @@ def build(config: DictConfig) -> Experiment:
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        raise UserError(_first_line(error)) from error
+        raise UserError(f"{error.full_key or 'configuration'}: {_first_line(error)}") from error
     if not isinstance(plain, dict):
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
     plain = {str(key): value for key, value in plain.items()}
@@ -162,6 +163,9 @@ def _first_line(error: BaseException) -> str:
 @hydra.main(version_base="1.3", config_path=str(conf_directory()), config_name="config")
 def _task(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
+    # Libraries on each other's deprecations: nothing that a user of this program can act on.
+    warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
+    warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     try:
         experiment = build(config)
         from neural_sim.pipeline import run
