@@ -108,37 +108,59 @@ def image_grid(
     predictions: Sequence[Mapping[str, torch.Tensor]] | None = None,
     title: str = "",
 ) -> Figure:
-    """Images with their boxes (solid), or with predictions drawn solid over dashed true boxes."""
-    count = len(images)
-    rows = max(1, -(-count // columns))
-    figure = Figure(figsize=(1.35 * columns, 1.5 * rows + 0.7), layout="constrained")
-    figure.suptitle(title, color=INK, fontsize=11)
+    """Images with their boxes (solid), or with the best prediction solid over dashed true boxes.
+
+    All images go on one canvas: an axes each would take a hundred times as long to lay out.
+    """
+    count, height, width = len(images), *images.images.shape[-2:]
+    rows, gap = max(1, -(-count // columns)), round(0.18 * height)
+    canvas = np.ones((rows * (height + gap), columns * (width + gap), 3), dtype=np.float32)
+    figure = Figure(figsize=(1.35 * columns, 1.35 * rows + 0.4))
+    axes = figure.add_axes((0.01, 0.0, 0.98, 1.0 - 0.4 / (1.35 * rows + 0.4)))
     for i in range(count):
-        axes = figure.add_subplot(rows, columns, i + 1)
-        axes.imshow(images.images[i].permute(1, 2, 0).clamp(0, 1).cpu().numpy())
-        axes.set_axis_off()
+        top, left = i // columns * (height + gap) + gap, i % columns * (width + gap)
+        canvas[top : top + height, left : left + width] = (
+            images.images[i].permute(1, 2, 0).clamp(0, 1).cpu().numpy()
+        )
         caption = []
         for box, label in zip(images.boxes[i].tolist(), images.labels[i].tolist(), strict=True):
             if label >= 0:
-                _box(axes, box, label, dashed=predictions is not None)
+                _box(axes, box, (left, top), label, dashed=predictions is not None)
                 caption.append(class_names[label])
         if predictions is not None:
-            caption = [_best_prediction(axes, predictions[i], class_names)]
-        axes.set_title(", ".join(caption) or "no box", fontsize=6.5, color=MUTED, pad=2)
+            caption = [_best_prediction(axes, predictions[i], (left, top), class_names)]
+        axes.text(
+            left + width / 2, top - 2, ", ".join(caption) or "no box", fontsize=6.5, color=MUTED, ha="center"
+        )
+    axes.imshow(canvas)
+    axes.set_axis_off()
+    figure.suptitle(title, color=INK, fontsize=11)
     return figure
 
 
-def _best_prediction(axes: Any, prediction: Mapping[str, torch.Tensor], class_names: Sequence[str]) -> str:
+def _best_prediction(
+    axes: Any, prediction: Mapping[str, torch.Tensor], origin: tuple[int, int], class_names: Sequence[str]
+) -> str:
     if not len(prediction["scores"]):
         return "nothing found"
     best = int(prediction["scores"].argmax())
     label = int(prediction["labels"][best])
-    _box(axes, prediction["boxes"][best].tolist(), label, dashed=False)
+    _box(axes, prediction["boxes"][best].tolist(), origin, label, dashed=False)
     return f"{class_names[label]} {float(prediction['scores'][best]):.2f}"
 
 
-def _box(axes: Any, box: Sequence[float], label: int, dashed: bool) -> None:
+def _box(axes: Any, box: Sequence[float], origin: tuple[int, int], label: int, dashed: bool) -> None:
     x0, y0, x1, y1 = box
+    left, top = origin
     colour = "white" if dashed else CLASS_COLOURS[label % len(CLASS_COLOURS)]
-    axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor=colour,
-                             linewidth=0.9 if dashed else 1.4, linestyle="--" if dashed else "-"))  # fmt: skip
+    axes.add_patch(
+        Rectangle(
+            (left + x0 - 0.5, top + y0 - 0.5),
+            x1 - x0,
+            y1 - y0,
+            fill=False,
+            edgecolor=colour,
+            linewidth=0.9 if dashed else 1.4,
+            linestyle="--" if dashed else "-",
+        )
+    )
