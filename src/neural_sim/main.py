@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -113,7 +114,7 @@ def _instantiate(node: Any, where: str) -> Any:
         return hydra.utils.instantiate(dict(node), _convert_="all")
     except Exception as error:  # Hydra wraps whatever the constructor raised
         cause = error.__cause__ or error
-        if isinstance(cause, (ValueError, TypeError, FileNotFoundError, hydra.errors.InstantiationException)):
+        if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
             raise UserError(f"{where}: {_first_line(cause)}") from error
         raise
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from neural_sim.parameter.update import Update
 from neural_sim.types import PinholeCamera
@@ -28,7 +29,7 @@ class Views:
     field_of_view_deg: float = 40.0
     distance_range: tuple[float, float] = (2.4, 4.0)
     supersample: int = 2
-    backend: str = "auto"
+    backend: Literal["auto", "pyrender", "raycast"] = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import lightning
 import torch
@@ -71,7 +71,7 @@ class RadianceFieldModule(lightning.LightningModule):
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
     def training_step(self, batch: Any, batch_index: int) -> None:
-        optimizer = self.optimizers(use_pl_optimizer=False)
+        optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
         renderings, pixels = self.fitting.render()
         loss = torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
         optimizer.zero_grad(set_to_none=True)
