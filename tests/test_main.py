@@ -38,6 +38,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     assert set(results["psi"]["pitcher"]) == {"initial", "learned", "target"}
     for distribution in results["psi"]["pitcher"].values():
         assert sum(distribution) == pytest.approx(1.0, abs=1e-6)
+    assert results["symmetric_bins"]["drill"] == [[b] for b in range(1, 9)]
     assert results["psi"]["pitcher"]["learned"] != results["psi"]["pitcher"]["initial"]
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
     assert figures == {"psi.png", "ap.png", "training_images.png", "detections.png"}

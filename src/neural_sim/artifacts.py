@@ -31,6 +31,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.store import Entry, Store, code_version, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -197,6 +198,24 @@ class Artifacts:
         }  # fmt: skip
         entry = self.store.fetch("target", key, make)
         return {name: codec.unpack_images(held) for name, held in entry.value.items()}
+
+    @cached_property
+    def symmetric_bins(self) -> dict[str, list[list[int]]]:
+        """Groups of bins, numbered from 1, that each object's symmetry makes the same."""
+        found = {}
+        for name in self.names:
+            key = {
+                "object": self.digests[name], **self._config("parameter", "views"),
+                "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "parameter"),
+            }  # fmt: skip
+            camera = self.x.views.camera(48)
+            entry = self.store.fetch(
+                "symmetry", key, lambda name=name, camera=camera: equivalent_bins(
+                    self.meshes[name], self.mesh_renderer, self.x.pose, camera
+                ),
+            )  # fmt: skip
+            found[name] = [[b + 1 for b in group] for group in entry.value]
+        return found
 
     # --- detectors ---
 

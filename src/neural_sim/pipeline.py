@@ -86,6 +86,7 @@ class Pipeline:
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             left_out=self.made.account.left_out,
             config=self.x.config,
+            symmetric_bins=self.made.symmetric_bins,
         )
 
     def report(self, folder: Path) -> None:

@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunResults:
-    """Everything the report shows. Probabilities are [objects, k]; ``ap`` maps ns, learned, matched to scores."""
+    """Everything the report shows. Probabilities are [objects, k]; ``ap`` maps ns, learned, matched to scores.
+
+    ``symmetric_bins`` groups bins (from 1) whose views an object's symmetry makes the same.
+    """
 
     experiment: str
     method: str
@@ -39,6 +42,7 @@ class RunResults:
     peak_memory_mb: float
     left_out: Sequence[Mapping[str, str]]
     config: Mapping[str, Any]
+    symmetric_bins: Mapping[str, Sequence[Sequence[int]]] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
@@ -54,6 +58,7 @@ class RunResults:
                 "biased": list(self.biased),
                 "psi": psi,
                 "total_variation": self.total_variations(),
+                "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
                 "iterations": list(self.records),
                 "fields": {name: history[-1] for name, history in self.fields.items() if history},
