@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,7 +18,8 @@ from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
 from neural_sim.field.base import RadianceField
-from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
+from neural_sim.field.recipe import FieldRecipe
+from neural_sim.field.training import field_from_state, field_state
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.outer import SimulatorModule, learn_psi
@@ -33,8 +33,6 @@ from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,10 @@ class Artifacts:
         return choose_mesh_renderer(self.x.views.backend, self.x.views.supersample)
 
     def _config(self, *groups: str) -> dict[str, Any]:
-        return {group: self.x.config[group] for group in groups}
+        """Groups as configured, with the digests of the files they read where they read any."""
+        sources = {"synthesis": self.x.synthesis.background, "target": self.x.target}
+        files = {g: sources[g].digest() for g in groups if hasattr(sources.get(g), "digest")}
+        return {group: self.x.config[group] for group in groups} | ({"files": files} if files else {})
 
     def _fetch(self, stage: str, kind: str, what: str, key: dict[str, Any], make: Callable[[], Any]) -> Any:
         """A result from the store, or made now if its stage is among those asked for."""

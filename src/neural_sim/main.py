@@ -91,10 +91,10 @@ def build(config: DictConfig) -> Experiment:
 
 
 def _check_top(plain: Mapping[str, Any]) -> None:
-    from neural_sim.pipeline import STAGES
-
     if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:
         raise UserError(f"seed must be a whole number from 0, got {plain['seed']!r}")
+    from neural_sim.pipeline import STAGES  # after what needs no heavy import to refuse
+
     if not isinstance(plain["stages"], list) or not plain["stages"]:
         raise UserError(f"stages must be a list of {', '.join(STAGES)}, got {plain['stages']!r}")
     for stage in plain["stages"]:

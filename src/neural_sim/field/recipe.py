@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.objective import Fitting
-from neural_sim.field.training import KINDS, fit_field
+from neural_sim.field.training import fit_field
 from neural_sim.types import PosedViews
 
 
@@ -47,18 +47,3 @@ class FieldRecipe:
             placed, fitting, generator, steps=self.steps, held_out=held_out,
             final_rate=self.final_rate, score_every=self.score_every,
         )  # fmt: skip
-
-
-def field_state(field: RadianceField) -> dict[str, Any]:
-    """Kind, constructor arguments and tensors of a field, on the CPU."""
-    state = {name: tensor.detach().cpu() for name, tensor in field.state_dict().items()}
-    return {"kind": type(field).__name__, "settings": field.settings(), "state": state}
-
-
-def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
-    """Inverse of :func:`field_state`, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
-    if saved.get("kind") not in KINDS:
-        raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
-    field = KINDS[saved["kind"]](**saved["settings"])
-    field.load_state_dict(saved["state"])
-    return field.eval().requires_grad_(False)

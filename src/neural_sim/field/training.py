@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -64,12 +66,27 @@ def fit_field(
     return field, module.history
 
 
-def save_field(field: RadianceField, path: Path | str) -> None:
-    """Write the kind, the constructor's arguments and the state to one file."""
+def field_state(field: RadianceField) -> dict[str, Any]:
+    """Kind, constructor arguments and tensors of a field, on the CPU. Raises ``ValueError`` for an unknown kind."""
     kind = type(field).__name__
     if kind not in KINDS:
-        raise ValueError(f"save_field: no field of kind {kind}, want one of {sorted(KINDS)}")
-    torch.save({"kind": kind, "settings": field.settings(), "state": field.state_dict()}, path)
+        raise ValueError(f"field: unknown kind {kind!r}, want one of {sorted(KINDS)}")
+    state = {name: tensor.detach().cpu() for name, tensor in field.state_dict().items()}
+    return {"kind": kind, "settings": field.settings(), "state": state}
+
+
+def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
+    """Inverse of :func:`field_state`, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
+    if saved.get("kind") not in KINDS:
+        raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
+    field = KINDS[saved["kind"]](**saved["settings"])
+    field.load_state_dict(saved["state"])
+    return field.eval().requires_grad_(False)
+
+
+def save_field(field: RadianceField, path: Path | str) -> None:
+    """Write :func:`field_state` to one file."""
+    torch.save(field_state(field), path)
 
 
 def load_field(path: Path | str, device: torch.device | str = "cpu") -> RadianceField:
@@ -77,6 +94,4 @@ def load_field(path: Path | str, device: torch.device | str = "cpu") -> Radiance
     saved = torch.load(path, map_location=device, weights_only=True)
     if not isinstance(saved, dict) or saved.get("kind") not in KINDS:
         raise ValueError(f"load_field: {path} holds no field of a kind among {sorted(KINDS)}")
-    field = KINDS[saved["kind"]](**saved["settings"]).to(device)
-    field.load_state_dict(saved["state"])
-    return field.eval().requires_grad_(False)
+    return field_from_state(saved).to(device)
