@@ -22,7 +22,7 @@ from neural_sim.field.recipe import FieldRecipe
 from neural_sim.field.training import field_from_state, field_state
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.outer import SimulatorModule, learn_psi
+from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter.pose import Pose
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.views import choose_mesh_renderer, render_views

@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
+from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
-from neural_sim.outer import CachedSet, SimulatorModule, learn_psi
+from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf import NerfRenderer

@@ -7,72 +7,25 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 import lightning.pytorch as pl
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
-from neural_sim.detector.targets import Targets
-from neural_sim.detector.training import cached_features, train_detector
-from neural_sim.gradient.base import IndexedLoss, ObjectImages, RenderedPath
+from neural_sim.detector.training import train_detector
+from neural_sim.gradient.base import ObjectImages
 from neural_sim.gradient.estimators import Estimator, Losses, Probes
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
+from neural_sim.outer.binding import bound_losses, object_images
+from neural_sim.outer.records import IterationRecord, LearnedPsi
 from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.types import LabelledImages
-
-
-@dataclass(frozen=True)
-class IterationRecord:
-    """What one outer iteration did; probabilities are those the images were drawn from, before the step."""
-
-    probabilities: list[list[float]]
-    entropies: list[float]
-    gradient_norms: list[float]
-    signal_to_noise: list[float]
-    validation_loss: float
-    training_loss: float
-    stationarity: float
-    solver_status: str
-    solver_steps: int
-    solver_residual: float
-    damping: float
-    curvature_min: float
-    curvature_max: float
-    images_without_box: int
-    seconds: dict[str, float]
-
-
-@dataclass(frozen=True)
-class CachedSet:
-    """Features of a set's images under the frozen backbone, and their targets: all the predictor's loss needs."""
-
-    detector: Detector
-    features: tuple[Tensor, ...]
-    targets: Targets
-
-    @staticmethod
-    def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
-        features = cached_features(detector, backbone, images.images)
-        return CachedSet(detector, features, detector.assign(images.boxes, images.labels))
-
-    def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
-        """Losses of the images ``index``."""
-        rows = tuple(level[index] for level in self.features)
-        return self.detector.per_image_loss(params, rows, self.targets.select(index))
-
-    def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
-        """The mean loss as a sum over chunks."""
-        count = len(self.targets)
-        return [
-            lambda params, rows=rows: self.losses(params, rows).sum() / count
-            for rows in torch.arange(count).split(chunk_size)
-        ]
 
 
 @contextmanager
@@ -172,22 +125,12 @@ class SimulatorModule(pl.LightningModule):
         wanted = self.settings.curvature_images
         subset = torch.randperm(count, generator=self.generator)[:wanted] if 0 < wanted < count else None
         inner = InnerProblem(trainable, cached.losses, weights, subset=subset)
-        probe_losses: IndexedLoss | None = self._probe_set.losses if self._probe_set else None
-        losses = Losses(cached.losses, self._losses_of_images(cached.targets), probe_losses)
-        estimates, first = {}, 0
-        for label, part in enumerate(rendered):
-            index = torch.arange(first, first + len(part.images))
-            first += len(part.images)
-            held = ObjectImages(
-                psi=self.psi[label].detach().to(part.rgb.dtype),
-                log_probabilities=self.scene.pose.log_probabilities,
-                images=part.images.images,
-                index=index,
-                weights=weights[index],
-                draw=part.draw,
-                path=self._path(label, part) if self.estimator.relaxed else None,
-            )
-            estimates[self.scene.names[label]] = self._bind(losses, held, self._probes.get(label))
+        losses = bound_losses(cached, self._backbone, self._probe_set)
+        held = object_images(self.scene, rendered, self.psi, weights, self.estimator.relaxed)
+        estimates = {
+            name: self._bind(losses, part, self._probes.get(label))
+            for label, (name, part) in enumerate(held.items())
+        }
         result = hypergradient(
             inner, self._validation.mean_terms(), estimates, self.solver, self.generator, self._adjoint
         )
@@ -197,30 +140,6 @@ class SimulatorModule(pl.LightningModule):
     def _bind(self, losses: Losses, held: ObjectImages, probes: Probes | None) -> Callable:
         _, trainable = self.detector.split(self.theta)
         return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
-
-    def _losses_of_images(self, targets: Targets) -> Callable[[Parameters, Tensor, Tensor], Tensor]:
-        def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
-            features = self.detector.features(self._backbone, chunk)
-            return self.detector.per_image_loss(params, features, targets.select(index))
-
-        return losses
-
-    def _path(self, label: int, part: RenderedObject) -> RenderedPath:
-        scene, noise = self.scene, part.noise
-        if noise is None:
-            raise ValueError("pathwise: these images were not drawn from psi afresh")
-
-        def compose(rgb: Tensor, opacity: Tensor) -> Tensor:
-            return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins).images
-
-        return RenderedPath(
-            relaxed=lambda psi: scene.pose.relaxed(psi, noise),
-            render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
-            compose=compose,
-            camera=scene.camera,
-            rgb=part.rgb,
-            opacity=part.opacity,
-        )
 
     def _draw_images(self) -> list[RenderedObject]:
         count, labels = self.settings.images_per_object, range(len(self.scene.names))
@@ -271,15 +190,6 @@ class SimulatorModule(pl.LightningModule):
             seconds=seconds,
         )
         self.records.append(record)
-
-
-@dataclass(frozen=True)
-class LearnedPsi:
-    """The loop's outcome. ``last`` is what the method reports; ``best`` had the lowest validation loss."""
-
-    last: Float[Tensor, "objects k"]
-    best: Float[Tensor, "objects k"]
-    records: list[IterationRecord] = field(default_factory=list)
 
 
 def learn_psi(module: SimulatorModule, progress: bool) -> LearnedPsi:

@@ -1,0 +1,42 @@
+"""A labelled set under a frozen backbone: its features are computed once for all losses, products and scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.targets import Targets
+from neural_sim.detector.training import cached_features
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class CachedSet:
+    """Features of a set's images under the frozen backbone, and their targets: all the predictor's loss needs."""
+
+    detector: Detector
+    features: tuple[Tensor, ...]
+    targets: Targets
+
+    @staticmethod
+    def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
+        features = cached_features(detector, backbone, images.images)
+        return CachedSet(detector, features, detector.assign(images.boxes, images.labels))
+
+    def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
+        """Losses of the images ``index``."""
+        rows = tuple(level[index] for level in self.features)
+        return self.detector.per_image_loss(params, rows, self.targets.select(index))
+
+    def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
+        """The mean loss as a sum over chunks."""
+        count = len(self.targets)
+        return [
+            lambda params, rows=rows: self.losses(params, rows).sum() / count
+            for rows in torch.arange(count).split(chunk_size)
+        ]

@@ -1,0 +1,1 @@
+"""The psi loop: render, train, hypergradient, step (paper, Sec. 3)."""

@@ -1,0 +1,38 @@
+"""What the psi loop leaves: one record an iteration, and the distributions it found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """What one outer iteration did; probabilities are those the images were drawn from, before the step."""
+
+    probabilities: list[list[float]]
+    entropies: list[float]
+    gradient_norms: list[float]
+    signal_to_noise: list[float]
+    validation_loss: float
+    training_loss: float
+    stationarity: float
+    solver_status: str
+    solver_steps: int
+    solver_residual: float
+    damping: float
+    curvature_min: float
+    curvature_max: float
+    images_without_box: int
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class LearnedPsi:
+    """The loop's outcome. ``last`` is what the method reports; ``best`` had the lowest validation loss."""
+
+    last: Float[Tensor, "objects k"]
+    best: Float[Tensor, "objects k"]
+    records: list[IterationRecord] = field(default_factory=list)
