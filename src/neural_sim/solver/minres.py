@@ -42,15 +42,28 @@ class MinimumResidual(LinearSolver):
                 return Iterate(value, Status.MAX_STEPS, steps)
             cycle = _cycle(operator, residual, tolerance, max_steps - steps)
             steps += cycle.steps
-            after = rhs - operator(value + cycle.value)
+            candidate = value + cycle.value
+            after = rhs - operator(candidate)
             reached = norm(after)
             if cycle.least is not None and reached > self.restart_gain * cycle.least_norm:
-                return Iterate(value + cycle.least, Status.LEAST_SQUARES, steps)
-            if reached > (self.restart_gain if cycle.converged else 1.0) * size:
-                best = value + cycle.value if reached < size else value
-                return Iterate(best, Status.STAGNATED, steps)
-            value, residual, size = value + cycle.value, after, reached
+                least = value + cycle.least
+                left = rhs - operator(least)
+                if norm(left) > tolerance and _minimises(operator, left):
+                    return Iterate(least, Status.LEAST_SQUARES, steps)
+                if norm(left) < reached:
+                    candidate, after, reached = least, left, norm(left)
+            if reached > max(tolerance, (self.restart_gain if cycle.converged else 1.0) * size):
+                return Iterate(candidate if reached < size else value, Status.STAGNATED, steps)
+            value, residual, size = candidate, after, reached
         return Iterate(value, Status.CONVERGED, steps)
+
+
+def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
+    """Whether ``|A r| <= 10 sqrt(eps) |A| |r|`` of the true residual: the recurrence's own estimate is of a residual
+    that rounding no longer lets it reach where the condition number exceeds 1 / sqrt(eps).
+    """
+    limit = 10.0 * torch.finfo(residual.dtype).eps ** 0.5 * max(abs(end) for end in operator.curvature)
+    return norm(operator(residual)) <= limit * norm(residual)
 
 
 @dataclass(frozen=True)
