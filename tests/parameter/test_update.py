@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neural_sim.parameter.update import SGD, Adam, Mirror, bound
+from neural_sim.parameter.update import SGD, Adam, Mirror, UpdateState, bound, told_from_noise
 
 
 def test_bound_keeps_direction_and_limits_size():
@@ -19,11 +19,11 @@ def test_sgd_matches_torch():
     reference = torch.nn.Parameter(psi.clone())
     optimiser = torch.optim.SGD([reference], lr=0.01, momentum=0.9)
     update = SGD(learning_rate=0.01, momentum=0.9, max_step=10.0)
-    state = update.start(psi)
+    state = UpdateState.zeros(psi)
     for gradient in torch.tensor(
         [[[1.0, -0.5, -0.5]], [[0.2, 0.3, -0.5]], [[0.0, 1.0, -1.0]]], dtype=torch.float64
     ):
-        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, state)
+        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, torch.zeros_like(psi), state)
         reference.grad = gradient.clone()
         optimiser.step()
     torch.testing.assert_close(psi, reference.detach())
@@ -34,9 +34,9 @@ def test_adam_matches_torch_up_to_centring():
     reference = torch.nn.Parameter(psi.clone())
     optimiser = torch.optim.Adam([reference], lr=0.01, betas=(0.8, 0.95), eps=1e-12)
     update = Adam(learning_rate=0.01, max_step=10.0)
-    state = update.start(psi)
+    state = UpdateState.zeros(psi)
     for gradient in torch.tensor([[[1.0, -0.5, -0.5]], [[0.2, 0.3, -0.5]]], dtype=torch.float64):
-        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, state)
+        psi, state = update.step(psi, torch.log_softmax(psi, -1), gradient, torch.zeros_like(psi), state)
         reference.grad = gradient.clone()
         optimiser.step()
     expected = reference.detach() - reference.detach().mean()
@@ -50,7 +50,7 @@ def test_mirror_step_is_exponentiated_gradient():
     p = log_p.exp()
     gradient = p * (slope - (p * slope).sum())
     update = Mirror(learning_rate=0.05, momentum=0.0, max_step=10.0)
-    moved, _ = update.step(log_p, log_p, gradient, update.start(log_p))
+    moved, _ = update.step(log_p, log_p, gradient, torch.zeros_like(log_p), UpdateState.zeros(log_p))
     centred = slope - slope.mean()
     eta = 0.05 / centred.square().mean().sqrt()
     expected = torch.softmax(log_p - eta * slope, -1)
@@ -61,11 +61,11 @@ def test_mirror_step_is_exponentiated_gradient():
 def test_each_finds_the_best_bin(update):
     cost = torch.tensor([[0.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 1.0]], dtype=torch.float64)
     psi = torch.log(torch.tensor([[0.02, 0.94, 0.02, 0.02]], dtype=torch.float64)).repeat(2, 1)
-    state = update.start(psi)
+    state = UpdateState.zeros(psi)
     for _ in range(40):
         log_p = torch.log_softmax(psi, -1)
         gradient = log_p.exp() * (cost - (log_p.exp() * cost).sum(-1, keepdim=True))
-        psi, state = update.step(psi, log_p, gradient, state)
+        psi, state = update.step(psi, log_p, gradient, torch.zeros_like(psi), state)
     assert psi.argmax(-1).tolist() == [0, 2]
 
 
@@ -76,9 +76,39 @@ def test_each_finds_the_best_bin(update):
 def test_steps_are_finite_and_bounded_whatever_the_scale(update, scale):
     psi = torch.zeros(1, 4, dtype=torch.float64)
     gradient = scale * torch.tensor([[1.0, -2.0, 0.5, 0.5]], dtype=torch.float64)
-    moved, _ = update.step(psi, torch.log_softmax(psi, -1), gradient, update.start(psi))
+    moved, _ = update.step(
+        psi, torch.log_softmax(psi, -1), gradient, torch.zeros_like(psi), UpdateState.zeros(psi)
+    )
     assert torch.isfinite(moved).all()
     assert moved.abs().max() <= update.max_step * (1 + 1e-12)
+
+
+def test_directions_are_shrunk_by_what_is_noise():
+    direction = torch.tensor([[3.0, -4.0], [0.3, -0.4], [0.0, 0.0], [3.0, -4.0]], dtype=torch.float64)
+    variance = torch.tensor([[2.0, 3.0], [2.0, 3.0], [1.0, 1.0], [torch.inf, 1.0]], dtype=torch.float64)
+    expected = torch.tensor([[0.8], [0.0], [0.0], [1.0]], dtype=torch.float64)
+    torch.testing.assert_close(told_from_noise(direction, variance), expected)
+
+
+def test_mirror_holds_an_object_of_pure_noise_and_moves_the_other():
+    """One object's gradient is noise of the stated size, the other's has a mean that averaging reveals."""
+    generator = torch.Generator().manual_seed(0)
+    update, psi = Mirror(learning_rate=0.3, momentum=0.8), torch.zeros(2, 8, dtype=torch.float64)
+    mean = torch.zeros(2, 8, dtype=torch.float64)
+    mean[1, 0] = -0.1
+    ends = {}
+    for shrink in (True, False):
+        update, moved = Mirror(learning_rate=0.3, momentum=0.8, shrink=shrink), psi.clone()
+        state = UpdateState.zeros(moved)
+        for _ in range(30):
+            p = torch.softmax(moved, -1)
+            error = 0.1 * p
+            noise = 0.1 * torch.randn(2, 8, generator=generator, dtype=torch.float64)
+            moved, state = update.step(moved, p.log(), p * (mean + noise), error, state)
+        ends[shrink] = torch.softmax(moved, -1)
+    assert ends[True][1].argmax() == 0
+    drift = {s: (p[0] - 0.125).abs().sum() for s, p in ends.items()}
+    assert drift[True] < 0.6 * drift[False]
 
 
 @pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0), lambda: Adam(betas=(1.0, 0.9)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -11,11 +11,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class UpdateState:
-    """What an update carries between steps: first and second moments of the direction, and the step count."""
+    """What an update carries between steps: moments of the direction, its noise variance, and the step count."""
 
     first: Float[Tensor, "objects k"]
     second: Float[Tensor, "objects k"]
+    noise: Float[Tensor, "objects k"]
     steps: int = 0
+
+    @staticmethod
+    def zeros(psi: Float[Tensor, "objects k"]) -> UpdateState:
+        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
 def _check(learning_rate: float, max_step: float, **rates: float) -> None:
@@ -46,16 +51,13 @@ class SGD:
     def __post_init__(self) -> None:
         _check(self.learning_rate, self.max_step, momentum=self.momentum)
 
-    def start(self, psi: Tensor) -> UpdateState:
-        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
-
     def step(
-        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
         """psi after one step, and the state to pass to the next."""
         velocity = self.momentum * state.first + gradient
         moved = psi + bound(-self.learning_rate * velocity, self.max_step)
-        return moved, UpdateState(velocity, state.second, state.steps + 1)
+        return moved, UpdateState(velocity, state.second, state.noise, state.steps + 1)
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,8 @@ class Adam:
     def __post_init__(self) -> None:
         _check(self.learning_rate, self.max_step, beta1=self.betas[0], beta2=self.betas[1])
 
-    def start(self, psi: Tensor) -> UpdateState:
-        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
-
     def step(
-        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
         """psi after one step, and the state to pass to the next."""
         beta1, beta2 = self.betas
@@ -83,9 +82,8 @@ class Adam:
         second = beta2 * state.second + (1 - beta2) * gradient.square()
         unbiased = first / (1 - beta1**steps)
         scale = (second / (1 - beta2**steps)).sqrt() + self.epsilon
-        return psi + bound(-self.learning_rate * unbiased / scale, self.max_step), UpdateState(
-            first, second, steps
-        )
+        moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
+        return moved, UpdateState(first, second, state.noise, steps)
 
 
 @dataclass(frozen=True)
@@ -96,33 +94,50 @@ class Mirror:
     a bin that p has left gets as long a step as one it favours. Momentum averages the direction; its scale is taken out
     by a running root mean square over all objects and bins, so that ``learning_rate`` is in logits per
     step whatever the units of the loss.
+
+    ``shrink`` scales each object's averaged direction by max(0, 1 - its noise variance / its square), the positive-part
+    rule of James and Stein (1961): an object whose direction cannot be told from noise stays where it is, and
+    the average of several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
     """
 
     learning_rate: float = 0.4
     momentum: float = 0.6
     max_step: float = 0.8
-    scale_memory: float = field(default=0.9)
+    scale_memory: float = 0.9
+    shrink: bool = True
 
     def __post_init__(self) -> None:
         _check(self.learning_rate, self.max_step, momentum=self.momentum, scale_memory=self.scale_memory)
 
-    def start(self, psi: Tensor) -> UpdateState:
-        return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi))
-
     def step(
-        self, psi: Tensor, log_p: Tensor, gradient: Tensor, state: UpdateState
+        self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
         """psi after one step, and the state to pass to the next."""
-        steps = state.steps + 1
-        direction = gradient / log_p.exp()
+        steps, rest = state.steps + 1, 1 - self.momentum
+        p = log_p.exp()
+        direction = gradient / p
         direction = direction - direction.mean(-1, keepdim=True)
         memory = self.scale_memory
         second = memory * state.second + (1 - memory) * direction.square().mean().expand_as(psi)
         scale = (second / (1 - memory**steps)).sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
-        velocity = self.momentum * state.first + (1 - self.momentum) * direction
-        unbiased = velocity / (1 - self.momentum**steps)
+        velocity = self.momentum * state.first + rest * direction
+        noise = self.momentum**2 * state.noise + rest**2 * (standard_error / p).square()
+        kept = told_from_noise(velocity, noise) if self.shrink else 1.0
+        unbiased = kept * velocity / (1 - self.momentum**steps)
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
-        return moved, UpdateState(velocity, second, steps)
+        return moved, UpdateState(velocity, second, noise, steps)
+
+
+def told_from_noise(
+    direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]
+) -> Float[Tensor, "objects 1"]:
+    """max(0, 1 - sum of the variances / squared norm) per object; 1 where a variance is not finite, 0 for a zero
+    direction.
+    """
+    squares = direction.square().sum(-1, keepdim=True)
+    noise = variance.sum(-1, keepdim=True)
+    kept = 1.0 - noise / squares.clamp_min(torch.finfo(squares.dtype).tiny)
+    return torch.where(torch.isfinite(noise), kept.clamp(0.0, 1.0), torch.ones_like(kept))
 
 
 Update = SGD | Adam | Mirror
