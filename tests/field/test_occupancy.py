@@ -70,6 +70,16 @@ def test_rays_along_an_axis_and_rays_that_miss(generator: torch.Generator) -> No
     assert len(nothing) == 0 and nothing.starts.tolist() == [0, 0]
 
 
+def test_a_camera_too_far_to_count_its_steps_is_refused_instead_of_walking_for_ever() -> None:
+    field = GridField().eval()
+    field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -1.0), 0.5)
+    towards = torch.tensor([[-1.0, 0.0, 0.0]])
+    assert len(field.sample(Rays(torch.tensor([[1e6, 0.1, 0.2]]), towards), 0.0)) > 0
+    with pytest.raises(ValueError, match="closer"):
+        field.sample(Rays(torch.tensor([[1e8, 0.1, 0.2]]), towards), 0.0)
+    assert len(field.sample(Rays(torch.tensor([[1e8, 9.0, 9.0]]), towards), 0.0)) == 0
+
+
 def test_termination_drops_only_what_light_does_not_reach(generator: torch.Generator) -> None:
     field = field_with(torch.ones(8, 8, 8, dtype=torch.bool), 0.25)
     with torch.no_grad():

@@ -49,7 +49,8 @@ def march(
 ) -> None:
     """Walk rays of shape (rays, 3) through the grid and show ``visit`` every wave that may hold occupied cells.
 
-    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance.
+    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. Raises ValueError where
+    a ray starts so far away that its arithmetic cannot tell one lattice step from the next (float32: 2^22 steps).
     """
     front = _enter(rays, occupancy, step, phase)
     distance = occupancy.distance.flatten()
@@ -92,6 +93,13 @@ def _enter(rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "
     far = torch.maximum(to_low, to_high).amin(-1) * unit
     phases = torch.as_tensor(phase, dtype=origin.dtype, device=origin.device).expand(len(origin))
     first, last = (near - phases).ceil().clamp_min(0.0), (far - phases).floor()
+    met, limit = last[first <= last], 0.5 / torch.finfo(origin.dtype).eps
+    farthest = float(met.amax()) if len(met) else 0.0
+    if farthest > limit:
+        raise ValueError(
+            f"march: the grid lies {farthest:.3g} steps of {step:.3g} from a ray's origin, {origin.dtype} counts to "
+            f"{limit:.3g}; bring the camera closer"
+        )
     number = torch.arange(len(origin), device=origin.device)
     return _Front(number, first, last, origin, slope, phases).keep(first <= last, first)
 
