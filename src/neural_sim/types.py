@@ -55,6 +55,14 @@ class PosedViews:
 
 
 @dataclass(frozen=True)
+class Maps:
+    """One array per rendered map, premultiplied colour and opacity: values, tangents or cotangents."""
+
+    rgb: Float[Tensor, "n h w 3"]
+    opacity: Float[Tensor, "n h w"]
+
+
+@dataclass(frozen=True)
 class LabelledImages:
     """Images with boxes. Rows of ``boxes`` whose label is -1 are padding.
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.gradient.base import ObjectImages, RenderedPath
+from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem
-from neural_sim.types import PinholeCamera, Rays, SceneDraw
+from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 DOUBLE = torch.float64
 CAMERA = PinholeCamera(width=3, height=2, field_of_view=math.radians(40.0))
@@ -30,6 +32,20 @@ def render(draw: SceneDraw):
     flat = Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3))
     rgb, opacity = render_rays(flat)
     return rgb.view(len(draw), 2, 3, 3), opacity.view(len(draw), 2, 3)
+
+
+def tangents(draw: SceneDraw, names=("phi", "rho", "distance")):
+    """Derivatives of the maps by each named number, by generic forward mode through everything."""
+
+    def maps(number, name):
+        return render(dataclasses.replace(draw, **{name: number}))
+
+    found = {}
+    for name in names:
+        number = getattr(draw, name)
+        _, rates = torch.func.jvp(lambda x, n=name: maps(x, n), (number,), (torch.ones_like(number),))
+        found[name] = Maps(*rates)
+    return found
 
 
 class Bilevel:
@@ -97,6 +113,22 @@ class Bilevel:
 
         basis = step * torch.eye(len(self.psi), dtype=DOUBLE)
         return torch.stack([(outer(self.psi + e) - outer(self.psi - e)) / (2 * step) for e in basis])
+
+
+@pytest.fixture
+def pathwise():
+    """The pathwise estimate of one object's images from the losses of images."""
+
+    def estimate(loss_of, params, vector, batch, **settings):
+        losses = Losses(lambda p, rows: loss_of(p, batch.images[rows], rows), loss_of)
+        return PathwiseEstimator(**settings).estimate(losses, params, vector, batch, None)
+
+    return estimate
+
+
+@pytest.fixture
+def stand_in_tangents():
+    return tangents
 
 
 @pytest.fixture

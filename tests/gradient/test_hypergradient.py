@@ -9,13 +9,12 @@ import torch
 
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
-from neural_sim.gradient.pathwise import Pathwise
 from neural_sim.gradient.stratified import importance_weights, stratified
-from neural_sim.gradient.tangents import moved_by, render_with_tangents
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
 from neural_sim.solver.solution import Status
+from neural_sim.synthesis.motion import moved_by
 
 DOUBLE = torch.float64
 EXACT = AdjointSolver(ConjugateGradient(), FixedDamping(0.0), rtol=1e-12, max_steps=200)
@@ -28,12 +27,12 @@ def solve(problem, inner, estimate, solver=EXACT):
 
 
 @pytest.mark.parametrize("patch_size", [1, 4, 1000])
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_pathwise_hypergradient_is_the_retrained_derivative(problem, patch_size, mode):
+@pytest.mark.parametrize("theta_mode", ["forward", "reverse"])
+def test_pathwise_hypergradient_is_the_retrained_derivative(problem, pathwise, patch_size, theta_mode):
     batch = problem.object_images()
-    settings = Pathwise(patch_size=patch_size, chunk_size=3, mode=mode)
+    settings = {"patch_size": patch_size, "chunk_size": 3, "theta_mode": theta_mode}
     inner = problem.inner(batch.images)
-    result = solve(problem, inner, lambda v: settings.estimate(problem.loss_of, inner.params, v, batch))
+    result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch, **settings))
     assert result.solution.status.trusted
     assert result.stationarity < 1e-12
     torch.testing.assert_close(
@@ -41,24 +40,23 @@ def test_pathwise_hypergradient_is_the_retrained_derivative(problem, patch_size,
     )
 
 
-def test_tangents_of_the_first_render_give_the_same_hypergradient(problem):
+def test_tangents_of_the_first_render_give_the_same_hypergradient(problem, pathwise, stand_in_tangents):
     batch = problem.object_images()
     names = moved_by(batch.path.relaxed, batch.psi)
     assert names == ("phi", "distance")
-    maps, tangents = render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, names, 5)
-    path = dataclasses.replace(batch.path, rgb=maps.rgb, opacity=maps.opacity, tangents=tangents)
+    path = dataclasses.replace(batch.path, tangents=stand_in_tangents(batch.draw, names))
     batch = dataclasses.replace(batch, path=path)
     inner = problem.inner(batch.images)
-    result = solve(problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch))
+    result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch))
     torch.testing.assert_close(
         result.psi_gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10
     )
 
 
-def test_a_step_along_the_negative_hypergradient_lowers_the_validation_loss(problem):
+def test_a_step_along_the_negative_hypergradient_lowers_the_validation_loss(problem, pathwise):
     batch = problem.object_images()
     inner = problem.inner(batch.images)
-    result = solve(problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch))
+    result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch))
     slope = result.psi_gradients["can"]
     before = problem.validation(problem.minimiser(problem.psi))
     after = problem.validation(problem.minimiser(problem.psi - 1e-4 * slope / slope.norm()))
@@ -104,13 +102,11 @@ def test_stratified_hypergradient_is_the_retrained_derivative_over_hard_bins(pro
     torch.testing.assert_close(result.psi_gradients["can"], torch.stack(outer), rtol=1e-7, atol=1e-10)
 
 
-def test_solver_and_damping_are_accounted_for(problem):
+def test_solver_and_damping_are_accounted_for(problem, pathwise):
     batch = problem.object_images()
     inner = problem.inner(batch.images)
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-8, max_steps=100)
-    result = solve(
-        problem, inner, lambda v: Pathwise().estimate(problem.loss_of, inner.params, v, batch), solver
-    )
+    result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch), solver)
     assert result.solution.status is Status.CONVERGED
     assert result.damping.condition <= 20.0 * (1 + 1e-6)
     assert set(result.seconds) == {"validation", "solve", "mixed"}

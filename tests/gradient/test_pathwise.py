@@ -8,16 +8,17 @@ import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.gradient.base import Maps, from_contributions
+from neural_sim.gradient.base import from_contributions
 from neural_sim.gradient.pathwise import (
-    Pathwise,
+    PathwiseEstimator,
     contract,
     draw_cotangents,
     map_cotangents,
     patch_rays,
     psi_contributions,
 )
-from neural_sim.gradient.tangents import moved_by, render_with_tangents
+from neural_sim.synthesis.motion import moved_by
+from neural_sim.types import Maps
 
 DOUBLE = torch.float64
 
@@ -50,8 +51,8 @@ def test_patch_rays_are_the_cameras_rays(problem):
     torch.testing.assert_close(part.directions, whole.directions.reshape(-1, 3)[pixels])
 
 
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_mixed_derivative_equals_autograd_through_everything(problem, generator, mode):
+@pytest.mark.parametrize("theta_mode", ["forward", "reverse"])
+def test_mixed_derivative_equals_autograd_through_everything(problem, pathwise, generator, theta_mode):
     batch = problem.object_images()
     params = {name: tensor + 0.1 for name, tensor in problem.minimiser(problem.psi).items()}
     vector = {
@@ -65,29 +66,16 @@ def test_mixed_derivative_equals_autograd_through_everything(problem, generator,
     slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
     along = sum((slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
-    ours = Pathwise(patch_size=4, chunk_size=2, mode=mode).estimate(problem.loss_of, params, vector, batch)
+    settings = {"patch_size": 4, "chunk_size": 2, "theta_mode": theta_mode}
+    ours = pathwise(problem.loss_of, params, vector, batch, **settings)
     torch.testing.assert_close(ours.value, reference, rtol=1e-10, atol=1e-12)
 
 
-def test_forward_mode_equals_reverse_mode(problem, maps):
+def test_tangents_equal_patches(problem, maps, stand_in_tangents):
     batch = problem.object_images()
-    rendered, tangents = render_with_tangents(
-        batch.path.render_rays, batch.path.camera, batch.draw, patch_size=5
-    )
-    torch.testing.assert_close(rendered.rgb, batch.path.rgb)
-    torch.testing.assert_close(rendered.opacity, batch.path.opacity)
     reverse = draw_cotangents(batch.path.render_rays, batch.path.camera, batch.draw, maps, 5)
-    for name, value in contract(tangents, maps).items():
+    for name, value in contract(stand_in_tangents(batch.draw), maps).items():
         assert float((value - reverse[name]).abs().max()) < 1e-8
-
-
-def test_a_render_without_tangents_is_the_plain_render(problem):
-    batch = problem.object_images()
-    rendered, tangents = render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, ())
-    torch.testing.assert_close(rendered.rgb, batch.path.rgb)
-    assert tangents == {}
-    with pytest.raises(ValueError, match="names"):
-        render_with_tangents(batch.path.render_rays, batch.path.camera, batch.draw, ("bins",))
 
 
 def test_contributions_add_up_to_the_vector_jacobian_product(problem, generator):
@@ -140,9 +128,15 @@ def test_standard_error_is_that_of_a_sum():
     assert from_contributions(rows[:1]).signal_to_noise.tolist() == [0.0, 0.0]
 
 
-def test_settings_and_missing_paths_are_refused(problem):
-    with pytest.raises(ValueError, match="patch_size"):
-        Pathwise(patch_size=0)
+@pytest.mark.parametrize(
+    "bad", [{"patch_size": 0}, {"chunk_size": 0}, {"mode": "sideways"}, {"theta_mode": "sideways"}]
+)
+def test_bad_settings_name_their_key(bad):
+    with pytest.raises(ValueError, match=f"gradient.{next(iter(bad))}"):
+        PathwiseEstimator(**bad)
+
+
+def test_images_without_a_path_are_refused(problem, pathwise):
     batch = dataclasses.replace(problem.object_images(), path=None)
     with pytest.raises(ValueError, match="path"):
-        Pathwise().estimate(problem.loss_of, {}, {}, batch)
+        pathwise(problem.loss_of, {}, {}, batch)

@@ -16,8 +16,7 @@ from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import image_cotangent, scores
-from neural_sim.gradient.pathwise import Pathwise, contract, draw_cotangents, map_cotangents
-from neural_sim.gradient.tangents import moved_by, render_with_tangents
+from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents
 from neural_sim.parameter.pose import Pose
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
@@ -28,6 +27,7 @@ from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted
 from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.motion import moved_by, pose_rates
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera, Rays
 
@@ -73,6 +73,11 @@ class Rooms:
         rgb, opacity = self.render_rays(Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)))
         return rgb.view(COUNT, 32, 32, 3), opacity.view(COUNT, 32, 32)
 
+    def tangents(self, draw, names):
+        poses, rates = cameras.orbit(draw.phi, draw.rho, draw.distance), pose_rates(draw, names)
+        _, moved = NerfRenderer(termination=0.0).render_with_tangents(self.field, CAMERA, poses, rates)
+        return dict(zip(names, moved, strict=True))
+
     def compose(self, rgb, opacity):
         return self.synthesizer.compose(rgb, opacity, self.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
 
@@ -107,7 +112,7 @@ def rooms() -> Rooms:
     return Rooms()
 
 
-def test_pathwise_equals_autograd_through_every_room(rooms):
+def test_pathwise_equals_autograd_through_every_room(rooms, pathwise):
     psi = rooms.psi.clone().requires_grad_()
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in rooms.trainable.items()}
     images = rooms.compose(*rooms.render(psi)).images
@@ -115,8 +120,8 @@ def test_pathwise_equals_autograd_through_every_room(rooms):
     slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
     along = sum((slope * rooms.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
-    ours = Pathwise(patch_size=700, chunk_size=3).estimate(
-        rooms.loss_of, rooms.trainable, rooms.vector, rooms.object_images()
+    ours = pathwise(
+        rooms.loss_of, rooms.trainable, rooms.vector, rooms.object_images(), patch_size=700, chunk_size=3
     )
     assert float(reference.norm()) > 0.0
     torch.testing.assert_close(ours.value, reference, rtol=1e-9, atol=1e-12)
@@ -130,26 +135,24 @@ def test_patches_and_tangents_agree_on_the_field(rooms):
     maps = map_cotangents(batch.path, cotangent)
     whole = draw_cotangents(rooms.render_rays, CAMERA, batch.draw, maps, 10**6)
     patches = draw_cotangents(rooms.render_rays, CAMERA, batch.draw, maps, 500)
-    _, tangents = render_with_tangents(rooms.render_rays, CAMERA, batch.draw, patch_size=500)
-    forward = contract(tangents, maps)
+    forward = contract(rooms.tangents(batch.draw, ("phi", "rho", "distance")), maps)
     for name, value in whole.items():
         assert float((patches[name] - value).abs().max()) < 1e-10
         assert float((forward[name] - value).abs().max()) < 1e-8
     assert moved_by(batch.path.relaxed, rooms.psi) == ("phi",)
 
 
-def test_tangents_replace_the_second_render(rooms):
+def test_tangents_replace_the_second_render(rooms, pathwise):
     batch = rooms.object_images()
-    names = moved_by(batch.path.relaxed, rooms.psi)
-    _, tangents = render_with_tangents(rooms.render_rays, CAMERA, batch.draw, names)
+    tangents = rooms.tangents(batch.draw, moved_by(batch.path.relaxed, rooms.psi))
 
     def refuse(rays):
         raise AssertionError("rendered twice")
 
     path = dataclasses.replace(batch.path, tangents=tangents, render_rays=refuse)
     arguments = (rooms.loss_of, rooms.trainable, rooms.vector)
-    forward = Pathwise().estimate(*arguments, dataclasses.replace(batch, path=path))
-    reverse = Pathwise().estimate(*arguments, batch)
+    forward = pathwise(*arguments, dataclasses.replace(batch, path=path))
+    reverse = pathwise(*arguments, batch)
     assert float((forward.value - reverse.value).abs().max()) < 1e-8
 
 
@@ -178,12 +181,12 @@ def test_hessian_products_of_the_detector_agree_and_are_cheap(rooms):
     assert float((products["central_difference"] - exact).norm() / exact.norm()) < 1e-5
 
 
-def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(rooms):
+def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(rooms, pathwise):
     """The whole of Eq. 2 on a detector's indefinite Hessian, against a tight solve by another method."""
     inner = InnerProblem(rooms.trainable, rooms.losses, torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE))
     validation = [lambda params: rooms.losses(params, torch.tensor([1, 3])).mean()]
     batch = rooms.object_images()
-    estimates = {"can": lambda v: Pathwise().estimate(rooms.loss_of, rooms.trainable, v, batch)}
+    estimates = {"can": lambda v: pathwise(rooms.loss_of, rooms.trainable, v, batch)}
     solver = AdjointSolver(
         ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-4, retain_graph=True
     )
@@ -214,7 +217,7 @@ def last_layers(rooms):
     return small, loss_of
 
 
-def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms):
+def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms, pathwise):
     """Poses move the images, a proximal inner problem is retrained on them by Newton's method; sign included."""
     anchor, loss_of = last_layers(rooms)
     proximal, every = 0.5, torch.arange(COUNT)
@@ -253,7 +256,7 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms):
 
     batch = rooms.object_images()
     params = minimiser(batch.images, anchor)
-    estimates = {"can": lambda v: Pathwise().estimate(loss_of, params, v, batch)}
+    estimates = {"can": lambda v: pathwise(loss_of, params, v, batch)}
     solver = AdjointSolver(
         ConjugateGradient(), FixedDamping(0.0), rtol=1e-10, max_steps=300, retain_graph=True
     )

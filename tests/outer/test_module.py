@@ -1,5 +1,7 @@
 """The psi loop on a small scene: it replays, records, and moves psi against the derivative."""
 
+import copy
+import dataclasses
 import math
 
 import pytest
@@ -9,6 +11,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.update import Mirror
@@ -18,7 +21,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import RelaxedDraws, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
@@ -52,10 +55,15 @@ def _module(scene, estimator, iterations=2):
     )  # fmt: skip
 
 
-ESTIMATORS = [PathwiseEstimator(), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()]
+ESTIMATORS = [
+    PathwiseEstimator(),
+    PathwiseEstimator("reverse"),
+    StratifiedEstimator(probes_per_bin=2),
+    ReinforceEstimator(),
+]
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
 def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     module = _module(scene, estimator)
     learned = learn_psi(module, progress=False)
@@ -85,11 +93,49 @@ def test_the_backbone_stays_frozen(scene):
 def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
     generator = torch.Generator().manual_seed(3)
     psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
-    part = scene.draw(1, psi, 4, generator, relaxed=True)
+    part = scene.draw(1, psi, 4, generator, RelaxedDraws())
     draw = scene.pose.relaxed(psi, part.noise)
     torch.testing.assert_close(draw.phi, part.draw.phi)
     again = scene.synthesizer.compose(part.rgb, part.opacity, part.nuisance, 1, part.draw.bins)
     assert torch.equal(again.images, part.images.images) and torch.equal(again.boxes, part.images.boxes)
+
+
+@pytest.mark.parametrize("bin_mean", ["linear", "circular"])
+def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean):
+    """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
+    fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
+    pose = Pose(bins=4, temperature=1.0, bin_mean=bin_mean)
+    wide = dataclasses.replace(scene, fields=fields, pose=pose)
+    generator = torch.Generator().manual_seed(1)
+    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    params = {name: value.double() for name, value in detector.init(generator).items()}
+    backbone, trainable = detector.split(params)
+    vector = {
+        name: torch.randn(value.shape, generator=generator).double() for name, value in trainable.items()
+    }
+    psi = torch.randn(2, 4, generator=generator, dtype=torch.float64)
+    forward = PathwiseEstimator(mode="forward")
+    rendered = wide.training_set(psi, 5, generator, forward.relaxed)
+    assert all(set(part.tangents) == {"phi"} for part in rendered)
+    images = join(rendered)
+    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, None)
+    weights = torch.full((10,), 0.1, dtype=torch.float64)
+    for held in object_images(wide, rendered, psi, weights).values():
+        bare = dataclasses.replace(held, path=dataclasses.replace(held.path, tangents=None))
+        for patch_size in (64, 10**6):
+            reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size)
+            found = [
+                estimator.estimate(losses, trainable, vector, batch, None).value
+                for estimator, batch in ((forward, held), (reverse, bare))
+            ]
+            assert found[0].dtype == torch.float64 and float(found[1].norm()) > 0.0
+            assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-8
+
+
+def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
+    for mode, carried in (("forward", True), ("reverse", False)):
+        drawn = _module(scene, PathwiseEstimator(mode=mode))._draw_images()
+        assert all((part.tangents is not None) is carried for part in drawn)
 
 
 def test_probes_cover_every_bin_equally(scene):

@@ -98,6 +98,31 @@ def test_forward_mode_equals_reverse_mode_through_the_pose(field: GridField) -> 
     torch.testing.assert_close(forward, reverse, atol=1e-10, rtol=1e-8)
 
 
+@pytest.mark.parametrize("rays_per_chunk", [20, 100, 10_000])
+def test_tangents_ride_along_with_the_render(field: GridField, rays_per_chunk: int) -> None:
+    """Against central differences of whole views as the camera turns, and as it goes away."""
+    camera, poses = view(7)
+    renderer = NerfRenderer(termination=0.0, rays_per_chunk=rays_per_chunk)
+    phi, ones = torch.tensor([0.3, 1.9], dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+
+    def turned(angle: torch.Tensor) -> torch.Tensor:
+        return cameras.orbit(angle, 0.5 * phi, phi + 2.5)
+
+    def zoomed(distance: torch.Tensor) -> torch.Tensor:
+        return cameras.orbit(phi, 0.5 * phi, distance)
+
+    moves = [(turned, phi), (zoomed, phi + 2.5)]
+    rates = torch.stack([torch.func.jvp(move, (number,), (ones,))[1] for move, number in moves])
+    maps, tangents = renderer.render_with_tangents(field, camera, poses, rates)
+    rgb, opacity = renderer.render(field, camera, poses)
+    torch.testing.assert_close((maps.rgb, maps.opacity), (rgb, opacity), rtol=0.0, atol=1e-12)
+    for (move, number), tangent in zip(moves, tangents, strict=True):
+        ahead, behind = (renderer.render(field, camera, move(number + step)) for step in (1e-6, -1e-6))
+        slopes = tuple((a - b) / 2e-6 for a, b in zip(ahead, behind, strict=True))
+        torch.testing.assert_close((tangent.rgb, tangent.opacity), slopes, rtol=1e-4, atol=1e-5)
+        assert float(tangent.rgb.abs().max()) > 0.1
+
+
 def test_wrong_shapes_and_settings_are_refused(field: GridField) -> None:
     with pytest.raises(ValueError, match=r"\(rays, 3\)"):
         NerfRenderer().render_rays(field, Rays(torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -40,6 +41,30 @@ class RadianceField(nn.Module, ABC):
         ``directions`` are unit and point away from the camera. Differentiable in both arguments, forward and
         reverse mode.
         """
+
+    def query_with_tangents(
+        self,
+        positions: Float[Tensor, "samples 3"],
+        directions: Float[Tensor, "samples 3"],
+        velocities: Float[Tensor, "m samples 3"],
+        turns: Float[Tensor, "m samples 3"],
+    ) -> tuple[
+        Float[Tensor, "samples"],
+        Float[Tensor, "samples 3"],
+        Float[Tensor, "m samples"],
+        Float[Tensor, "m samples 3"],
+    ]:
+        """``query``, and its m >= 1 derivatives where positions move at ``velocities`` and directions at ``turns``.
+
+        Here by Jacobian-vector products; a field that knows its own derivative overrides this.
+        """
+        values, rates = [], []
+        for velocity, turn in zip(velocities, turns, strict=True):
+            value, rate = torch.func.jvp(self.query, (positions, directions), (velocity, turn))[:2]
+            values.append(value)
+            rates.append(rate)
+        sigma_rates, rgb_rates = (torch.stack(parts) for parts in zip(*rates, strict=True))
+        return *values[0], sigma_rates, rgb_rates
 
     @abstractmethod
     def sample(self, rays: Rays, termination: float) -> PackedSamples:

@@ -8,7 +8,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neural_sim.field.base import PackedSamples, RadianceField
-from neural_sim.field.interpolation import CORNERS, interpolate, interpolate_for_training, trilinear_weights
+from neural_sim.field.interpolation import (
+    CORNERS,
+    gather_weighted,
+    interpolate,
+    interpolate_for_training,
+    trilinear_tangents,
+    trilinear_weights,
+)
 from neural_sim.field.marching import SampleCollector, lookup, march
 from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, dilate, subdivide, vertices
 from neural_sim.types import Rays
@@ -133,6 +140,32 @@ class GridField(RadianceField):
         if self.training:
             return interpolate_for_training(self.table, corners, weights)
         return interpolate(self.table, corners, weights)
+
+    @torch.no_grad()
+    def query_with_tangents(
+        self,
+        positions: Float[Tensor, "samples 3"],
+        directions: Float[Tensor, "samples 3"],
+        velocities: Float[Tensor, "m samples 3"],
+        turns: Float[Tensor, "m samples 3"],
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See the base class; in closed form but for a head, at little more than the cost of ``query``."""
+        local = (positions - self.origin) / float(self.cell)
+        base = local.floor()
+        cells = lookup(base, self.occupancy)
+        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
+        weights, rates = trilinear_tangents(local - base, velocities / float(self.cell))
+        raw = gather_weighted(self.table, corners, weights)
+        raw_rates = torch.stack([gather_weighted(self.table, corners, rate) for rate in rates])
+        slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / float(self.cell))
+        sigma, rgb = self.decode(raw, directions)
+        if self.head is None:
+            return sigma, rgb, slope * raw_rates[..., 0], (rgb * (1.0 - rgb)) * raw_rates[..., 1:4]
+        rgb_rates = [
+            torch.func.jvp(lambda *at: self.decode(*at)[1], (raw, directions), (rate, turn))[1]
+            for rate, turn in zip(raw_rates, turns, strict=True)
+        ]
+        return sigma, rgb, slope * raw_rates[..., 0], torch.stack(rgb_rates)
 
     def density(self, raw: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples"]:
         """Density sigma, per object radius, of table rows."""

@@ -23,6 +23,44 @@ def trilinear_weights(fraction: Float[Tensor, "samples 3"]) -> Float[Tensor, "sa
     return (xy[..., None] * z[:, None, None, :]).flatten(1)
 
 
+def trilinear_tangents(
+    fraction: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
+) -> tuple[Float[Tensor, "samples 8"], Float[Tensor, "m samples 8"]]:
+    """``trilinear_weights``, and their derivatives where the fraction moves at ``velocities``.
+
+    Corner by corner over all samples, so that every operation runs over contiguous memory. No derivative passes.
+    """
+    x, y, z = fraction.detach().t().contiguous().unbind(0)
+    xy = _bilinear(torch.ones_like(x), x, y, x * y)
+    rates = []
+    for velocity in velocities.detach():
+        u, v, w = velocity.t().contiguous().unbind(0)
+        moved = _bilinear(torch.zeros_like(u), u, v, torch.addcmul(u * y, v, x))
+        rate = moved.new_empty(4, 2, len(x))
+        torch.mul(moved, z, out=rate[:, 1]).addcmul_(xy, w)
+        torch.sub(moved, rate[:, 1], out=rate[:, 0])
+        rates.append(rate.flatten(0, 1).t())
+    weights = xy.new_empty(4, 2, len(x))
+    torch.mul(xy, z, out=weights[:, 1])
+    torch.sub(xy, weights[:, 1], out=weights[:, 0])
+    return weights.flatten(0, 1).t().contiguous(), torch.stack(rates).contiguous()
+
+
+def _bilinear(one: Tensor, x: Tensor, y: Tensor, xy: Tensor) -> Float[Tensor, "4 samples"]:
+    """(1 - x)(1 - y), (1 - x) y, x (1 - y), x y from the product; or their derivatives, ``one`` being 0."""
+    low_y = y - xy
+    return torch.stack([one - x - low_y, low_y, x - xy, xy])
+
+
+def gather_weighted(
+    table: Float[Tensor, "rows channels"],
+    corners: Int[Tensor, "samples 8"],
+    weights: Float[Tensor, "samples 8"],
+) -> Float[Tensor, "samples channels"]:
+    """``interpolate`` in one fused operation, several times faster; for values only."""
+    return torch.nn.functional.embedding_bag(corners, table, per_sample_weights=weights, mode="sum")
+
+
 def interpolate(
     table: Float[Tensor, "rows channels"],
     corners: Int[Tensor, "samples 8"],

@@ -31,11 +31,7 @@ def sum_rays(
 
 def transmittance(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
     """Fraction of light that reaches each sample: exp of minus the exclusive sum of sigma delta along its ray."""
-    depth = (sigma * samples.width).double()
-    exclusive = depth.cumsum(0) - depth
-    # A sentinel keeps the start of a last ray without samples inside the array; its value is never used.
-    at_start = torch.nn.functional.pad(exclusive, (0, 1)).index_select(0, samples.starts[:-1])
-    return torch.exp(at_start.index_select(0, samples.ray) - exclusive).to(sigma.dtype)
+    return torch.exp(-_exclusive((sigma * samples.width).double(), samples)).to(sigma.dtype)
 
 
 def render_weights(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
@@ -50,3 +46,37 @@ def composite(
     weights = render_weights(sigma, samples)[:, None]
     pixels = sum_rays(torch.cat([weights * rgb, weights], -1), samples)
     return pixels[:, :3], pixels[:, 3]
+
+
+def composite_with_tangents(
+    sigma: Float[Tensor, "samples"],
+    rgb: Float[Tensor, "samples 3"],
+    sigma_rates: Float[Tensor, "m samples"],
+    rgb_rates: Float[Tensor, "m samples 3"],
+    samples: PackedSamples,
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
+    """``composite`` as RGBA, and its derivatives where densities and colours change at the given rates.
+
+    With tau = sigma delta and D its exclusive sum along the ray, the weight T alpha changes at
+    T (exp(-tau) tau' - alpha D'). Distances and widths are constants.
+    """
+    passed = transmittance(sigma, samples)
+    alpha = alpha_from_sigma(sigma, samples.width)
+    weights = passed * alpha
+    held = passed * torch.exp(-sigma * samples.width)
+    parts = [weights[:, None] * rgb, weights[:, None]]
+    for sigma_rate, rgb_rate in zip(sigma_rates, rgb_rates, strict=True):
+        depth_rate = sigma_rate * samples.width
+        rate = held * depth_rate - weights * _exclusive(depth_rate, samples)
+        parts += [torch.addcmul(rate[:, None] * rgb, weights[:, None], rgb_rate), rate[:, None]]
+    pixels = sum_rays(torch.cat(parts, -1), samples).unflatten(-1, (-1, 4))
+    return pixels[:, 0], pixels[:, 1:].movedim(1, 0)
+
+
+def _exclusive(values: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
+    """Sum of the values before each sample along its ray."""
+    wide = values.double()
+    exclusive = wide.cumsum(0) - wide
+    # A sentinel keeps the start of a last ray without samples inside the array; its value is never used.
+    at_start = torch.nn.functional.pad(exclusive, (0, 1)).index_select(0, samples.starts[:-1])
+    return (exclusive - at_start.index_select(0, samples.ray)).to(values.dtype)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.field.base import PackedSamples, RadianceField
-from neural_sim.field.quadrature import composite
+from neural_sim.field.quadrature import composite, composite_with_tangents
 from neural_sim.types import PinholeCamera, Rays
 
 
@@ -35,6 +35,22 @@ def render_packed(
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
     """``render_samples`` on the samples that the field itself chooses."""
     return render_samples(field, rays, field.sample(rays, termination))
+
+
+@torch.no_grad()
+def render_with_tangents(
+    field: RadianceField, rays: Rays, rates: Rays, termination: float
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
+    """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
+
+    One pass over the samples gives both: a sample at distance t moves at o' + t d'.
+    """
+    samples = field.sample(rays, termination)
+    positions, directions = sample_points(rays, samples)
+    turns = rates.directions.index_select(1, samples.ray)
+    velocities = torch.addcmul(rates.origins.index_select(1, samples.ray), turns, samples.distance[:, None])
+    queried = field.query_with_tangents(positions, directions, velocities, turns)
+    return composite_with_tangents(*queried, samples)
 
 
 @torch.no_grad()

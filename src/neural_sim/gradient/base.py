@@ -13,11 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.types import PinholeCamera, Rays, SceneDraw
+from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 Params = dict[str, Tensor]
-CONTINUOUS = ("phi", "rho", "distance")
-"""The numbers of a ``SceneDraw`` that images depend on smoothly."""
 
 
 class IndexedLoss(Protocol):
@@ -35,11 +33,20 @@ class ImageLoss(Protocol):
 
 
 @dataclass(frozen=True)
-class Maps:
-    """One array per rendered map, premultiplied colour and opacity: values, tangents or cotangents."""
+class Probes:
+    """Images of one object drawn from every bin on purpose: their rows among all probes, and their bins."""
 
-    rgb: Float[Tensor, "n h w 3"]
-    opacity: Float[Tensor, "n h w"]
+    index: Int[Tensor, "m"]
+    bins: Int[Tensor, "m"]
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Per-image losses of the training images (from cached features, and from the images), and of the probes."""
+
+    cached: IndexedLoss
+    from_images: ImageLoss
+    probes: IndexedLoss | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
 
-Mode = Literal["forward", "reverse"]
+ThetaMode = Literal["forward", "reverse"]
 
 
 def scores(
@@ -24,7 +24,7 @@ def scores(
     vector: Params,
     index: Int[Tensor, "n"],
     chunk_size: int = 32,
-    mode: Mode = "forward",
+    mode: ThetaMode = "forward",
 ) -> Float[Tensor, "n"]:
     """``s_i = <dl_i/dtheta, v>`` of the images in ``index``, at most ``chunk_size`` of them in memory at a
     time.
@@ -49,7 +49,7 @@ def image_cotangent(
     index: Int[Tensor, "n"],
     weights: Float[Tensor, "n"],
     chunk_size: int = 16,
-    mode: Mode = "forward",
+    mode: ThetaMode = "forward",
 ) -> Float[Tensor, "n 3 h w"]:
     """``d/dx <d(sum_i w_i l_i)/dtheta, v>``, the cotangent of every image (left factor of Eq. 9 times v).
 
@@ -93,7 +93,7 @@ def _reverse_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"
 
 
 def _check(mode: str, chunk_size: int) -> None:
-    if mode not in get_args(Mode):
-        raise ValueError(f"gradient: mode must be one of {get_args(Mode)}, got {mode!r}")
+    if mode not in get_args(ThetaMode):
+        raise ValueError(f"gradient: mode must be one of {get_args(ThetaMode)}, got {mode!r}")
     if chunk_size < 1:
         raise ValueError(f"gradient: chunk_size must be at least 1, got {chunk_size}")

@@ -1,15 +1,17 @@
-"""The paper's estimator, in reverse mode: Tools 1 to 3 (Sec. 3.1, Eq. 9 and its patch-wise form).
+"""The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eq. 9).
 
-First forward: images without derivatives (the caller's). Then v and the images' cotangents. Second forward:
-rays of one patch at a time, replayed from the same draw, each backward at once into the draw's few numbers
-per image. The chain from psi to the draw is walked once, at the end. Where the first render carried tangents
-(``tangents.py``), they are contracted instead, and there is no second forward.
+Reverse mode is the paper's. First forward: images without derivatives (the scene's). Then v and the images' cotangents.
+Second forward: rays of one patch at a time, replayed from the same draw, each backward at once into the draw's few
+numbers per image. Forward mode: V has a few numbers per image and an image has thousands, so the first render carries
+the maps' derivatives by the numbers that psi moves, and there is neither a second render nor a patch; the cotangents
+are contracted with them. Either way the chain from psi to the draw is walked once, at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -17,53 +19,79 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.gradient.base import (
-    CONTINUOUS,
-    ImageLoss,
-    Maps,
+    Losses,
     MixedDerivative,
     ObjectImages,
     Params,
+    Probes,
     RenderedPath,
     from_contributions,
 )
-from neural_sim.gradient.mixed import Mode, image_cotangent
-from neural_sim.types import PinholeCamera, Rays, SceneDraw
+from neural_sim.gradient.mixed import ThetaMode, image_cotangent
+from neural_sim.synthesis.motion import CONTINUOUS
+from neural_sim.synthesis.scene import RelaxedDraws
+from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
+Mode = Literal["forward", "reverse"]
 RenderRays = Callable[[Rays], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
-class Pathwise:
-    """Settings of the reverse pathwise estimator: rays in a patch, images in a chunk, mode of the theta derivative."""
+class PathwiseEstimator:
+    """Relaxed draws, differentiated through the renderer.
 
+    Args:
+        mode: how images are differentiated by V. ``forward``: along with the first render; ``reverse``: the paper's
+            second forward, patch by patch.
+        patch_size: rays in a patch of the reverse mode.
+        chunk_size: images whose losses are differentiated at a time.
+        theta_mode: how the inner derivative of the loss, in theta along v, is taken.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    probes_per_bin: ClassVar[int] = 0
+    mode: Mode = "forward"
     patch_size: int = 4096
     chunk_size: int = 16
-    mode: Mode = "forward"
+    theta_mode: ThetaMode = "forward"
 
     def __post_init__(self) -> None:
-        if self.patch_size < 1 or self.chunk_size < 1:
-            raise ValueError(
-                f"pathwise: patch_size and chunk_size must be positive, got {self.patch_size}, {self.chunk_size}"
-            )
+        for key, modes in (("mode", get_args(Mode)), ("theta_mode", get_args(ThetaMode))):
+            if getattr(self, key) not in modes:
+                raise ValueError(f"gradient.{key} must be one of {modes}, got {getattr(self, key)!r}")
+        for key in ("patch_size", "chunk_size"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
+
+    @property
+    def relaxed(self) -> RelaxedDraws:
+        """How this estimator's images are drawn."""
+        return RelaxedDraws(tangents=self.mode == "forward")
 
     def estimate(
-        self, loss_of: ImageLoss, params: Params, vector: Params, object_images: ObjectImages
+        self, losses: Losses, params: Params, vector: Params, images: ObjectImages, probes: Probes | None
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` through the images. Raises ``ValueError`` if they carry no path."""
-        path, here = object_images.path, object_images
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+
+        Tangents that came with the images are used whatever the mode. Raises ``ValueError`` for images without a path.
+        """
+        path = images.path
         if path is None:
             raise ValueError(
                 "pathwise: these images carry no rendered path, which this estimator differentiates"
             )
         cotangent = image_cotangent(
-            loss_of, params, vector, here.images, here.index, here.weights, self.chunk_size, self.mode
-        )
+            losses.from_images, params, vector, images.images, images.index, images.weights,
+            self.chunk_size, self.theta_mode,
+        )  # fmt: skip
         maps = map_cotangents(path, cotangent)
         if path.tangents is not None:
             along_draw = contract(path.tangents, maps)
         else:
-            along_draw = draw_cotangents(path.render_rays, path.camera, here.draw, maps, self.patch_size)
-        return from_contributions(psi_contributions(path.relaxed, here.psi, along_draw))
+            along_draw = draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
+        return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw))
 
 
 def map_cotangents(path: RenderedPath, image_cotangents: Float[Tensor, "n 3 h w"]) -> Maps:

@@ -10,8 +10,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
-from neural_sim.gradient.base import ObjectImages, RenderedPath
-from neural_sim.gradient.estimators import Losses
+from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.synthesis.scene import RenderedObject, Scene
 
 
@@ -46,13 +45,14 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPat
         camera=scene.camera,
         rgb=part.rgb,
         opacity=part.opacity,
+        tangents=part.tangents,
     )
 
 
 def object_images(
-    scene: Scene, rendered: list[RenderedObject], psi: Tensor, weights: Tensor, relaxed: bool
+    scene: Scene, rendered: list[RenderedObject], psi: Tensor, weights: Tensor
 ) -> dict[str, ObjectImages]:
-    """Every object's images by name, with their rows in the joined training set; a path where ``relaxed``."""
+    """Every object's images by name, with their rows in the joined training set; a path where draws are relaxed."""
     bound, first = {}, 0
     for label, part in enumerate(rendered):
         index = torch.arange(first, first + len(part.images))
@@ -64,6 +64,6 @@ def object_images(
             index=index,
             weights=weights[index],
             draw=part.draw,
-            path=rendered_path(scene, label, part) if relaxed else None,
+            path=rendered_path(scene, label, part) if part.relaxed else None,
         )
     return bound

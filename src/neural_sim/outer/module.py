@@ -16,11 +16,12 @@ from torch import Tensor, nn
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
-from neural_sim.gradient.base import ObjectImages
-from neural_sim.gradient.estimators import Estimator, Losses, Probes
+from neural_sim.gradient.base import Losses, ObjectImages, Probes
+from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.parameter.update import UpdateState
 from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.pool import ImagePool
@@ -64,7 +65,7 @@ class SimulatorModule(pl.LightningModule):
         self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
         self.records: list[IterationRecord] = []
         self.best_psi, self.best_loss = self.psi.detach().clone(), math.inf
-        self._update_state = settings.update.start(self.psi)
+        self._update_state = UpdateState.zeros(self.psi)
         self._backbone, _ = detector.split(params)
         self._validation = CachedSet.of(detector, self._backbone, validation)
         self._probe_set: CachedSet | None = None
@@ -95,9 +96,14 @@ class SimulatorModule(pl.LightningModule):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
         self._record(result, images, training_loss, seconds)
-        gradient = torch.stack([result.psi_gradients[name] for name in self.scene.names])
+        gradient, error = (
+            torch.stack([values[name] for name in self.scene.names]).to(self.psi)
+            for values in (result.psi_gradients, result.standard_errors)
+        )
         log_p = self.scene.pose.log_probabilities(self.psi)
-        moved, self._update_state = self.settings.update.step(self.psi, log_p, gradient, self._update_state)
+        moved, self._update_state = self.settings.update.step(
+            self.psi, log_p, gradient, error, self._update_state
+        )
         self.psi.data = moved
 
     def _train(self, images: LabelledImages) -> float:
@@ -126,7 +132,7 @@ class SimulatorModule(pl.LightningModule):
         subset = torch.randperm(count, generator=self.generator)[:wanted] if 0 < wanted < count else None
         inner = InnerProblem(trainable, cached.losses, weights, subset=subset)
         losses = bound_losses(cached, self._backbone, self._probe_set)
-        held = object_images(self.scene, rendered, self.psi, weights, self.estimator.relaxed)
+        held = object_images(self.scene, rendered, self.psi, weights)
         estimates = {
             name: self._bind(losses, part, self._probes.get(label))
             for label, (name, part) in enumerate(held.items())
