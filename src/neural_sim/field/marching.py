@@ -49,8 +49,8 @@ def march(
 ) -> None:
     """Walk rays of shape (rays, 3) through the grid and show ``visit`` every wave that may hold occupied cells.
 
-    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. Raises ValueError where
-    a ray starts so far away that its arithmetic cannot tell one lattice step from the next (float32: 2^22 steps).
+    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. Raises ValueError
+    where a ray starts so far away that its arithmetic cannot tell one lattice step from the next (float32: 2^22 steps).
     """
     front = _enter(rays, occupancy, step, phase)
     distance = occupancy.distance.flatten()
