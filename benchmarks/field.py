@@ -9,14 +9,12 @@ import argparse
 import json
 import logging
 import math
-import os
-import platform
 import resource
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
+from machine import machine
 
 from neural_sim import cameras
 from neural_sim.field.base import RadianceField
@@ -31,18 +29,6 @@ from neural_sim.types import PinholeCamera, PosedViews
 
 PAPER_OBJECTS = ["002", "003", "009", "019", "025", "035"]
 HELD_OUT = 16
-
-
-def machine() -> dict[str, Any]:
-    """What a timing depends on."""
-    return {
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "load": os.getloadavg()[0],
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
 
 
 def load_objects(root: str | None, names: list[str] | None) -> list[ObjectMesh]:

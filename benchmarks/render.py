@@ -14,7 +14,8 @@ import time
 from pathlib import Path
 
 import torch
-from field import HELD_OUT, fit, load_objects, machine, training_views  # the benchmark beside this one
+from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
+from machine import machine
 
 from neural_sim import cameras
 from neural_sim.field.base import RadianceField

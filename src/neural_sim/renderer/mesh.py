@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pyrender.constants import GLTF
 from torch import Tensor
 
-from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.types import PinholeCamera
@@ -28,7 +28,7 @@ with contextlib.suppress(ImportError):
 NEAR, FAR = 0.01, 100.0
 
 
-class PyrenderRenderer:
+class PyrenderRenderer(MeshRenderer):
     """Renders with pyrender's unlit pass over a surface whose light is baked into its vertices.
 
     pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each pixel
@@ -39,16 +39,9 @@ class PyrenderRenderer:
 
     name = "pyrender"
 
-    def __init__(self, supersample: int = 2, lighting: Lighting | None = None) -> None:
-        if supersample < 1:
-            raise ValueError(f"renderer.supersample: want at least 1, got {supersample}")
-        self.supersample = supersample
-        self.lighting = Lighting() if lighting is None else lighting
-
     def render(
         self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
     ) -> Float[Tensor, "n h w 4"]:
-        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is."""
         scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
         scene.add(_primitives(shaded_surface(mesh, self.lighting)))
         lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neural_sim.cameras import focal_length, rays
-from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.renderer.texture_sampling import Pyramid
@@ -20,21 +20,14 @@ from neural_sim.types import PinholeCamera
 EDGE_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 
 
-class RaycastRenderer:
+class RaycastRenderer(MeshRenderer):
     """The same image as ``PyrenderRenderer`` without OpenGL: rays over embree, textures filtered by footprint."""
 
     name = "raycast"
 
-    def __init__(self, supersample: int = 2, lighting: Lighting | None = None) -> None:
-        if supersample < 1:
-            raise ValueError(f"renderer.supersample: want at least 1, got {supersample}")
-        self.supersample = supersample
-        self.lighting = Lighting() if lighting is None else lighting
-
     def render(
         self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
     ) -> Float[Tensor, "n h w 4"]:
-        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is."""
         surface = shaded_surface(mesh, self.lighting)
         bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         pyramid = None if surface.texture is None else Pyramid(surface.texture)
@@ -48,9 +41,6 @@ class RaycastRenderer:
         if not images:
             return torch.zeros(0, camera.height, camera.width, 4)
         return torch.from_numpy(np.stack(images))
-
-    def close(self) -> None:
-        """Nothing to free; here so that both mesh renderers are used alike."""
 
 
 def _cast(

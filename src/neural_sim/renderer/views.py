@@ -7,13 +7,13 @@ import logging
 import os
 import subprocess
 import sys
-from typing import Literal, Protocol
+from typing import Literal
 
-import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.types import PinholeCamera, PosedViews
@@ -33,20 +33,6 @@ colour, depth = context.render(scene, flags=pyrender.RenderFlags.FLAT | pyrender
 context.delete()
 raise SystemExit(0 if depth.max() > 1.0 else 3)
 """
-
-
-class MeshRenderer(Protocol):
-    """What both mesh renderers offer."""
-
-    name: str
-    supersample: int
-    lighting: Lighting
-
-    def render(
-        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
-    ) -> Float[Tensor, "n h w 4"]: ...
-
-    def close(self) -> None: ...
 
 
 def choose_mesh_renderer(

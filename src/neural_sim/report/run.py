@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neural_sim.cameras import orbit
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.report import figures, tracking
 from neural_sim.synthesis.export import write_coco
@@ -139,6 +140,7 @@ def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], fo
         key: torch.cat([getattr(part.draw, key) for part in parts])
         for key in ("phi", "rho", "distance", "bins")
     }
+    poses["camera_to_world"] = orbit(poses["phi"], poses["rho"], poses["distance"])
     return write_coco(join(parts), list(names), folder, poses)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.pose import Pose
-from neural_sim.renderer.views import MeshRenderer
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.split import split

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.renderer.views import MeshRenderer
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 

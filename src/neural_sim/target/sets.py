@@ -9,7 +9,7 @@ import torch
 
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.pose import Pose
-from neural_sim.renderer.views import MeshRenderer
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
 from neural_sim.types import LabelledImages, PinholeCamera

@@ -9,7 +9,7 @@ from torch import Tensor
 from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.pose import Pose, PoseNoise
-from neural_sim.renderer.views import MeshRenderer
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.types import PinholeCamera
 
 # Per offset within the bin and second angle: as they are, or mirrored about their middle.
