@@ -22,10 +22,15 @@ Start = Literal["rhs", "random"]
 
 @dataclass(frozen=True)
 class Damped:
-    """``value`` is lambda >= 0; ``spectrum`` is that of the undamped operator, None where it was not estimated."""
+    """``value`` is lambda >= 0; ``spectrum`` is that of the undamped operator, None where it was not estimated.
+
+    ``start`` solves the damped system on the Krylov space that the estimate searched, where that is the right-hand
+    side's: the products that chose lambda need not be made again.
+    """
 
     value: float
     spectrum: Spectrum | None
+    start: Float[Tensor, "n"] | None = None
 
     @property
     def condition(self) -> float:
@@ -108,7 +113,9 @@ class LanczosDamping(Damping):
                 "damping: the operator is not finite; lambda falls to its minimum, %g", self.minimum
             )
             return Damped(self.minimum, spectrum)
-        return Damped(self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest), spectrum)
+        value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
+        searched = self.start == "rhs" and usable and spectrum.krylov is not None
+        return Damped(value, spectrum, spectrum.krylov.solve(value) if searched else None)
 
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0

@@ -13,12 +13,35 @@ from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
 
 
 @dataclass(frozen=True)
+class Krylov:
+    """The Krylov space of a start vector b of norm ``size``: orthonormal rows of ``basis``, and A in that basis."""
+
+    basis: Float[Tensor, "m n"]
+    tridiagonal: Float[Tensor, "m m"]
+    size: float
+
+    def solve(self, shift: float) -> Float[Tensor, "n"] | None:
+        """The Galerkin solution of ``(A + shift I) x = b``, which is what m steps of conjugate gradients from zero
+        reach; no products, whatever the shift (Krylov spaces do not depend on it). None where the shifted
+        matrix is not positive definite on this space.
+        """
+        shifted = self.tridiagonal + shift * torch.eye(len(self.tridiagonal), dtype=torch.float64)
+        factor, info = torch.linalg.cholesky_ex(shifted)
+        if int(info) != 0:
+            return None
+        first = torch.zeros(len(shifted), 1, dtype=torch.float64)
+        first[0] = self.size
+        weights = torch.cholesky_solve(first, factor)[:, 0].to(self.basis)
+        return self.basis.T @ weights if bool(torch.isfinite(weights).all()) else None
+
+
+@dataclass(frozen=True)
 class Spectrum:
     """Extreme Ritz values. Some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the
     largest).
 
     ``finite`` is False where the operator returned inf or nan; the values are those found until then (0 if
-    none).
+    none). ``krylov`` is the space that was searched, None if no product was finite.
     """
 
     smallest: float
@@ -27,6 +50,7 @@ class Spectrum:
     largest_error: float
     products: int
     finite: bool
+    krylov: Krylov | None = None
 
     def condition(self, shift: float = 0.0) -> float:
         """Condition number of A + shift I if that is positive definite on what was seen, else inf."""
@@ -73,7 +97,10 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
             betas[-1] = 0.0  # an invariant subspace: its Ritz values are eigenvalues
             break
         basis.append(product / betas[-1])
-    return _extremes(alphas, betas, operator.products, finite)
+    size = biggest * norm(vector)
+    return _extremes(
+        alphas, betas, operator.products, finite, torch.stack(basis[: max(len(alphas), 1)]), size
+    )
 
 
 def random_start(
@@ -83,7 +110,9 @@ def random_start(
     return torch.randn(size, generator=generator, dtype=dtype, device=generator.device).to(device)
 
 
-def _extremes(alphas: list[float], betas: list[float], products: int, finite: bool) -> Spectrum:
+def _extremes(
+    alphas: list[float], betas: list[float], products: int, finite: bool, basis: Tensor, size: float
+) -> Spectrum:
     if not alphas:
         return Spectrum(0.0, 0.0, 0.0, 0.0, products, finite)
     off = torch.tensor(betas[: len(alphas) - 1], dtype=torch.float64)
@@ -93,4 +122,6 @@ def _extremes(alphas: list[float], betas: list[float], products: int, finite: bo
     values, vectors = torch.linalg.eigh(tridiagonal)
     errors = betas[len(alphas) - 1] * vectors[-1].abs()  # residual of a Ritz pair: beta_m |e_m^T y|
     low, high = float(values[0]), float(values[-1])
-    return Spectrum(low, high, float(errors[0]), float(errors[-1]), products, finite)
+    return Spectrum(
+        low, high, float(errors[0]), float(errors[-1]), products, finite, Krylov(basis, tridiagonal, size)
+    )
