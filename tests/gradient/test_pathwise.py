@@ -128,8 +128,26 @@ def test_standard_error_is_that_of_a_sum():
     assert from_contributions(rows[:1]).signal_to_noise.tolist() == [0.0, 0.0]
 
 
+def test_standard_error_counts_pairs_as_one():
+    """Draws a, a, b, b, ... know no more than a, b, ... do, twice as large; plain counting would say less."""
+    once = torch.tensor([[1.0], [3.0], [2.0], [6.0]], dtype=DOUBLE)
+    twice = from_contributions(once.repeat_interleave(2, 0), group=2)
+    expected = from_contributions(2.0 * once)
+    assert twice.value == expected.value and twice.standard_error == expected.standard_error
+    with pytest.raises(ValueError, match="multiple of the group of 2, got 3"):
+        from_contributions(once[:3], group=2)
+
+
 @pytest.mark.parametrize(
-    "bad", [{"patch_size": 0}, {"chunk_size": 0}, {"mode": "sideways"}, {"theta_mode": "sideways"}]
+    "bad",
+    [
+        {"patch_size": 0},
+        {"chunk_size": 0},
+        {"conditional_draws": 0},
+        {"mode": "sideways"},
+        {"theta_mode": "sideways"},
+        {"relaxation": "none"},
+    ],
 )
 def test_bad_settings_name_their_key(bad):
     with pytest.raises(ValueError, match=f"gradient.{next(iter(bad))}"):

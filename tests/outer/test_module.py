@@ -100,8 +100,16 @@ def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
     assert torch.equal(again.images, part.images.images) and torch.equal(again.boxes, part.images.boxes)
 
 
-@pytest.mark.parametrize("bin_mean", ["linear", "circular"])
-def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean):
+@pytest.mark.parametrize(
+    ("bin_mean", "settings"),
+    [
+        ("linear", {}),
+        ("circular", {"antithetic": True, "common_backgrounds": True}),
+        ("circular", {"relaxation": "straight_through"}),
+        ("linear", {"relaxation": "gumbel_rao", "conditional_draws": 3}),
+    ],
+)
+def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean, settings):
     """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
     fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
     pose = Pose(bins=4, temperature=1.0, bin_mean=bin_mean)
@@ -114,22 +122,49 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin
         name: torch.randn(value.shape, generator=generator).double() for name, value in trainable.items()
     }
     psi = torch.randn(2, 4, generator=generator, dtype=torch.float64)
-    forward = PathwiseEstimator(mode="forward")
-    rendered = wide.training_set(psi, 5, generator, forward.relaxed)
+    forward = PathwiseEstimator(mode="forward", **settings)
+    rendered = wide.training_set(psi, 4, generator, forward.relaxed)
     assert all(set(part.tangents) == {"phi"} for part in rendered)
     images = join(rendered)
     losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, None)
-    weights = torch.full((10,), 0.1, dtype=torch.float64)
+    weights = torch.full((8,), 0.125, dtype=torch.float64)
     for held in object_images(wide, rendered, psi, weights).values():
         bare = dataclasses.replace(held, path=dataclasses.replace(held.path, tangents=None))
         for patch_size in (64, 10**6):
-            reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size)
+            reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size, **settings)
             found = [
                 estimator.estimate(losses, trainable, vector, batch, None).value
                 for estimator, batch in ((forward, held), (reverse, bare))
             ]
             assert found[0].dtype == torch.float64 and float(found[1].norm()) > 0.0
             assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-8
+
+
+def test_pairs_share_what_they_are_asked_to_share(scene):
+    psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
+    paired = RelaxedDraws(antithetic=True, common_backgrounds=True)
+    part = scene.draw(0, psi, 6, torch.Generator().manual_seed(0), paired)
+    backgrounds = part.nuisance.backgrounds.unflatten(0, (3, 2))
+    assert torch.equal(backgrounds[:, 0], backgrounds[:, 1])
+    assert not torch.equal(backgrounds[0, 0], backgrounds[1, 0])
+    assert torch.equal(part.nuisance.shifts[::2], part.nuisance.shifts[1::2])
+    uniform = torch.exp(-torch.exp(-part.noise.gumbel.double())).unflatten(0, (3, 2))
+    torch.testing.assert_close(uniform.sum(1), torch.ones(3, 4, dtype=torch.float64), rtol=0.0, atol=1e-5)
+    held = object_images(scene, [part], psi[None], torch.full((6,), 1 / 6))
+    assert held["a"].group == 2
+    for odd in (RelaxedDraws(antithetic=True), RelaxedDraws(common_backgrounds=True)):
+        with pytest.raises(ValueError, match=r"even outer\.images_per_object, got 5"):
+            scene.draw(0, psi, 5, torch.Generator(), odd)
+
+
+def test_straight_through_images_are_those_of_hard_draws(scene):
+    psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
+    hard, through = (
+        scene.draw(1, psi, 4, torch.Generator().manual_seed(2), how)
+        for how in (None, RelaxedDraws("straight_through", tangents=True))
+    )
+    torch.testing.assert_close(through.images.images, hard.images.images, rtol=0.0, atol=1e-5)
+    assert torch.equal(through.images.boxes, hard.images.boxes)
 
 
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):

@@ -75,7 +75,8 @@ class ObjectImages:
 
     ``psi`` logits; ``log_probabilities`` maps them to log p over the bins. ``index`` are the images' rows in
     the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
-    ``draw`` is where they were rendered. ``path`` is needed by the pathwise estimators only.
+    ``draw`` is where they were rendered. ``path`` is needed by the pathwise estimator only. Each ``group`` of
+    consecutive images shares randomness (1: all are independent).
     """
 
     psi: Float[Tensor, "k"]
@@ -85,6 +86,7 @@ class ObjectImages:
     weights: Float[Tensor, "n"]
     draw: SceneDraw
     path: RenderedPath | None = None
+    group: int = 1
 
 
 @dataclass(frozen=True)
@@ -105,10 +107,16 @@ class MixedDerivative:
         return torch.where(self.value == 0.0, torch.zeros_like(ratio), ratio)
 
 
-def from_contributions(contributions: Float[Tensor, "n k"]) -> MixedDerivative:
-    """The sum of independent per-image contributions, and the standard error of that sum."""
-    count = contributions.shape[0]
-    value = contributions.sum(0)
+def from_contributions(contributions: Float[Tensor, "n k"], group: int = 1) -> MixedDerivative:
+    """The sum of per-image contributions, and the standard error of that sum.
+
+    Every ``group`` of consecutive images may depend on each other, groups may not. Raises ``ValueError`` for a
+    number of images that does not divide into groups.
+    """
+    if len(contributions) % group:
+        raise ValueError(f"contributions: want a multiple of the group of {group}, got {len(contributions)}")
+    sums = contributions.unflatten(0, (-1, group)).sum(1)
+    value, count = sums.sum(0), len(sums)
     if count < 2:
         return MixedDerivative(value, torch.full_like(value, torch.inf))
-    return MixedDerivative(value, contributions.std(0) * count**0.5)
+    return MixedDerivative(value, sums.std(0) * count**0.5)

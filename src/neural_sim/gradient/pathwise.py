@@ -28,6 +28,7 @@ from neural_sim.gradient.base import (
     from_contributions,
 )
 from neural_sim.gradient.mixed import ThetaMode, image_cotangent
+from neural_sim.parameter.pose import Relaxation
 from neural_sim.synthesis.motion import CONTINUOUS
 from neural_sim.synthesis.scene import RelaxedDraws
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -43,6 +44,11 @@ class PathwiseEstimator:
     Args:
         mode: how images are differentiated by V. ``forward``: along with the first render; ``reverse``: the paper's
             second forward, patch by patch.
+        relaxation: how draws depend on psi, see :meth:`Pose.relaxed`: ``gumbel_softmax`` (the paper's),
+            ``straight_through`` or ``gumbel_rao``.
+        conditional_draws: Gumbel noises averaged for each image of ``gumbel_rao``.
+        antithetic: draw Gumbel noise in pairs from uniforms u and 1 - u.
+        common_backgrounds: the images of a pair share background and shift.
         patch_size: rays in a patch of the reverse mode.
         chunk_size: images whose losses are differentiated at a time.
         theta_mode: how the inner derivative of the loss, in theta along v, is taken.
@@ -53,22 +59,34 @@ class PathwiseEstimator:
 
     probes_per_bin: ClassVar[int] = 0
     mode: Mode = "forward"
+    relaxation: Relaxation = "gumbel_softmax"
+    conditional_draws: int = 8
+    antithetic: bool = False
+    common_backgrounds: bool = False
     patch_size: int = 4096
     chunk_size: int = 16
     theta_mode: ThetaMode = "forward"
 
     def __post_init__(self) -> None:
-        for key, modes in (("mode", get_args(Mode)), ("theta_mode", get_args(ThetaMode))):
-            if getattr(self, key) not in modes:
-                raise ValueError(f"gradient.{key} must be one of {modes}, got {getattr(self, key)!r}")
-        for key in ("patch_size", "chunk_size"):
+        for key, choice in (("mode", Mode), ("relaxation", Relaxation), ("theta_mode", ThetaMode)):
+            if getattr(self, key) not in get_args(choice):
+                raise ValueError(
+                    f"gradient.{key} must be one of {get_args(choice)}, got {getattr(self, key)!r}"
+                )
+        for key in ("conditional_draws", "patch_size", "chunk_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
 
     @property
     def relaxed(self) -> RelaxedDraws:
         """How this estimator's images are drawn."""
-        return RelaxedDraws(tangents=self.mode == "forward")
+        return RelaxedDraws(
+            self.relaxation,
+            self.conditional_draws,
+            self.antithetic,
+            self.common_backgrounds,
+            tangents=self.mode == "forward",
+        )
 
     def estimate(
         self, losses: Losses, params: Params, vector: Params, images: ObjectImages, probes: Probes | None
@@ -91,7 +109,7 @@ class PathwiseEstimator:
             along_draw = contract(path.tangents, maps)
         else:
             along_draw = draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
-        return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw))
+        return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
 
 
 def map_cotangents(path: RenderedPath, image_cotangents: Float[Tensor, "n 3 h w"]) -> Maps:
@@ -154,15 +172,13 @@ def psi_contributions(
     """Every image's part in the derivative by psi: its draw's cotangents through the replayed relaxed draw
     (Tool 1).
 
-    Rows sum to the vector-Jacobian product; they are kept apart for the standard error.
+    Rows sum to the vector-Jacobian product; they are kept apart for the standard error. psi has fewer numbers than
+    there are images, so that forward mode, one pass for each number, is the cheap way to all rows.
     """
-    leaf = psi.detach().requires_grad_()
-    with torch.enable_grad():
-        draw = relaxed(leaf)
-        along = sum(getattr(draw, name) * cotangent for name, cotangent in cotangents.items())
-    rows = torch.zeros(len(draw), psi.numel(), dtype=psi.dtype, device=psi.device)
-    if not (isinstance(along, Tensor) and along.requires_grad):
-        return rows  # nothing in this draw depends on psi
-    for image in range(len(draw)):
-        (rows[image],) = torch.autograd.grad(along[image], leaf, retain_graph=True, materialize_grads=True)
-    return rows
+
+    def along(psi: Tensor) -> Tensor:
+        draw = relaxed(psi)
+        return torch.stack([getattr(draw, name) * value for name, value in cotangents.items()]).sum(0)
+
+    basis = torch.eye(psi.numel(), dtype=psi.dtype, device=psi.device)
+    return torch.stack([torch.func.jvp(along, (psi.detach(),), (e,))[1] for e in basis], -1)

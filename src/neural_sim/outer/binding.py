@@ -31,15 +31,15 @@ def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | No
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPath:
     """How one object's images came from psi. Raises ``ValueError`` for images that were not drawn afresh."""
-    noise = part.noise
-    if noise is None:
+    noise, relaxed = part.noise, part.relaxed
+    if noise is None or relaxed is None:
         raise ValueError("pathwise: these images were not drawn from psi afresh")
 
     def compose(rgb: Tensor, opacity: Tensor) -> Tensor:
         return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins).images
 
     return RenderedPath(
-        relaxed=lambda psi: scene.pose.relaxed(psi, noise),
+        relaxed=lambda psi: scene.pose.relaxed(psi, noise, relaxed.relaxation),
         render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
         compose=compose,
         camera=scene.camera,
@@ -65,5 +65,6 @@ def object_images(
             weights=weights[index],
             draw=part.draw,
             path=rendered_path(scene, label, part) if part.relaxed else None,
+            group=part.relaxed.group if part.relaxed else 1,
         )
     return bound

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -14,18 +15,23 @@ from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distributions import Specification, distribution
 from neural_sim.types import SceneDraw
 
+Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
+"""How a draw depends on psi, see :meth:`Pose.relaxed`."""
+
 
 @dataclass(frozen=True)
 class PoseNoise:
     """All randomness of n draws, made once and replayed by every pass (paper, Tool 2).
 
-    ``gumbel`` picks the bin; ``within``, ``other`` and ``distance`` are uniform in [0, 1).
+    ``gumbel`` picks the bin; ``within``, ``other`` and ``distance`` are uniform in [0, 1). ``exponential`` (for
+    ``gumbel_rao`` only) makes other Gumbel noise that would have picked the same bin.
     """
 
     gumbel: Float[Tensor, "n k"]
     within: Float[Tensor, "n"]
     other: Float[Tensor, "n"]
     distance: Float[Tensor, "n"]
+    exponential: Float[Tensor, "n draws k"] | None = None
 
     def __len__(self) -> int:
         return self.within.shape[0]
@@ -100,11 +106,26 @@ class Pose:
         """log-probability of drawn bins (for REINFORCE)."""
         return self.log_probabilities(psi)[bins]
 
-    def draw_noise(self, n: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> PoseNoise:
-        """Randomness of n draws; independent of psi."""
-        noise = binned.gumbel((n, self.bins), generator, dtype)
+    def draw_noise(
+        self,
+        n: int,
+        generator: torch.Generator,
+        dtype: torch.dtype = torch.float32,
+        antithetic: bool = False,
+        conditional: int = 0,
+    ) -> PoseNoise:
+        """Randomness of n draws; independent of psi.
+
+        ``antithetic``: Gumbel noise in pairs from uniforms u and 1 - u. ``conditional``: draws of the noise given the
+        bin, for ``gumbel_rao``. Raises ``ValueError`` for an odd number of antithetic draws.
+        """
+        noise = binned.gumbel((n, self.bins), generator, dtype, antithetic)
         uniform = torch.rand((3, n), generator=generator, dtype=torch.float64).to(dtype)
-        return PoseNoise(noise, uniform[0], uniform[1], uniform[2])
+        exponential = None
+        if conditional:
+            empty = torch.empty(n, conditional, self.bins, dtype=torch.float64)
+            exponential = empty.exponential_(generator=generator).clamp_min(1e-30).to(dtype)
+        return PoseNoise(noise, uniform[0], uniform[1], uniform[2], exponential)
 
     def hard(self, psi: Float[Tensor, "k"], noise: PoseNoise) -> SceneDraw:
         """Exact samples of p_psi by the Gumbel-max trick; no derivative reaches psi."""
@@ -115,15 +136,35 @@ class Pose:
         """Samples in given bins, uniform within each."""
         return self._place(self._centres(noise.within)[bins], bins, noise)
 
-    def relaxed(self, psi: Float[Tensor, "k"], noise: PoseNoise) -> SceneDraw:
-        """Relaxed samples, differentiable in psi: approximate bin centre plus uniform offset (Tool 1).
+    def relaxed(
+        self, psi: Float[Tensor, "k"], noise: PoseNoise, relaxation: Relaxation = "gumbel_softmax"
+    ) -> SceneDraw:
+        """Samples that are differentiable in psi: approximate bin centre plus uniform offset (Tool 1).
 
-        At small tau most draws lie in one bin and carry next to no derivative; the few near a tie carry it all.
+        ``gumbel_softmax`` is the paper's: at small tau most draws lie in one bin and carry next to no derivative; the
+        few near a tie carry it all. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and takes the
+        relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of no
+        expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is averaged
+        over noise that would have chosen the same bin (Paulus et al. 2021).
+
+        Raises:
+            ValueError: ``gumbel_rao`` without the noise for it.
         """
-        weights = binned.gumbel_softmax(self.log_probabilities(psi), noise.gumbel, self.temperature)
-        bin_centres = self._centres(weights)
+        log_p = self.log_probabilities(psi)
+        given = noise.gumbel
+        bin_centres = self._centres(given)
         mean = binned.circular_mean if self.bin_mean == "circular" else binned.linear_mean
-        return self._place(mean(weights, bin_centres), weights.argmax(-1), noise)
+        chosen = (log_p.detach() + given).argmax(-1)
+        if relaxation == "gumbel_rao":
+            if noise.exponential is None:
+                raise ValueError("pose: gumbel_rao wants noise drawn with conditional >= 1, got none")
+            given = binned.conditional_gumbel(log_p.detach(), chosen, noise.exponential)
+        relaxed = mean(binned.gumbel_softmax(log_p, given, self.temperature), bin_centres)
+        if relaxation == "gumbel_softmax":
+            return self._place(relaxed, chosen, noise)
+        if relaxation == "gumbel_rao":
+            relaxed = relaxed.mean(-1)
+        return self._place(bin_centres[chosen] + (relaxed - relaxed.detach()), chosen, noise)
 
     def bin_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The bin each pose of ``draw`` lies in, whatever bin it was drawn for."""

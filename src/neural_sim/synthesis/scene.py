@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.cameras import orbit
 from neural_sim.field.base import RadianceField
-from neural_sim.parameter.pose import Pose, PoseNoise
+from neural_sim.parameter.pose import Pose, PoseNoise, Relaxation
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import moved_by, pose_rates
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer
@@ -22,18 +22,39 @@ from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
 class RelaxedDraws:
     """How images are drawn that the pathwise estimator will differentiate.
 
+    ``relaxation`` and ``conditional_draws`` (of ``gumbel_rao``): see :meth:`Pose.relaxed`. ``antithetic``: Gumbel
+    noise in pairs from u and 1 - u. ``common_backgrounds``: the images of a pair share background and shift.
     ``tangents``: the maps' derivatives by the numbers that psi moves ride along with the render.
     """
 
+    relaxation: Relaxation = "gumbel_softmax"
+    conditional_draws: int = 8
+    antithetic: bool = False
+    common_backgrounds: bool = False
     tangents: bool = False
+
+    @property
+    def group(self) -> int:
+        """How many consecutive images share randomness."""
+        return 2 if self.antithetic or self.common_backgrounds else 1
+
+    def noise(self, pose: Pose, count: int, generator: torch.Generator, dtype: torch.dtype) -> PoseNoise:
+        """Raises ``ValueError`` for a count that does not divide into pairs where pairs are asked for."""
+        if count % self.group:
+            raise ValueError(
+                "gradient.antithetic and gradient.common_backgrounds pair images: want an even "
+                f"outer.images_per_object, got {count}"
+            )
+        conditional = self.conditional_draws if self.relaxation == "gumbel_rao" else 0
+        return pose.draw_noise(count, generator, dtype, self.antithetic, conditional)
 
 
 @dataclass(frozen=True)
 class RenderedObject:
     """One object's images with all that made them: replaying ``noise`` and ``nuisance`` gives them again.
 
-    ``noise`` is None for images that were not drawn from psi afresh, ``relaxed`` for hard draws. ``tangents``, where the
-    render carried them, are the maps' derivatives by the named numbers of the draw.
+    ``noise`` is None for images that were not drawn from psi afresh, ``relaxed`` for hard draws. ``tangents``, where
+    the render carried them, are the maps' derivatives by the named numbers of the draw.
     """
 
     images: LabelledImages
@@ -63,14 +84,15 @@ class Scene:
         """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
         poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
         rgb, opacity = self.renderer.render(self.fields[label], self.camera, poses)
-        return self._compose(label, draw, noise, Maps(rgb, opacity), generator)
+        nuisance = self.synthesizer.draw_nuisance(len(draw), self.camera, generator)
+        return self._compose(label, draw, noise, Maps(rgb, opacity), nuisance)
 
     def _compose(
-        self, label: int, draw: SceneDraw, noise: PoseNoise, maps: Maps, generator: torch.Generator
+        self, label: int, draw: SceneDraw, noise: PoseNoise, maps: Maps, nuisance: Nuisance
     ) -> RenderedObject:
+        bins = self.pose.bin_of(draw)
         with torch.no_grad():
-            nuisance = self.synthesizer.draw_nuisance(len(draw), self.camera, generator)
-            images = self.synthesizer.compose(maps.rgb, maps.opacity, nuisance, label, self.pose.bin_of(draw))
+            images = self.synthesizer.compose(maps.rgb, maps.opacity, nuisance, label, bins)
         return RenderedObject(images, noise, draw, nuisance, maps.rgb, maps.opacity)
 
     def dtype(self, label: int) -> torch.dtype:
@@ -85,20 +107,36 @@ class Scene:
         generator: torch.Generator,
         relaxed: RelaxedDraws | None = None,
     ) -> RenderedObject:
-        """``count`` images of one object from p_psi: hard samples, or the paper's relaxed ones."""
-        noise = self.pose.draw_noise(count, generator, self.dtype(label))
+        """``count`` images of one object from p_psi: hard samples, or those that the pathwise estimator asks for."""
         logits = psi.detach().to(self.dtype(label))
-        if relaxed is None:
-            return self.render(label, self.pose.hard(logits, noise), noise, generator)
+        if relaxed is not None:
+            return self._draw_relaxed(label, logits, count, generator, relaxed)
+        noise = self.pose.draw_noise(count, generator, self.dtype(label))
+        return self.render(label, self.pose.hard(logits, noise), noise, generator)
+
+    def _draw_relaxed(
+        self, label: int, logits: Tensor, count: int, generator: torch.Generator, relaxed: RelaxedDraws
+    ) -> RenderedObject:
+        noise = relaxed.noise(self.pose, count, generator, self.dtype(label))
+
+        def replay(psi: Tensor) -> SceneDraw:
+            return self.pose.relaxed(psi, noise, relaxed.relaxation)
+
         with torch.no_grad():
-            draw = self.pose.relaxed(logits, noise)
-        names = moved_by(lambda leaf: self.pose.relaxed(leaf, noise), logits) if relaxed.tangents else ()
-        if not names:
-            return replace(self.render(label, draw, noise, generator), relaxed=relaxed)
-        poses, rates = orbit(draw.phi, draw.rho, draw.distance), pose_rates(draw, names)
-        maps, moved = self.renderer.render_with_tangents(self.fields[label], self.camera, poses, rates)
-        made = self._compose(label, draw, noise, maps, generator)
-        return replace(made, relaxed=relaxed, tangents=dict(zip(names, moved, strict=True)))
+            draw = replay(logits)
+        poses, field = orbit(draw.phi, draw.rho, draw.distance), self.fields[label]
+        names = moved_by(replay, logits) if relaxed.tangents else ()
+        if names:
+            rates = pose_rates(draw, names)
+            maps, moved = self.renderer.render_with_tangents(field, self.camera, poses, rates)
+        else:
+            maps, moved = Maps(*self.renderer.render(field, self.camera, poses)), ()
+        shared = 2 if relaxed.common_backgrounds else 1
+        nuisance = self.synthesizer.draw_nuisance(count // shared, self.camera, generator)
+        nuisance = nuisance.select(torch.arange(count) // shared)
+        made = self._compose(label, draw, noise, maps, nuisance)
+        tangents = dict(zip(names, moved, strict=True)) if names else None
+        return replace(made, relaxed=relaxed, tangents=tangents)
 
     def training_set(
         self,
