@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from neural_sim.detector.module import DetectorModule
 from neural_sim.detector.training import cached_features, mean_loss, train_detector
 from neural_sim.types import LabelledImages
 
@@ -96,3 +97,40 @@ def test_nothing_to_train_on_is_refused(tools, generator, images):
         train(detector, start, images, epochs=0)
     with pytest.raises(ValueError, match="mean_loss"):
         mean_loss(detector, start, images.select(slice(0, 0)))
+
+
+def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, generator, images):
+    detector = tools.detector()
+    backbone, start = detector.split(detector.init(generator))
+    anchor = {name: value + 0.1 for name, value in start.items()}
+    targets = detector.assign(images.boxes, images.labels)
+    features = cached_features(detector, backbone, images.images)
+    module = DetectorModule(detector, start, backbone, 1, 1e-2, 0.0, 0.1, 3.0, anchor)
+    added = float(module.training_step((features, targets), 0).detach()) - float(
+        detector.loss(start, features, targets)
+    )
+    assert added == pytest.approx(1.5 * sum(value.numel() for value in start.values()) * 0.01, rel=1e-4)
+    module.on_train_epoch_end()
+    assert module.epoch_losses == [pytest.approx(float(detector.loss(start, features, targets)), rel=1e-6)]
+
+
+def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+
+    def distance(proximal):
+        trained, _ = train(
+            detector,
+            start,
+            images,
+            epochs=40,
+            trainable_only=True,
+            proximal=proximal,
+            anchor=start,
+            weight_decay=0.0,
+        )
+        return math.sqrt(sum(float((trained[n] - start[n]).square().sum()) for n in start))
+
+    assert distance(100.0) < 0.1 * distance(1.0) < 0.1 * distance(0.0)
+    with pytest.raises(ValueError, match="anchor"):
+        train(detector, start, images, proximal=1.0)

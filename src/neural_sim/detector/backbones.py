@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -52,25 +53,39 @@ class ResidualBlock(nn.Module):
         return self.activation(x + self.body(x))
 
 
-class TinyBackbone(nn.Module):
-    """Four strided convolutions with a residual block at strides 8 and 16; 0.3 M parameters."""
+@dataclass(frozen=True)
+class Plan:
+    """Shape of a ``StridedBackbone``: output channels of its four stages, and which end in a residual block."""
 
-    def __init__(self, strides: tuple[int, ...], activation: str) -> None:
+    widths: tuple[int, int, int, int]
+    residual: tuple[bool, bool, bool, bool]
+
+
+PLANS = {
+    "tiny": Plan((16, 32, 64, 96), (False, False, True, True)),  # 0.3 M parameters
+    "micro": Plan((4, 8, 8, 8), (False, False, False, False)),  # 1,604 parameters
+}
+
+
+class StridedBackbone(nn.Module):
+    """Four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
+
+    def __init__(self, plan: Plan, strides: tuple[int, ...], activation: str) -> None:
         super().__init__()
-        widths = (3, 16, 32, 64, 96)
-        self.channels = {8: widths[3], 16: widths[4]}
+        self.channels = {8: plan.widths[2], 16: plan.widths[3]}
         self.strides = strides
         self.stages = nn.ModuleList()
-        for level in range(4):
-            before, after = widths[level], widths[level + 1]
+        before = 3
+        for after, residual in zip(plan.widths, plan.residual, strict=True):
             layers: list[nn.Module] = [
                 nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False),
                 group_norm(after),
                 ACTIVATIONS[activation](),
             ]
-            if level >= 2:
+            if residual:
                 layers.append(ResidualBlock(after, activation))
             self.stages.append(nn.Sequential(*layers))
+            before = after
 
     def forward(self, x: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         maps = {}
@@ -144,14 +159,16 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
-) -> TinyBackbone | ResNetBackbone:
+) -> StridedBackbone | ResNetBackbone:
     """The backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
 
     Raises:
         ValueError: for weights that do not exist or do not fit.
     """
-    if architecture == "tiny":
+    if architecture in PLANS:
         if weights is not None:
-            raise ValueError(f"detector.weights: tiny has no published weights, got {weights!r}, want null")
-        return TinyBackbone(strides, activation)
+            raise ValueError(
+                f"detector.weights: {architecture} has no published weights, got {weights!r}, want null"
+            )
+        return StridedBackbone(PLANS[architecture], strides, activation)
     return ResNetBackbone(architecture, strides, activation, weights)

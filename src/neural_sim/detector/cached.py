@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.retinanet import Detector, Outputs, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.training import cached_features
 from neural_sim.types import LabelledImages
@@ -30,8 +30,15 @@ class CachedSet:
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
         """Losses of the images ``index``."""
-        rows = tuple(level[index] for level in self.features)
-        return self.detector.per_image_loss(params, rows, self.targets.select(index))
+        return self.losses_of(self.outputs(params, index), index)
+
+    def outputs(self, params: Parameters, index: Tensor) -> Outputs:
+        """The predictor's outputs on the images ``index``."""
+        return self.detector.outputs(params, tuple(level[index] for level in self.features))
+
+    def losses_of(self, outputs: Outputs, index: Tensor) -> Float[Tensor, "n"]:
+        """Losses of the images ``index`` as a function of their outputs alone, for Gauss-Newton products."""
+        return self.detector.losses_of(outputs, self.targets.select(index))
 
     def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
         """The mean loss as a sum over chunks."""

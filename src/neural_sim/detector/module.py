@@ -28,6 +28,7 @@ class DetectorModule(pl.LightningModule):
         learning_rate: at its peak.
         weight_decay: decoupled, on convolution weights only.
         warmup_fraction: part of ``total_steps`` in which the learning rate rises.
+        proximal: adds ``proximal / 2 |learned - anchor|^2`` to the loss; ``anchor`` holds the learned names.
     """
 
     def __init__(
@@ -39,11 +40,15 @@ class DetectorModule(pl.LightningModule):
         learning_rate: float,
         weight_decay: float,
         warmup_fraction: float,
+        proximal: float = 0.0,
+        anchor: Parameters | None = None,
     ) -> None:
         super().__init__()
         self.detector = detector
         self._names = list(learned)
         self._values = nn.ParameterList([nn.Parameter(value.detach().clone()) for value in learned.values()])
+        self._proximal = proximal
+        self._anchor = None if anchor is None else [anchor[name].detach() for name in self._names]
         self._fixed = {name: value.detach() for name, value in fixed.items()}
         self._on_features = not any(name.startswith("backbone.") for name in learned)
         self.total_steps, self.warmup_steps = total_steps, math.ceil(warmup_fraction * total_steps)
@@ -65,7 +70,15 @@ class DetectorModule(pl.LightningModule):
         loss = self.detector.loss(trainable, features, targets)
         self._losses.append(loss.detach())
         self._sizes.append(len(targets))
-        return loss
+        return loss + self._proximal_term()
+
+    def _proximal_term(self) -> Tensor | float:
+        if self._proximal == 0.0 or self._anchor is None:
+            return 0.0
+        pairs = zip(self._values, self._anchor, strict=True)
+        return (
+            0.5 * self._proximal * torch.stack([(value - held).square().sum() for value, held in pairs]).sum()
+        )
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning's own version refuses frozen dataclasses.

@@ -6,6 +6,7 @@ values always come in as an argument, so that training losses can be differentia
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -23,7 +24,13 @@ from neural_sim.detector.network import NormalisedBackbone, build_predictor, fix
 from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
 
 Parameters = dict[str, Tensor]
-ARCHITECTURES = {"tiny": (8, 16), "resnet18": (4, 8, 16, 32), "resnet50": (4, 8, 16, 32)}
+Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors 4"]]
+ARCHITECTURES = {
+    "micro": (8, 16),
+    "tiny": (8, 16),
+    "resnet18": (4, 8, 16, 32),
+    "resnet50": (4, 8, 16, 32),
+}
 
 
 class Detector:
@@ -32,13 +39,13 @@ class Detector:
     Args:
         num_classes: classes, from 0, without a background class.
         image_size: (height, width) in pixels, or one number for a square.
-        architecture: ``tiny``, ``resnet18`` or ``resnet50``.
+        architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
         weights: of the ResNets' backbone: None, a file with a torchvision state dictionary, or torchvision's
             name of the weights.
         activation: ``silu`` or ``relu`` (torchvision's own).
         box_loss: ``pseudo_huber`` or ``l1`` (torchvision's own).
         box_loss_delta: scale of the pseudo-Huber loss, in encoded units.
-        strides: of the pyramid's levels, from 4, 8, 16 and 32 (tiny: 8 and 16).
+        strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16).
         anchor_sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side
             is ``anchor_reference``; they scale with the image's.
         anchor_reference: that side in pixels.
@@ -49,6 +56,7 @@ class Detector:
         prior_probability: foreground probability that the untrained head predicts.
         foreground_iou, background_iou: overlaps from which an anchor is foreground, below which background.
         score_threshold, nms_iou, max_detections, max_candidates: of the detections, see :meth:`predict`.
+        proximal: lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm start.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -78,6 +86,7 @@ class Detector:
         nms_iou: float = 0.5,
         max_detections: int = 100,
         max_candidates: int = 1000,
+        proximal: float = 0.0,
     ) -> None:
         strides = tuple(strides)
         _check(
@@ -90,6 +99,7 @@ class Detector:
             head_convs=(head_convs, 1 <= head_convs <= 4, "1 to 4"),
             prior_probability=(prior_probability, 0 < prior_probability < 1, "inside (0, 1)"),
             anchor_reference=(anchor_reference, anchor_reference > 0, "above 0"),
+            proximal=(proximal, 0 <= proximal < math.inf, "finite and at least 0"),
             anchor_sizes=(anchor_sizes, len(anchor_sizes) == len(strides), "one list for each stride"),
             foreground_iou=(foreground_iou, background_iou <= foreground_iou <= 1, "background_iou up to 1"),
         )
@@ -107,6 +117,7 @@ class Detector:
         self.focal_alpha, self.focal_gamma = focal_alpha, focal_gamma
         self.prior_probability = prior_probability
         self.foreground_iou, self.background_iou = foreground_iou, background_iou
+        self.proximal = proximal
         self.score_threshold, self.nms_iou = score_threshold, nms_iou
         self.max_detections, self.max_candidates = max_detections, max_candidates
         backbone = build_backbone(architecture, strides, activation, weights)
@@ -159,9 +170,7 @@ class Detector:
         dtype = next(value.dtype for value in backbone.values() if value.is_floating_point())
         return functional_call(self._backbone, backbone, (images.to(dtype),), strict=True)
 
-    def outputs(
-        self, trainable: Parameters, features: Sequence[Tensor]
-    ) -> tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors 4"]]:
+    def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
         """Class logits and encoded boxes of every anchor."""
         out = functional_call(self._predictor, trainable, (features,), strict=True)
         return out["cls_logits"], out["bbox_regression"]
@@ -179,11 +188,12 @@ class Detector:
     def per_image_loss(
         self, trainable: Parameters, features: Sequence[Tensor], targets: Targets
     ) -> Float[Tensor, "n"]:
-        """Focal loss plus box loss of each image, each a sum over anchors by the number of foreground anchors.
+        """Losses of the outputs. A jvp along v gives every image's score <dl_i / dtheta, v> in one pass."""
+        return self.losses_of(self.outputs(trainable, features), targets)
 
-        A jvp along v gives every image's score <dl_i / dtheta, v> in one pass.
-        """
-        logits, deltas = self.outputs(trainable, features)
+    def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
+        """Focal loss plus box loss of each image, each a sum over anchors by the number of foreground anchors."""
+        logits, deltas = outputs
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)
         wanted = (labels[..., None] == classes).to(logits.dtype)

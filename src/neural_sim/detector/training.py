@@ -63,23 +63,29 @@ def train_detector(
     warmup_fraction: float = 0.1,
     trainable_only: bool = False,
     progress: bool = False,
+    proximal: float = 0.0,
+    anchor: Parameters | None = None,
 ) -> tuple[Parameters, TrainingHistory]:
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
     Args:
         trainable_only: train the pyramid and the head on the frozen backbone's features, computed once.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
+        proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
 
     Returns:
-        New parameters, detached, all of them (the frozen ones are the given tensors), and the history.
+        New parameters, detached, all of them (the frozen ones are the given tensors), and the history, whose losses
+        leave the proximal term out.
 
     Raises:
-        ValueError: without images, epochs or a batch size.
+        ValueError: without images, epochs or a batch size; for a proximal term without its anchor.
     """
     if len(images) == 0 or epochs < 1 or batch_size < 1:
         raise ValueError(
             f"train_detector: want images, epochs and batch_size, got {len(images)}, {epochs}, {batch_size}"
         )
+    if proximal > 0.0 and anchor is None:
+        raise ValueError(f"train_detector: proximal {proximal} wants its anchor theta_0, got None")
     backbone, trainable = detector.split(params)
     targets = detector.assign(images.boxes, images.labels)
     if trainable_only:
@@ -92,8 +98,9 @@ def train_detector(
         inputs = (images.images,)
     batches = Batches(inputs, targets, batch_size, generator)
     module = DetectorModule(
-        detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction
-    )
+        detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction,
+        proximal, anchor,
+    )  # fmt: skip
     _fit(module, batches, epochs, progress, next(iter(learned.values())).device)
     values = {**fixed, **module.parameters_by_name()}
     history = TrainingHistory(tuple(module.epoch_losses), module.steps_done)

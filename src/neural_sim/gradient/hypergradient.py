@@ -5,18 +5,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.flatten import unflatten
+from neural_sim.solver.gauss_newton import CompositeTerm
 from neural_sim.solver.hvp import Term, gradient
 from neural_sim.solver.operator import norm
 from neural_sim.solver.solution import Solution
@@ -25,13 +28,32 @@ Estimate = Callable[[Params], MixedDerivative]
 
 
 @dataclass(frozen=True)
+class SplitLoss:
+    """An ``IndexedLoss`` given as model outputs and losses of outputs, which Gauss-Newton products need apart."""
+
+    outputs: Callable[[Params, Tensor], Any]
+    losses_of: Callable[[Any, Tensor], Float[Tensor, "n"]]
+
+    def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]:
+        return self.losses_of(self.outputs(params, index), index)
+
+    def term(self, index: Int[Tensor, "n"], weights: Float[Tensor, "n"]) -> CompositeTerm:
+        """The weighted sum over the rows ``index``."""
+        return CompositeTerm(
+            lambda params: self.outputs(params, index),
+            lambda outputs: self.losses_of(outputs, index) @ weights,
+        )
+
+
+@dataclass(frozen=True)
 class InnerProblem:
     """``L_train(theta) = sum_i w_i l_i(theta) + proximal / 2 |theta - anchor|^2`` at its (near) minimiser
     ``params``.
 
-    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. At most ``chunk_size``
-    images are in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term. ``subset`` limits
-    Hessian products (not the stationarity) to these rows, their weights scaled up to the same sum.
+    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. Losses given as ``SplitLoss``
+    serve Gauss-Newton products too. At most ``chunk_size`` images are in memory at a time. ``anchor`` is the fixed
+    theta_0 of the proximal term. ``subset`` limits Hessian products (not the stationarity) to these rows, their weights
+    scaled up to the same sum.
     """
 
     params: Params
@@ -61,13 +83,15 @@ class InnerProblem:
         if subset is not None:
             weights = weights * (self.weights.sum() / weights.sum())
         chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
-        terms: list[Term] = [
-            lambda params, rows=rows, weight=weight: self.losses(params, rows) @ weight
-            for rows, weight in chunks
-        ]
+        terms: list[Term] = [self._term(rows, weight) for rows, weight in chunks]
         if self.proximal > 0.0 and self.anchor is not None:
             terms.append(proximal_term(self.proximal, self.anchor))
         return terms
+
+    def _term(self, rows: Tensor, weights: Tensor) -> Term:
+        if isinstance(self.losses, SplitLoss):
+            return self.losses.term(rows, weights)
+        return lambda params: self.losses(params, rows) @ weights
 
 
 @dataclass(frozen=True)
@@ -75,10 +99,13 @@ class Hypergradient:
     """``dL_val/dpsi`` per object with everything needed to judge it.
 
     ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
+    ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
+    unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
     ``seconds`` by phase: validation, solve, mixed. ``raises`` counts how often lambda had to be raised.
     """
 
     psi_gradients: dict[str, Float[Tensor, "k"]]
+    standard_errors: dict[str, Float[Tensor, "k"]]
     signal_to_noise: dict[str, Float[Tensor, "k"]]
     solution: Solution
     damping: Damped
@@ -114,6 +141,12 @@ def hypergradient(
     solved = time.perf_counter()
     vector = unflatten(adjoint.vector, inner.params)
     mixed = {name: estimate(vector) for name, estimate in estimates.items()}
+    sensitivity = math.nan
+    if adjoint.doubled is not None and mixed:
+        doubled = unflatten(adjoint.doubled, inner.params)
+        sensitivity = _relative_change(
+            mixed, {name: estimate(doubled) for name, estimate in estimates.items()}
+        )
     seconds = {
         "validation": validated - began,
         "solve": solved - validated,
@@ -122,15 +155,23 @@ def hypergradient(
     return Hypergradient(
         # The one minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
         psi_gradients={name: -part.value for name, part in mixed.items()},
+        standard_errors={name: part.standard_error for name, part in mixed.items()},
         signal_to_noise={name: part.signal_to_noise for name, part in mixed.items()},
         solution=adjoint.solution,
         damping=adjoint.damping,
-        sensitivity=adjoint.sensitivity,
+        sensitivity=sensitivity,
         stationarity=stationarity,
         validation_norm=norm(right_hand_side),
         seconds=seconds,
         raises=adjoint.raises,
     )
+
+
+def _relative_change(before: Mapping[str, MixedDerivative], after: Mapping[str, MixedDerivative]) -> float:
+    old = torch.cat([part.value for part in before.values()])
+    new = torch.cat([part.value for part in after.values()])
+    size = norm(old)
+    return norm(new - old) / size if size > 0.0 else math.nan
 
 
 def proximal_term(proximal: float, anchor: Params) -> Term:
@@ -140,4 +181,4 @@ def proximal_term(proximal: float, anchor: Params) -> Term:
         squares = [(params[name] - anchor[name].detach()).square().sum() for name in params]
         return 0.5 * proximal * torch.stack(squares).sum()
 
-    return term
+    return CompositeTerm(lambda params: params, term)

@@ -16,7 +16,7 @@ from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import Damped, Damping, LanczosDamping
 from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, Mode, Term
-from neural_sim.solver.operator import Matvec, Shifted, norm
+from neural_sim.solver.operator import Matvec, Shifted
 from neural_sim.solver.solution import Solution, Status
 
 logger = logging.getLogger(__name__)
@@ -24,16 +24,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solved vector with its account. ``raises`` counts how often lambda had to be raised.
-
-    ``sensitivity`` is ``|v(2 lambda) - v(lambda)| / |v(lambda)|``, nan if not asked for. Not a bias: an
-    indefinite H has poles in lambda.
+    """The solved vector with its account. ``raises`` counts how often lambda had to be raised; ``doubled`` is the
+    vector at twice the final lambda, None if it was not asked for.
     """
 
     solution: Solution
     damping: Damped
     raises: int
-    sensitivity: float
+    doubled: Float[Tensor, "n"] | None
     seconds: float
 
     @property
@@ -47,12 +45,14 @@ class AdjointSolver:
 
     Args:
         linear: the linear solver.
-        damping: the choice of lambda; a Gauss-Newton one also swaps the operator and needs ``CompositeTerm``
-        s. mode: how Hessian products are made, see ``HessianOperator``.
+        damping: the choice of lambda; a Gauss-Newton one also swaps the operator and wants every term a
+            ``CompositeTerm``.
+        mode: how Hessian products are made, see ``HessianOperator``; Gauss-Newton products know one way only.
         rtol, max_steps: passed to the linear solver.
-        retain_graph: keep the gradient's graph between products: faster, memory of all chunks at once.
-        max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never
-        is). sensitivity: also solve at 2 lambda, to see how much v hangs on the damping (twice the cost).
+        retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
+        max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never is).
+        sensitivity: also solve at 2 lambda, from v, to see how much hangs on the damping: up to ``max_steps`` more
+            products.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -60,7 +60,7 @@ class AdjointSolver:
     mode: Mode = "reverse_over_reverse"
     rtol: float = 1e-2
     max_steps: int = 40
-    retain_graph: bool = False
+    retain_graph: bool = True
     max_raises: int = 3
     sensitivity: bool = False
 
@@ -80,7 +80,8 @@ class AdjointSolver:
         began = time.perf_counter()
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
-        solution = self.linear.solve(Shifted(operator, damped.value), b, x0, self.rtol, self.max_steps)
+        start = x0 if damped.start is None else damped.start
+        solution = self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
         raises = 0
         while solution.status is Status.NEGATIVE_CURVATURE and raises < self.max_raises:
             raised = self.damping.raised(damped, solution.curvature[0] - damped.value)
@@ -89,10 +90,11 @@ class AdjointSolver:
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
             damped, start, raises = raised, solution.value, raises + 1
             solution = self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
-        sensitivity = (
-            self._sensitivity(operator, damped.value, b, solution) if self.sensitivity else float("nan")
-        )
-        return Adjoint(solution, damped, raises, sensitivity, time.perf_counter() - began)
+        doubled = None
+        if self.sensitivity:
+            twice = Shifted(operator, 2.0 * damped.value)
+            doubled = self.linear.solve(twice, b, solution.value, self.rtol, self.max_steps).value
+        return Adjoint(solution, damped, raises, doubled, time.perf_counter() - began)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
         """The undamped curvature operator that the damping asks for."""
@@ -104,13 +106,4 @@ class AdjointSolver:
                 "solver.damping: Gauss-Newton needs every loss term as outputs and loss of outputs (CompositeTerm), "
                 f"got {len(terms) - len(composite)} of {len(terms)} without"
             )
-        return GaussNewtonOperator(composite, params)
-
-    def _sensitivity(self, operator: Matvec, damping: float, b: Tensor, solution: Solution) -> float:
-        size = norm(solution.value)
-        if size == 0.0:
-            return float("nan")
-        doubled = self.linear.solve(
-            Shifted(operator, 2.0 * damping), b, solution.value, self.rtol, self.max_steps
-        )
-        return norm(doubled.value - solution.value) / size
+        return GaussNewtonOperator(composite, params, self.retain_graph)

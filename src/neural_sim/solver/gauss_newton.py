@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,22 +30,29 @@ class GaussNewtonOperator:
     derivative.
 
     Equal to the Hessian where outputs are linear in the parameters; positive semi-definite where every loss
-    is convex in the outputs (a sigmoid focal loss is not, everywhere). Needs forward-mode rules. Raises
-    ``ValueError`` without terms.
+    is convex in the outputs (a sigmoid focal loss is not, everywhere). Needs forward-mode rules. ``retain_graph``
+    keeps every term's outputs and the way back between products. Raises ``ValueError`` without terms.
     """
 
-    def __init__(self, terms: Sequence[CompositeTerm], params: Mapping[str, Tensor]) -> None:
+    def __init__(
+        self, terms: Sequence[CompositeTerm], params: Mapping[str, Tensor], retain_graph: bool = False
+    ) -> None:
         if not terms:
             raise ValueError("GaussNewtonOperator: got no loss terms, want at least one")
         self._terms = list(terms)
         self._params = {name: tensor.detach() for name, tensor in params.items()}
         self._point = flatten(self._params)
+        self._retained = list(self._pulled_back()) if retain_graph else None
+
+    def _pulled_back(self) -> Iterator[tuple[CompositeTerm, Any, Callable]]:
+        """Each term with its outputs at the parameters and the product with its Jacobian's transpose."""
+        for term in self._terms:
+            yield term, *torch.func.vjp(term.outputs, self._params)[:2]
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         tangent = unflatten(vector, self._params)
         total = torch.zeros_like(vector)
-        for term in self._terms:
-            outputs, pull_back = torch.func.vjp(term.outputs, self._params)[:2]
+        for term, outputs, pull_back in self._pulled_back() if self._retained is None else self._retained:
             moved = torch.func.jvp(term.outputs, (self._params,), (tangent,))[1]
             curved = torch.func.jvp(torch.func.grad(term.loss), (outputs,), (moved,))[1]
             (part,) = pull_back(curved)
