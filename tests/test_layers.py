@@ -7,7 +7,8 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "cameras", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver",
-         "gradient", "settings", "outer", "store", "codec", "report", "artifacts", "pipeline", "main")  # fmt: skip
+         "gradient", "settings", "outer", "stress", "store", "codec", "report", "artifacts", "pipeline",
+         "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 

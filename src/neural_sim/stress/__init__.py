@@ -1,0 +1,1 @@
+"""Stiff and extreme cases, each held to a tolerance from theory or from a float64 reference."""
