@@ -81,9 +81,12 @@ class Rooms:
     def compose(self, rgb, opacity):
         return self.synthesizer.compose(rgb, opacity, self.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
 
-    def loss_of(self, params, images, index):
+    def loss_of(self, params, images, index, boxes=None):
         features = self.detector.features(self.backbone, images)
-        return self.detector.per_image_loss(params, features, self.targets.select(index))
+        targets = self.targets.select(index)
+        if boxes is not None:
+            targets = self.detector.assign(boxes, torch.ones(len(boxes), 1, dtype=torch.long))
+        return self.detector.per_image_loss(params, features, targets)
 
     def losses(self, params, index):
         features = [level[index] for level in self.features]
@@ -125,6 +128,35 @@ def test_pathwise_equals_autograd_through_every_room(rooms, pathwise):
     )
     assert float(reference.norm()) > 0.0
     torch.testing.assert_close(ours.value, reference, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_pathwise_with_moving_boxes_equals_autograd_through_every_room(rooms, pathwise, forward):
+    """The path through the regression targets is added, and is no rounding error beside the tolerance."""
+    moving = dataclasses.replace(rooms.synthesizer, label_gradient="differentiable")
+
+    def compose(rgb, opacity):
+        return moving.compose(rgb, opacity, rooms.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
+
+    psi = rooms.psi.clone().requires_grad_()
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in rooms.trainable.items()}
+    made = compose(*rooms.render(psi))
+    assert made.present.all() and made.boxes.requires_grad
+    loss = rooms.loss_of(leaves, made.images, torch.arange(COUNT), made.boxes).mean()
+    slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
+    along = sum((slope * rooms.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+    (reference,) = torch.autograd.grad(along, psi)
+    batch = rooms.object_images()
+    path = dataclasses.replace(
+        batch.path,
+        boxes=lambda opacity: compose(batch.path.rgb, opacity).boxes,
+        tangents=rooms.tangents(batch.draw, ("phi",)) if forward else None,
+    )
+    arguments = (rooms.loss_of, rooms.trainable, rooms.vector)
+    ours = pathwise(*arguments, dataclasses.replace(batch, path=path), chunk_size=3)
+    torch.testing.assert_close(ours.value, reference, rtol=1e-8, atol=1e-11)
+    still = pathwise(*arguments, batch)
+    assert float((ours.value - still.value).norm()) > 1e-4 * float(reference.norm())
 
 
 def test_patches_and_tangents_agree_on_the_field(rooms):

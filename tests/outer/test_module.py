@@ -109,11 +109,15 @@ def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
         ("linear", {"relaxation": "gumbel_rao", "conditional_draws": 3}),
     ],
 )
-def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean, settings):
+@pytest.mark.parametrize("label_gradient", ["ignored", "differentiable"])
+def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
+    scene, bin_mean, settings, label_gradient
+):
     """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
     fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
     pose = Pose(bins=4, temperature=1.0, bin_mean=bin_mean)
-    wide = dataclasses.replace(scene, fields=fields, pose=pose)
+    synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
+    wide = dataclasses.replace(scene, fields=fields, pose=pose, synthesizer=synthesizer)
     generator = torch.Generator().manual_seed(1)
     detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
     params = {name: value.double() for name, value in detector.init(generator).items()}
@@ -126,7 +130,7 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin
     rendered = wide.training_set(psi, 4, generator, forward.relaxed)
     assert all(set(part.tangents) == {"phi"} for part in rendered)
     images = join(rendered)
-    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, None)
+    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)
     weights = torch.full((8,), 0.125, dtype=torch.float64)
     for held in object_images(wide, rendered, psi, weights).values():
         bare = dataclasses.replace(held, path=dataclasses.replace(held.path, tangents=None))

@@ -25,10 +25,18 @@ class IndexedLoss(Protocol):
 
 
 class ImageLoss(Protocol):
-    """Losses of training images, differentiable (twice in all) in parameters and images; targets by row ``index``."""
+    """Losses of training images, differentiable (twice in all) in parameters and images; targets by row ``index``.
+
+    Where ``boxes`` are given, they take the place of those rows' boxes, and the losses are differentiable in them too.
+    """
 
     def __call__(
-        self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
+        self,
+        params: Params,
+        images: Float[Tensor, "n 3 h w"],
+        index: Int[Tensor, "n"],
+        boxes: Float[Tensor, "n boxes 4"] | None = None,
+        /,
     ) -> Float[Tensor, "n"]: ...
 
 
@@ -53,11 +61,11 @@ class Losses:
 class RenderedPath:
     """How one object's images came from psi, so that the way can be walked again with derivatives.
 
-    ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to
-    premultiplied colour [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and
-    opacity maps to images with the nuisance bound. ``rgb`` and ``opacity`` are the first render's.
-    ``tangents``, where that render carried them (forward mode), hold the maps' derivatives by the numbers of
-    the draw that psi moves.
+    ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to premultiplied colour
+    [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images with the
+    nuisance bound, ``boxes`` opacity maps to the images' boxes where the boxes' derivative is wanted. ``rgb`` and
+    ``opacity`` are the first render's. ``tangents``, where that render carried them (forward mode), hold the maps'
+    derivatives by the numbers of the draw that psi moves.
     """
 
     relaxed: Callable[[Float[Tensor, "k"]], SceneDraw]
@@ -67,6 +75,7 @@ class RenderedPath:
     rgb: Float[Tensor, "n h w 3"]
     opacity: Float[Tensor, "n h w"]
     tangents: Mapping[str, Maps] | None = None
+    boxes: Callable[[Float[Tensor, "n h w"]], Float[Tensor, "n boxes 4"]] | None = None
 
 
 @dataclass(frozen=True)

@@ -56,20 +56,33 @@ def image_cotangent(
     ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the images, is always
     reverse.
     """
+    return input_cotangents(loss_of, params, vector, (images,), index, weights, chunk_size, mode)[0]
+
+
+def input_cotangents(
+    loss_of: ImageLoss,
+    params: Params,
+    vector: Params,
+    inputs: tuple[Tensor, ...],
+    index: Int[Tensor, "n"],
+    weights: Float[Tensor, "n"],
+    chunk_size: int = 16,
+    mode: ThetaMode = "forward",
+) -> tuple[Tensor, ...]:
+    """``image_cotangent`` of images and, where ``inputs`` has them too, boxes."""
     _check(mode, chunk_size)
     along = _forward_scores if mode == "forward" else _reverse_scores
-    if not len(images):
-        return torch.zeros_like(images)
-    cotangents = []
-    for chunk, rows, weight in zip(
-        images.split(chunk_size), index.split(chunk_size), weights.split(chunk_size), strict=True
+    if not len(index):
+        return tuple(torch.zeros_like(values) for values in inputs)
+    parts = []
+    for rows, weight, *chunk in zip(
+        *(values.split(chunk_size) for values in (index, weights, *inputs)), strict=True
     ):
-        leaf = chunk.detach().requires_grad_()
+        leaves = [values.detach().requires_grad_() for values in chunk]
         with torch.enable_grad():
-            score = along(lambda p, leaf=leaf, rows=rows: loss_of(p, leaf, rows), params, vector)
-            (cotangent,) = torch.autograd.grad(score @ weight.to(score), leaf, materialize_grads=True)
-        cotangents.append(cotangent.detach())
-    return torch.cat(cotangents)
+            score = along(lambda p, x=leaves, rows=rows: loss_of(p, x[0], rows, *x[1:]), params, vector)
+            parts.append(torch.autograd.grad(score @ weight.to(score), leaves, materialize_grads=True))
+    return tuple(torch.cat(cotangents).detach() for cotangents in zip(*parts, strict=True))
 
 
 def _forward_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:

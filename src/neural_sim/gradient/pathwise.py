@@ -27,7 +27,7 @@ from neural_sim.gradient.base import (
     RenderedPath,
     from_contributions,
 )
-from neural_sim.gradient.mixed import ThetaMode, image_cotangent
+from neural_sim.gradient.mixed import ThetaMode, input_cotangents
 from neural_sim.parameter.pose import Relaxation
 from neural_sim.synthesis.motion import CONTINUOUS
 from neural_sim.synthesis.scene import RelaxedDraws
@@ -100,11 +100,12 @@ class PathwiseEstimator:
             raise ValueError(
                 "pathwise: these images carry no rendered path, which this estimator differentiates"
             )
-        cotangent = image_cotangent(
-            losses.from_images, params, vector, images.images, images.index, images.weights,
+        inputs = (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
+        cotangents = input_cotangents(
+            losses.from_images, params, vector, inputs, images.index, images.weights,
             self.chunk_size, self.theta_mode,
         )  # fmt: skip
-        maps = map_cotangents(path, cotangent)
+        maps = map_cotangents(path, *cotangents)
         if path.tangents is not None:
             along_draw = contract(path.tangents, maps)
         else:
@@ -112,13 +113,19 @@ class PathwiseEstimator:
         return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
 
 
-def map_cotangents(path: RenderedPath, image_cotangents: Float[Tensor, "n 3 h w"]) -> Maps:
-    """Image cotangents pulled back through the compositing onto the rendered maps."""
+def map_cotangents(
+    path: RenderedPath,
+    image_cotangents: Float[Tensor, "n 3 h w"],
+    box_cotangents: Float[Tensor, "n boxes 4"] | None = None,
+) -> Maps:
+    """Cotangents of images, and of boxes where they move, pulled back through the compositing onto the maps."""
     rgb, opacity = path.rgb.detach().requires_grad_(), path.opacity.detach().requires_grad_()
     with torch.enable_grad():
-        images = path.compose(rgb, opacity)
-    pulled = torch.autograd.grad(images, (rgb, opacity), image_cotangents, materialize_grads=True)
-    return Maps(*pulled)
+        made, pulled = [path.compose(rgb, opacity)], [image_cotangents]
+        if path.boxes is not None and box_cotangents is not None:
+            made.append(path.boxes(opacity))
+            pulled.append(box_cotangents)
+    return Maps(*torch.autograd.grad(made, (rgb, opacity), pulled, materialize_grads=True))
 
 
 def patch_rays(

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
-from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
+from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
 from neural_sim.synthesis.scene import RenderedObject, Scene
+from neural_sim.types import LabelledImages
 
 
-def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> Callable[..., Tensor]:
-    """Losses of images, differentiable in their pixels: an ``ImageLoss``."""
+def image_losses(
+    detector: Detector, backbone: Parameters, targets: Targets, labels: Int[Tensor, "images boxes"]
+) -> ImageLoss:
+    """Losses of images, differentiable in their pixels, and in their boxes where those are given."""
 
-    def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
-        return detector.per_image_loss(params, detector.features(backbone, chunk), targets.select(index))
+    def losses(params: Parameters, chunk: Tensor, index: Tensor, boxes: Tensor | None = None) -> Tensor:
+        wanted = targets.select(index)
+        if boxes is not None:
+            wanted = detector.assign(boxes, labels[index, : boxes.shape[1]])
+        return detector.per_image_loss(params, detector.features(backbone, chunk), wanted)
 
     return losses
 
 
-def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | None) -> Losses:
-    """Losses of an iteration's training images, from features and from pixels, and of its probes."""
-    from_images = image_losses(cached.detector, backbone, cached.targets)
+def bound_losses(
+    cached: CachedSet, backbone: Parameters, labels: Int[Tensor, "images boxes"], probes: CachedSet | None
+) -> Losses:
+    """Losses of an iteration's training images, from features and from pixels, and of its probes.
+
+    ``labels`` are those of the training images' boxes.
+    """
+    from_images = image_losses(cached.detector, backbone, cached.targets, labels)
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
 
@@ -35,17 +45,19 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPat
     if noise is None or relaxed is None:
         raise ValueError("pathwise: these images were not drawn from psi afresh")
 
-    def compose(rgb: Tensor, opacity: Tensor) -> Tensor:
-        return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins).images
+    def compose(rgb: Tensor, opacity: Tensor) -> LabelledImages:
+        return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins)
 
+    moving = scene.synthesizer.label_gradient == "differentiable"
     return RenderedPath(
         relaxed=lambda psi: scene.pose.relaxed(psi, noise, relaxed.relaxation),
         render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
-        compose=compose,
+        compose=lambda rgb, opacity: compose(rgb, opacity).images,
         camera=scene.camera,
         rgb=part.rgb,
         opacity=part.opacity,
         tangents=part.tangents,
+        boxes=(lambda opacity: compose(part.rgb, opacity).boxes) if moving else None,
     )
 
 

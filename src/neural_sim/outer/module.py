@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 import warnings
@@ -18,15 +19,19 @@ from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator
-from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
+from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, SplitLoss, hypergradient
 from neural_sim.outer.binding import bound_losses, object_images
+from neural_sim.outer.certificate import Certificate, certify, line
 from neural_sim.outer.records import IterationRecord, LearnedPsi
 from neural_sim.parameter.update import UpdateState
+from neural_sim.outer.retrained import Check, check_step
 from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.types import LabelledImages
+
+logger = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -74,6 +79,10 @@ class SimulatorModule(pl.LightningModule):
         if settings.pool_per_bin and not estimator.relaxed:
             self._pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self._adjoint: Tensor | None = None
+        self._warm_start = detector.split(params)[1]
+        # A generator of its own, so that being certified does not change a run.
+        self._check_generator = torch.Generator().manual_seed(generator.initial_seed() + 1)
+        self._stopped = False
 
     def configure_optimizers(self) -> None:
         return None
@@ -95,7 +104,22 @@ class SimulatorModule(pl.LightningModule):
         with _timed(seconds, "hypergradient"):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
-        self._record(result, images, training_loss, seconds)
+        with _timed(seconds, "certify"):
+            check = self._check(result)
+        certificate = certify(
+            result, self.scene.names, check, self.settings.trust, self.settings.on_untrusted
+        )
+        self._record(result, certificate, images, training_loss, seconds)
+        self._move(result, certificate)
+
+    def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
+        return -1 if self._stopped else None
+
+    def _move(self, result: Hypergradient, certificate: Certificate) -> None:
+        """psi's step, or what its certificate leaves of it."""
+        self._stopped = certificate.action == "stopped"
+        if certificate.action in ("skipped", "stopped"):
+            return
         gradient, error = (
             torch.stack([values[name] for name in self.scene.names]).to(self.psi)
             for values in (result.psi_gradients, result.standard_errors)
@@ -104,7 +128,8 @@ class SimulatorModule(pl.LightningModule):
         moved, self._update_state = self.settings.update.step(
             self.psi, log_p, gradient, error, self._update_state
         )
-        self.psi.data = moved
+        part = self.settings.trust.shrink if certificate.action == "shrunk" else 1.0
+        self.psi.data = self.psi + part * (moved - self.psi)
 
     def _train(self, images: LabelledImages) -> float:
         if self.settings.epochs == 0:
@@ -117,8 +142,11 @@ class SimulatorModule(pl.LightningModule):
             epochs=self.settings.epochs,
             batch_size=self.batch_size,
             learning_rate=self.settings.learning_rate,
-            weight_decay=self.weight_decay,
+            # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
+            weight_decay=0.0 if self.detector.proximal > 0.0 else self.weight_decay,
             trainable_only=True,
+            proximal=self.detector.proximal,
+            anchor=self._warm_start,
         )
         return history.losses[-1]
 
@@ -130,8 +158,11 @@ class SimulatorModule(pl.LightningModule):
         weights = torch.full((count,), 1.0 / count)
         wanted = self.settings.curvature_images
         subset = torch.randperm(count, generator=self.generator)[:wanted] if 0 < wanted < count else None
-        inner = InnerProblem(trainable, cached.losses, weights, subset=subset)
-        losses = bound_losses(cached, self._backbone, self._probe_set)
+        inner = InnerProblem(
+            trainable, SplitLoss(cached.outputs, cached.losses_of), weights,
+            proximal=self.detector.proximal, anchor=self._warm_start, subset=subset,
+        )  # fmt: skip
+        losses = bound_losses(cached, self._backbone, images.labels, self._probe_set)
         held = object_images(self.scene, rendered, self.psi, weights)
         estimates = {
             name: self._bind(losses, part, self._probes.get(label))
@@ -155,20 +186,55 @@ class SimulatorModule(pl.LightningModule):
 
     def _draw_probes(self) -> None:
         """New probes each iteration, so that what is peculiar to some does not push psi the same way every time."""
-        per_bin = self.estimator.probes_per_bin
-        if per_bin == 0:
-            return
+        if self.estimator.probes_per_bin:
+            self._probes, self._probe_set = self._every_bin(self.estimator.probes_per_bin, self.generator)
+
+    def _every_bin(self, per_bin: int, generator: torch.Generator) -> tuple[dict[int, Probes], CachedSet]:
+        """``per_bin`` images of every bin of every object, with their features."""
         source = self._pool.every_bin if self._pool else self.scene.probes
-        drawn = [source(label, per_bin, self.generator) for label in range(len(self.scene.names))]
+        drawn = [source(label, per_bin, generator) for label in range(len(self.scene.names))]
         each = self.scene.pose.bins * per_bin
-        self._probes = {
+        probes = {
             label: Probes(torch.arange(each) + label * each, self.scene.pose.bin_of(part.draw))
             for label, part in enumerate(drawn)
         }
-        self._probe_set = CachedSet.of(self.detector, self._backbone, join(drawn))
+        return probes, CachedSet.of(self.detector, self._backbone, join(drawn))
+
+    def _check(self, result: Hypergradient) -> Check | None:
+        """Every ``certify_every`` steps, one object's gradient against the retrained problem of this step's probes.
+
+        That problem has the proximal term whose exact derivative the step's solve took: its damping, held at the
+        parameters of this step, beside the detector's own. Estimators without probes get images drawn for the purpose.
+        """
+        every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
+        done = len(self.records) + 1
+        if every == 0 or done % every:
+            return None
+        probes, held = self._probes, self._probe_set
+        if held is None or self.estimator.probes_per_bin < per_bin:
+            probes, held = self._every_bin(per_bin, self._check_generator)
+        label = (done // every - 1) % len(self.scene.names)
+        return check_step(
+            self.detector.split(self.theta)[1],
+            self._warm_start,
+            (self.detector.proximal, result.damping.value),
+            held,
+            [probes[i] for i in range(len(self.scene.names))],
+            per_bin,
+            self._validation,
+            self.scene.pose.log_probabilities,
+            self.psi.detach(),
+            label,
+            result.psi_gradients[self.scene.names[label]],
+        )
 
     def _record(
-        self, result: Hypergradient, images: LabelledImages, training_loss: float, seconds: dict[str, float]
+        self,
+        result: Hypergradient,
+        certificate: Certificate,
+        images: LabelledImages,
+        training_loss: float,
+        seconds: dict[str, float],
     ) -> None:
         log_p = self.scene.pose.log_probabilities(self.psi.detach())
         _, trainable = self.detector.split(self.theta)
@@ -176,26 +242,18 @@ class SimulatorModule(pl.LightningModule):
             validation_loss = float(sum(term(trainable) for term in self._validation.mean_terms()))
         if validation_loss < self.best_loss:
             self.best_loss, self.best_psi = validation_loss, self.psi.detach().clone()
-        spectrum = result.damping.spectrum
-        noise = [float(result.signal_to_noise[name].median()) for name in self.scene.names]
         record = IterationRecord(
             probabilities=log_p.exp().tolist(),
             entropies=(-(log_p.exp() * log_p).sum(-1)).tolist(),
             gradient_norms=[float(result.psi_gradients[name].norm()) for name in self.scene.names],
-            signal_to_noise=noise,
             validation_loss=validation_loss,
             training_loss=training_loss,
-            stationarity=result.stationarity,
-            solver_status=result.solution.status.name,
-            solver_steps=result.solution.steps,
-            solver_residual=result.solution.residual,
-            damping=result.damping.value,
-            curvature_min=spectrum.smallest if spectrum else math.nan,
-            curvature_max=spectrum.largest if spectrum else math.nan,
+            certificate=certificate,
             images_without_box=int((~images.present.any(-1)).sum()),
             seconds=seconds,
         )
         self.records.append(record)
+        logger.info(line(certificate, len(self.records), self.settings.iterations, validation_loss))
 
 
 def learn_psi(module: SimulatorModule, progress: bool) -> LearnedPsi:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -40,15 +41,18 @@ class Synthesizer:
         shift: largest in-image shift, as a fraction of the image's width and height.
         threshold: opacity above which a pixel belongs to the object.
         minimum_area: fewest pixels of an object that get a box; below, the image has none.
+        label_gradient: ``ignored`` is the paper's; ``differentiable`` lets boxes carry the derivative of their
+            edges, so that the pathwise gradient sees that regression targets move with the object.
 
     Raises:
-        ValueError: a fraction outside [0, 1], a threshold outside [0, 1) or a negative area.
+        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, another label_gradient.
     """
 
     background: Background
     shift: float = 0.0
     threshold: float = 0.5
     minimum_area: float = 16.0
+    label_gradient: Literal["ignored", "differentiable"] = "ignored"
 
     def __post_init__(self) -> None:
         if not hasattr(self.background, "draw"):
@@ -59,6 +63,10 @@ class Synthesizer:
             raise ValueError(f"synthesis.threshold must lie in [0, 1), got {self.threshold}")
         if not self.minimum_area >= 0.0:
             raise ValueError(f"synthesis.minimum_area must not be negative, got {self.minimum_area}")
+        if self.label_gradient not in ("ignored", "differentiable"):
+            raise ValueError(
+                f"synthesis.label_gradient must be ignored or differentiable, got {self.label_gradient!r}"
+            )
 
     def draw_nuisance(self, n: int, camera: PinholeCamera, generator: torch.Generator) -> Nuisance:
         """Backgrounds and shifts of n images; independent of the scene parameters."""
@@ -75,12 +83,14 @@ class Synthesizer:
     ) -> LabelledImages:
         """One object's images with their boxes, on the device and in the dtype of ``rgb``.
 
-        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes are
-        not. An object that is out of frame or below ``minimum_area`` gives an image without a box.
+        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes in
+        ``opacity`` if ``label_gradient`` says so. An object that is out of frame or below ``minimum_area`` gives
+        an image without a box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
         images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
-        boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area)
+        moving = self.label_gradient == "differentiable"
+        boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
         labels = torch.where(present, label, -1)[:, None]
         made = LabelledImages(images, boxes, labels, bins.to(rgb.device))
         missing = images_without_boxes(made)
