@@ -74,7 +74,9 @@ def test_nothing_found_and_nothing_there():
     assert math.isnan(evaluate([empty], labelled([[-1]]), NAMES)["ap"])
 
 
-def test_mismatches_are_refused():
+def test_mismatches_and_empty_sets_are_refused():
+    with pytest.raises(ValueError, match="no images"):
+        evaluate([], labelled([[0]]).select(slice(0, 0)), NAMES)
     with pytest.raises(ValueError, match="prediction an image"):
         evaluate([], labelled([[0]]), NAMES)
     with pytest.raises(ValueError, match="has no name"):

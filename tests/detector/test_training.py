@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import DetectorModule
 from neural_sim.detector.training import cached_features, mean_loss, train_detector
 from neural_sim.types import LabelledImages
@@ -97,6 +98,9 @@ def test_nothing_to_train_on_is_refused(tools, generator, images):
         train(detector, start, images, epochs=0)
     with pytest.raises(ValueError, match="mean_loss"):
         mean_loss(detector, start, images.select(slice(0, 0)))
+    with pytest.raises(ValueError, match="no images"):
+        CachedSet.of(detector, detector.split(start)[0], images.select(slice(0, 0)))
+    assert detector.predict(start, images.images[:0]) == []
 
 
 def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, generator, images):

@@ -20,8 +20,10 @@ def evaluate(
         by class name. A class without a box in ``images`` is nan and stays out of the means.
 
     Raises:
-        ValueError: where predictions and images differ in number, or a label has no name.
+        ValueError: where there are no images, predictions and images differ in number, or a label has no name.
     """
+    if len(images) == 0:
+        raise ValueError("evaluate: got no images, want at least one")
     if len(predictions) != len(images):
         raise ValueError(
             f"evaluate: want a prediction an image, got {len(predictions)} for {len(images)} images"

@@ -219,7 +219,7 @@ class Detector:
         """
         backbone, trainable = self.split(params)
         found = []
-        for chunk in images.split(batch_size):
+        for chunk in images.split(batch_size) if len(images) else ():
             logits, deltas = self.outputs(trainable, self.features(backbone, chunk))
             found += [self._detections(*image) for image in zip(logits.sigmoid(), deltas, strict=True)]
         return found

@@ -46,7 +46,13 @@ class Batches:
 def cached_features(
     detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
 ) -> tuple[Tensor, ...]:
-    """Feature maps of all images, computed batch by batch, without a graph."""
+    """Feature maps of all images, computed batch by batch, without a graph.
+
+    Raises:
+        ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
+    """
+    if len(images) == 0:
+        raise ValueError("cached_features: got no images, want at least one")
     parts = [detector.features(backbone, chunk) for chunk in images.split(batch_size)]
     return tuple(torch.cat(level) for level in zip(*parts, strict=True))
 
