@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 from neural_sim.parameter.update import Update
 from neural_sim.types import PinholeCamera
+
+OnUntrusted = Literal["shrink", "skip", "stop"]
 
 
 def _at_least(where: str, smallest: float, **values: float) -> None:
@@ -67,12 +69,43 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Trust:
+    """What a psi step's hypergradient must meet to be trusted; None makes no demand.
+
+    ``max_residual`` of the adjoint solve, relative; ``max_stationarity`` of ``|dL_train/dtheta|``; ``max_sensitivity``
+    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); ``min_signal_to_noise`` of the best
+    psi component of all objects; ``min_cosine`` with the retrained finite difference (wants ``outer.certify_every``).
+    ``shrink`` is the part of an untrusted step that is taken where ``outer.on_untrusted`` says shrink.
+    """
+
+    max_residual: float | None = 0.1
+    max_stationarity: float | None = None
+    max_sensitivity: float | None = None
+    min_signal_to_noise: float | None = 1.0
+    min_cosine: float | None = 0.0
+    shrink: float = 0.25
+
+    def __post_init__(self) -> None:
+        limits = {
+            "max_residual": self.max_residual, "max_stationarity": self.max_stationarity,
+            "max_sensitivity": self.max_sensitivity, "min_signal_to_noise": self.min_signal_to_noise,
+        }  # fmt: skip
+        _at_least("outer.trust", 0, **{name: limit for name, limit in limits.items() if limit is not None})
+        if self.min_cosine is not None and not -1.0 <= self.min_cosine <= 1.0:
+            raise ValueError(f"outer.trust.min_cosine must lie in [-1, 1], got {self.min_cosine}")
+        if not 0.0 < self.shrink < 1.0:
+            raise ValueError(f"outer.trust.shrink must lie in (0, 1), got {self.shrink}")
+
+
+@dataclass(frozen=True)
 class Outer:
     """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
 
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
-    estimator, which replays exact draws, always renders.
+    estimator, which replays exact draws, always renders. ``on_untrusted`` is what happens to a step that fails
+    ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite
+    differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
     """
 
     update: Update
@@ -82,8 +115,18 @@ class Outer:
     learning_rate: float = 5e-4
     curvature_images: int = 64
     pool_per_bin: int = 24
+    trust: Trust = field(default_factory=Trust)
+    on_untrusted: OnUntrusted = "shrink"
+    certify_every: int = 0
+    certify_per_bin: int = 1
 
     def __post_init__(self) -> None:
         _at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
         _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
         _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
+        _at_least("outer", 0, certify_every=self.certify_every)
+        _at_least("outer", 1, certify_per_bin=self.certify_per_bin)
+        if self.on_untrusted not in get_args(OnUntrusted):
+            raise ValueError(
+                f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
+            )

@@ -71,7 +71,7 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     first = learned.records[0]
     assert first.probabilities == [[0.25] * 4] * 2
     assert first.entropies == pytest.approx([math.log(4)] * 2)
-    assert math.isfinite(first.validation_loss) and first.damping > 0
+    assert math.isfinite(first.validation_loss) and first.certificate.damping > 0
     assert {"render", "train", "hypergradient", "hypergradient_solve"} <= set(first.seconds)
     assert torch.isfinite(learned.last).all() and (learned.last != 0).any()
     assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()

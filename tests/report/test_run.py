@@ -17,8 +17,12 @@ def results():
     peaked = torch.tensor([[0.85, 0.05, 0.05, 0.05], [0.25] * 4], dtype=torch.float64)
     record = {
         "probabilities": uniform.tolist(), "entropies": [1.0, 1.0], "gradient_norms": [0.1, 0.2],
-        "validation_loss": 0.5, "training_loss": float("nan"), "stationarity": 1.0, "solver_steps": 3,
-        "solver_residual": 0.01, "damping": 2.0, "seconds": {"render": 0.5},
+        "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
+        "certificate": {
+            "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
+            "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "action": "shrunk",
+            "doubts": ["signal"], "signal_to_noise": [[0.1, 0.2, 0.3, float("inf")]] * 2,
+        },
     }  # fmt: skip
     scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"a": 0.6, "b": float("nan")}, "per_class_ap50": {}}
     return RunResults(
@@ -34,12 +38,14 @@ def test_results_are_json_by_the_standard(results, tmp_path):
     held = json.loads(write_results(results, tmp_path).read_text(), parse_constant=pytest.fail)
     assert held["ap"]["ns"]["per_class"]["b"] is None
     assert held["total_variation"]["a"] == {"initial": pytest.approx(0.6), "learned": 0.0}
+    assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
     assert held["psi"]["a"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
 
 
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
-    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan"):
+    trust = "untrusted psi steps: 2 of 2; shrunk 2; signal 2; cosine with retrained differences 0.90, 0.90"
+    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", trust):
         assert word in text
 
 

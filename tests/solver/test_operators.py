@@ -10,11 +10,12 @@ import torch
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
+from neural_sim.solver.exact import Exact
 from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import lanczos, random_start
-from neural_sim.solver.operator import dense
+from neural_sim.solver.operator import Shifted, columns
 from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
@@ -55,6 +56,11 @@ def test_hessian_products_equal_the_dense_hessian(network, mode, retain):
     operator = HessianOperator(terms, params, mode, retain_graph=retain)
     tolerance = 1e-7 if mode == "central_difference" else 1e-12
     torch.testing.assert_close(operator.dense(), dense_hessian(params, terms), rtol=tolerance, atol=tolerance)
+    b = gradient(terms, params)
+    solution = Exact().solve(Shifted(operator, 9.0), b, rtol=1e-6)
+    expected = torch.linalg.solve(dense_hessian(params, terms) + 9.0 * torch.eye(len(b), dtype=DOUBLE), b)
+    torch.testing.assert_close(solution.value, expected, rtol=10 * tolerance, atol=10 * tolerance)
+    assert solution.products == len(b) + 1
 
 
 def test_central_difference_is_scale_free(network):
@@ -222,7 +228,7 @@ def test_adjoint_solves_the_damped_system(network, damping, generator):
     solver = AdjointSolver(ConjugateGradient(), damping, rtol=1e-10, max_steps=500, sensitivity=True)
     adjoint = solver.solve(terms, params, b, None, generator)
     operator = solver.operator(terms, params)
-    matrix = dense(operator, b.numel(), dtype=DOUBLE)
+    matrix = columns(operator, b)
     eye = torch.eye(b.numel(), dtype=DOUBLE)
     reference = torch.linalg.solve(matrix + adjoint.damping.value * eye, b)
     assert adjoint.solution.status is Status.CONVERGED

@@ -40,6 +40,16 @@ class CachedSet:
         """Losses of the images ``index`` as a function of their outputs alone, for Gauss-Newton products."""
         return self.detector.losses_of(outputs, self.targets.select(index))
 
+    def select(self, index: Tensor) -> CachedSet:
+        """The images ``index`` alone."""
+        features = tuple(level[index] for level in self.features)
+        return CachedSet(self.detector, features, self.targets.select(index))
+
+    def double(self) -> CachedSet:
+        """The same in float64."""
+        targets = Targets(self.targets.labels, self.targets.deltas.double())
+        return CachedSet(self.detector, tuple(level.double() for level in self.features), targets)
+
     def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
         """The mean loss as a sum over chunks."""
         count = len(self.targets)

@@ -23,8 +23,8 @@ from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, Split
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.certificate import Certificate, certify, line
 from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.outer.retrained import Check, as_double, binned_problem, check
 from neural_sim.parameter.update import UpdateState
-from neural_sim.outer.retrained import Check, check_step
 from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.pool import ImagePool
@@ -214,19 +214,13 @@ class SimulatorModule(pl.LightningModule):
         if held is None or self.estimator.probes_per_bin < per_bin:
             probes, held = self._every_bin(per_bin, self._check_generator)
         label = (done // every - 1) % len(self.scene.names)
-        return check_step(
-            self.detector.split(self.theta)[1],
-            self._warm_start,
-            (self.detector.proximal, result.damping.value),
-            held,
-            [probes[i] for i in range(len(self.scene.names))],
-            per_bin,
-            self._validation,
-            self.scene.pose.log_probabilities,
-            self.psi.detach(),
-            label,
-            result.psi_gradients[self.scene.names[label]],
-        )
+        trainable = self.detector.split(self.theta)[1]
+        pulls = [(self.detector.proximal, self._warm_start), (result.damping.value, trainable)]
+        ordered = [probes[i] for i in range(len(self.scene.names))]
+        problem = binned_problem(held, ordered, per_bin, pulls, self.scene.pose.log_probabilities)
+        validation = self._validation.double().mean_terms()
+        gradient = result.psi_gradients[self.scene.names[label]]
+        return check(problem, validation, self.psi.detach(), label, as_double(trainable), gradient)
 
     def _record(
         self,

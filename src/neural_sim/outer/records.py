@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.outer.certificate import Certificate
+
 
 @dataclass(frozen=True)
 class IterationRecord:
@@ -15,16 +17,9 @@ class IterationRecord:
     probabilities: list[list[float]]
     entropies: list[float]
     gradient_norms: list[float]
-    signal_to_noise: list[float]
     validation_loss: float
     training_loss: float
-    stationarity: float
-    solver_status: str
-    solver_steps: int
-    solver_residual: float
-    damping: float
-    curvature_min: float
-    curvature_max: float
+    certificate: Certificate
     images_without_box: int
     seconds: dict[str, float]
 

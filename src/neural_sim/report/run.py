@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from neural_sim.cameras import orbit
+from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.report import figures, tracking
 from neural_sim.synthesis.export import write_coco
@@ -21,6 +22,10 @@ from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
+_CERTIFIED = (
+    "stationarity", "solver_steps", "solver_residual", "damping", "curvature_min", "curvature_max", "condition",
+    "sensitivity", "cosine",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class RunResults:
                 "total_variation": self.total_variations(),
                 "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
+                "certificates": untrusted(self.records),
                 "iterations": list(self.records),
                 "fields": {name: history[-1] for name, history in self.fields.items() if history},
                 "seconds": dict(self.seconds),
@@ -87,11 +93,24 @@ class RunResults:
         for which in ("initial", "learned"):
             row = "".join(f"{distances[name][which]:>13.2f}" for name in self.names)
             lines.append(f"  {which:<18}{row}")
+        if self.records:
+            lines.append(_trust_line(untrusted(self.records)))
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
         lines.append(f"seconds: {spent}; peak memory {self.peak_memory_mb:.0f} MB")
         if self.left_out:
             lines.append(f"left out: {len(self.left_out)} stage results found in the store")
         return "\n".join(lines)
+
+
+def _trust_line(held: Mapping[str, Any]) -> str:
+    """How many psi steps were not trusted, why, and what became of them."""
+    text = f"untrusted psi steps: {held['untrusted']} of {held['steps']}"
+    for part in ("actions", "doubts"):
+        if held[part]:
+            text += "; " + ", ".join(f"{name} {count}" for name, count in held[part].items())
+    if held["cosines"]:
+        text += "; cosine with retrained differences " + ", ".join(f"{c:.2f}" for c in held["cosines"])
+    return text
 
 
 def write_results(results: RunResults, folder: Path) -> Path:
@@ -206,15 +225,12 @@ def _series(results: RunResults) -> dict[str, list[float]]:
                 series.setdefault(f"psi/{name}/bin_{b + 1}", []).append(p)
             series.setdefault(f"psi/{name}/entropy", []).append(record["entropies"][i])
             series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
-        for key in (
-            "validation_loss",
-            "training_loss",
-            "stationarity",
-            "solver_steps",
-            "solver_residual",
-            "damping",
-        ):
+            for b, ratio in enumerate(record["certificate"]["signal_to_noise"][i]):
+                series.setdefault(f"psi/{name}/signal_to_noise_{b + 1}", []).append(ratio)
+        for key in ("validation_loss", "training_loss"):
             series.setdefault(f"psi/{key}", []).append(record[key])
+        for key in _CERTIFIED:
+            series.setdefault(f"psi/{key}", []).append(record["certificate"][key])
         for phase, spent in record["seconds"].items():
             series.setdefault(f"psi/seconds_{phase}", []).append(spent)
     for name, history in results.fields.items():

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.base import Iterate, LinearSolver
-from neural_sim.solver.operator import Watched, dense, norm
+from neural_sim.solver.operator import Watched, norm
 from neural_sim.solver.solution import Status
 
 Method = Literal["eigen", "cholesky"]
@@ -43,7 +43,7 @@ class Exact(LinearSolver):
             raise ValueError(
                 f"exact: got {size} unknowns, max_size is {self.max_size}; use an iterative solver"
             )
-        matrix = dense(operator, size, dtype=rhs.dtype, device=rhs.device)
+        matrix = operator.dense(rhs)
         # Products may be unsymmetric by rounding. Halves first: a sum of entries near the largest float overflows.
         matrix = 0.5 * matrix + 0.5 * matrix.T
         return (

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.operator import dense
+from neural_sim.solver.operator import columns
 
 
 @dataclass(frozen=True)
@@ -61,4 +61,4 @@ class GaussNewtonOperator:
 
     def dense(self) -> Float[Tensor, "n n"]:
         """The matrix itself, one product a column."""
-        return dense(self, self._point.numel(), dtype=self._point.dtype, device=self._point.device)
+        return columns(self, self._point)

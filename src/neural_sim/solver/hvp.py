@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.operator import dense, norm
+from neural_sim.solver.operator import columns, norm
 
 Term = Callable[[dict[str, Tensor]], Tensor]
 Mode = Literal["reverse_over_reverse", "forward_over_reverse", "central_difference"]
@@ -65,9 +65,22 @@ class HessianOperator:
             return self._forward_over_reverse(vector)
         return self._reverse_over_reverse(vector)
 
-    def dense(self) -> Float[Tensor, "n n"]:
-        """The matrix itself, one product a column."""
-        return dense(self, self.size, dtype=self._point.dtype, device=self._point.device)
+    def dense(self, batch: int = 64) -> Float[Tensor, "n n"]:
+        """The matrix itself: ``batch`` columns at a time on a retained graph, else one product a column."""
+        if self._retained is None:
+            return columns(self, self._point)
+        basis = torch.eye(self.size, dtype=self._point.dtype, device=self._point.device)
+        total = torch.zeros_like(basis)
+        for point, slope in self._retained:
+            if slope.requires_grad:
+                parts = [
+                    torch.autograd.grad(
+                        slope, point, rows, retain_graph=True, is_grads_batched=True, materialize_grads=True
+                    )[0]
+                    for rows in basis.split(batch)
+                ]
+                total += torch.cat(parts)
+        return total
 
     def _gradient_graphs(self) -> Iterator[tuple[Tensor, Tensor]]:
         """For each term a leaf point and the gradient there, still attached to it."""

@@ -70,19 +70,37 @@ class Watched:
             self.observe(quotient, quotient)
         return product
 
+    def dense(self, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
+        """The operator's matrix, by its own ``dense`` where it has one; counted as a product a column."""
+        matrix = _own_matrix(self._matvec)
+        if matrix is None:
+            return columns(self, like)
+        self.products += like.numel()
+        if not bool(torch.isfinite(matrix).all()):
+            raise NonFiniteProduct("the operator's matrix is not finite")
+        self.observe(float(matrix.diagonal().min()), float(matrix.diagonal().max()))
+        return matrix
+
     def observe(self, low: float, high: float) -> None:
         """Widen the curvature range by values known otherwise, for instance eigenvalues."""
         self._low, self._high = min(self._low, low), max(self._high, high)
 
 
-def dense(
-    matvec: Matvec, size: int, *, dtype: torch.dtype, device: torch.device | str = "cpu"
-) -> Float[Tensor, "n n"]:
-    """The operator's matrix, one product a column: an oracle for small problems."""
-    matrix = torch.empty(size, size, dtype=dtype, device=device)
-    basis = torch.zeros(size, dtype=dtype, device=device)
-    for column in range(size):
+def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
+    """The operator's matrix, one product a column: an oracle for small problems. Type and device as ``like``."""
+    matrix = like.new_empty(like.numel(), like.numel())
+    basis = torch.zeros_like(like)
+    for column in range(like.numel()):
         basis[column] = 1.0
         matrix[:, column] = matvec(basis)
         basis[column] = 0.0
     return matrix
+
+
+def _own_matrix(matvec: Matvec) -> Tensor | None:
+    """The matrix of an operator that has a faster way to it than column by column, else None."""
+    if isinstance(matvec, Shifted):
+        matrix = _own_matrix(matvec.matvec)
+        return None if matrix is None else matrix + matvec.shift * torch.eye(len(matrix)).to(matrix)
+    own = getattr(matvec, "dense", None)
+    return None if own is None else own()

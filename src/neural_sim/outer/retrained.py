@@ -1,0 +1,214 @@
+"""The hypergradient by finite differences of a retrained inner problem: what the implicit one should agree with.
+
+The problem is small enough to be trained to its end: images of every bin on purpose, which psi enters by the bins'
+weights alone, so that its minimiser moves smoothly with psi and every number is deterministic.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
+from neural_sim.gradient.estimators import Probes
+from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
+from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.stratified import importance_weights, stratified
+from neural_sim.solver.hvp import Term
+from neural_sim.solver.newton import Minimum, minimise
+
+logger = logging.getLogger(__name__)
+STEP = 0.05  # logits
+TOLERANCE = 1e-7  # of a retraining's gradient norm
+
+
+@dataclass(frozen=True)
+class BinnedProblem:
+    """``L_train(theta, psi) = 1/objects sum_o sum_b p_b(psi_o) mean_b l(theta) + proximal/2 |theta - anchor|^2``.
+
+    ``probes`` are the rows and bins of every object's images among those of ``losses``; ``log_probabilities`` maps
+    logits to log p over the bins.
+    """
+
+    losses: IndexedLoss
+    probes: Sequence[Probes]
+    log_probabilities: Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
+    proximal: float
+    anchor: Params
+    chunk_size: int = 64
+
+    def weights(self, psi: Float[Tensor, "objects k"]) -> Float[Tensor, "n"]:
+        """The images' weights in L_train."""
+        weights = psi.new_zeros(sum(len(part.index) for part in self.probes))
+        for logits, part in zip(psi, self.probes, strict=True):
+            p = self.log_probabilities(logits).exp()
+            weights[part.index] = importance_weights(p, part.bins, 1.0 / len(self.probes))
+        return weights
+
+    def at(self, psi: Float[Tensor, "objects k"], params: Params) -> InnerProblem:
+        """The inner problem of these logits, at the parameters ``params``."""
+        anchor = self.anchor if self.proximal > 0.0 else None
+        return InnerProblem(params, self.losses, self.weights(psi), self.chunk_size, self.proximal, anchor)
+
+    def retrain(self, psi: Float[Tensor, "objects k"], start: Params, tolerance: float) -> Minimum:
+        """The minimiser reached from ``start``, its gradient's norm at most ``tolerance`` if it says converged."""
+        return minimise(self.at(psi, start).terms(), start, tolerance)
+
+    def estimate(
+        self, psi: Float[Tensor, "objects k"], label: int, params: Params
+    ) -> Callable[[Params], MixedDerivative]:
+        """``v -> d/dpsi <dL_train/dtheta, v>`` of one object: exact, since nothing here is sampled."""
+        part = self.probes[label]
+
+        def exact(vector: Params) -> MixedDerivative:
+            along = scores(self.losses, params, vector, part.index, self.chunk_size)
+            return stratified(along, part.bins, psi[label], self.log_probabilities, 1.0 / len(self.probes))
+
+        return exact
+
+
+@dataclass(frozen=True)
+class FiniteDifference:
+    """Central differences of L_val at retrained parameters, in centred logits of one object.
+
+    ``slope`` is the largest gradient norm that any retraining ended at; ``converged`` says whether all of them reached
+    the tolerance. ``products`` counts Hessian products, ``trainings`` the retrainings.
+    """
+
+    gradient: Float[Tensor, "k"]
+    converged: bool
+    slope: float
+    trainings: int
+    products: int
+
+
+def finite_difference(
+    problem: BinnedProblem,
+    validation: Sequence[Term],
+    psi: Float[Tensor, "objects k"],
+    label: int,
+    start: Params,
+    step: float = STEP,
+    tolerance: float = TOLERANCE,
+) -> FiniteDifference:
+    """dL_val/dpsi of object ``label`` by k - 1 central differences of ``step`` logits, two retrainings each.
+
+    ``start`` is the minimiser at ``psi``, from which every retraining sets out. Its own error: ``step``^2 / 6 times a
+    third derivative, and ``|dL_val/dtheta| tolerance / (proximal step)`` from retraining no further than ``tolerance``.
+    """
+    total, runs = torch.zeros_like(psi[label]), []
+    for direction in contrasts(psi.shape[-1]).to(psi):
+        values = []
+        for sign in (1.0, -1.0):
+            moved = psi.clone()
+            moved[label] += sign * step * direction
+            runs.append(problem.retrain(moved, start, tolerance))
+            with torch.no_grad():
+                values.append(math.fsum(float(term(runs[-1].params)) for term in validation))
+        total += (values[0] - values[1]) / (2.0 * step) * direction
+    return FiniteDifference(
+        total,
+        all(run.converged for run in runs),
+        max(run.slope for run in runs),
+        len(runs),
+        sum(run.products for run in runs),
+    )
+
+
+@dataclass(frozen=True)
+class Check:
+    """A step's gradient of one object against the finite difference; ``cosine`` is nan unless that one converged."""
+
+    cosine: float
+    label: int
+    difference: FiniteDifference
+
+
+def check(
+    problem: BinnedProblem,
+    validation: Sequence[Term],
+    psi: Float[Tensor, "objects k"],
+    label: int,
+    start: Params,
+    gradient: Float[Tensor, "k"],
+) -> Check:
+    """The cosine of ``gradient``, however it was estimated, with the retrained finite difference of ``problem``.
+
+    The problem is trained to its end from ``start`` first, so that a low cosine also tells of an inner problem that the
+    loop leaves far from its minimum, of a short solve and of a noisy estimate.
+    """
+    minimum = problem.retrain(psi, start, TOLERANCE)
+    if not minimum.converged:
+        logger.warning("certificate: retraining stopped at a gradient of %.2g; no cosine", minimum.slope)
+        return Check(
+            math.nan,
+            label,
+            FiniteDifference(torch.zeros_like(gradient), False, minimum.slope, 1, minimum.products),
+        )
+    found = finite_difference(problem, validation, psi, label, minimum.params)
+    if not found.converged:
+        logger.warning("certificate: a retraining stopped at a gradient of %.2g; no cosine", found.slope)
+        return Check(math.nan, label, found)
+    return Check(centred_cosine(gradient, found.gradient), label, found)
+
+
+def binned_problem(
+    images: CachedSet,
+    probes: Sequence[Probes],
+    per_bin: int,
+    pulls: Sequence[tuple[float, Params]],
+    log_probabilities: Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]],
+) -> BinnedProblem:
+    """The problem in float64 on the first ``per_bin`` ``images`` of every bin and object.
+
+    Each of ``pulls``, a weight lambda_i and a fixed theta_i, adds ``lambda_i/2 |theta - theta_i|^2``.
+    """
+    chosen = [first_of_every_bin(part, per_bin) for part in probes]
+    few = images.select(torch.cat([part.index for part in chosen])).double()
+    sizes = [len(part.index) for part in chosen]
+    rows = torch.arange(sum(sizes)).split(sizes)
+    held = [Probes(row, part.bins) for row, part in zip(rows, chosen, strict=True)]
+    weight, centre = merged_anchor([(weight, as_double(anchor)) for weight, anchor in pulls])
+    return BinnedProblem(SplitLoss(few.outputs, few.losses_of), held, log_probabilities, weight, centre)
+
+
+def as_double(params: Params) -> Params:
+    """The parameters in float64."""
+    return {name: value.double() for name, value in params.items()}
+
+
+def first_of_every_bin(probes: Probes, per_bin: int) -> Probes:
+    """The first ``per_bin`` images of every bin."""
+    kept = torch.cat([(probes.bins == b).nonzero()[:per_bin, 0] for b in probes.bins.unique()])
+    return Probes(probes.index[kept], probes.bins[kept])
+
+
+def merged_anchor(parts: Sequence[tuple[float, Params]]) -> tuple[float, Params]:
+    """Several terms ``lambda_i/2 |theta - theta_i|^2`` as one: the sum of the lambdas, and the weighted mean anchor."""
+    total = math.fsum(weight for weight, _ in parts)
+    if total == 0.0:
+        return 0.0, dict(parts[0][1])
+    names = parts[0][1]
+    return total, {n: torch.stack([w / total * anchor[n] for w, anchor in parts]).sum(0) for n in names}
+
+
+def contrasts(k: int) -> Float[Tensor, "k-1 k"]:
+    """Orthonormal rows that sum to zero (Helmert's): a basis of centred logits."""
+    rows = torch.zeros(k - 1, k, dtype=torch.float64)
+    for i in range(1, k):
+        rows[i - 1, :i], rows[i - 1, i] = 1.0, -float(i)
+    return rows / rows.norm(dim=-1, keepdim=True)
+
+
+def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
+    """Cosine of two gradients in centred logits, where softmax lives; nan where either vanishes."""
+    left, right = (g.double() - g.double().mean() for g in (left, right))
+    size = float(left.norm() * right.norm())
+    return float(left @ right) / size if size > 0.0 else math.nan
