@@ -83,6 +83,32 @@ def test_steps_are_finite_and_bounded_whatever_the_scale(update, scale):
     assert moved.abs().max() <= update.max_step * (1 + 1e-12)
 
 
+@pytest.mark.parametrize("update", [SGD(learning_rate=1e3), Adam(), Mirror()])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e308])
+def test_a_gradient_that_is_not_finite_is_refused_and_forgotten(update, bad):
+    psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
+    log_p, none = torch.log_softmax(psi, -1), torch.zeros_like(psi)
+    good = torch.tensor([[0.2, -0.3, 0.1]], dtype=torch.float64)
+    start = update.step(psi, log_p, good, none, UpdateState.zeros(psi))[1]
+    poisoned = torch.tensor([[bad, 1.0, -1.0]], dtype=torch.float64)
+    kept, state = update.step(psi, log_p, poisoned, none, start)
+    assert torch.equal(kept, psi) and state.refused == 1
+    after, _ = update.step(kept, log_p, good, none, state)
+    expected, _ = update.step(psi, log_p, good, none, start)
+    assert torch.equal(after, expected)
+
+
+def test_an_unknown_noise_shrinks_nothing_and_is_forgotten():
+    update, psi = Mirror(), torch.zeros(1, 3, dtype=torch.float64)
+    log_p, gradient = torch.log_softmax(psi, -1), torch.tensor([[0.2, -0.3, 0.1]], dtype=torch.float64)
+    unknown = torch.full_like(psi, torch.inf)
+    moved, state = update.step(psi, log_p, gradient, unknown, UpdateState.zeros(psi))
+    unshrunk, _ = update.step(psi, log_p, gradient, torch.zeros_like(psi), UpdateState.zeros(psi))
+    assert torch.equal(moved, unshrunk)
+    stays, _ = update.step(psi, log_p, gradient, torch.full_like(psi, 1e6), state)
+    assert torch.equal(stays, psi)
+
+
 def test_directions_are_shrunk_by_what_is_noise():
     direction = torch.tensor([[3.0, -4.0], [0.3, -0.4], [0.0, 0.0], [3.0, -4.0]], dtype=torch.float64)
     variance = torch.tensor([[2.0, 3.0], [2.0, 3.0], [1.0, 1.0], [torch.inf, 1.0]], dtype=torch.float64)

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class UpdateState:
-    """What an update carries between steps: moments of the direction, its noise variance, and the step count."""
+    """What an update carries between steps: moments of the direction, its noise variance, and the step count.
+
+    ``refused`` counts gradients that were not finite, or whose square is not: they move neither psi nor the moments.
+    """
 
     first: Float[Tensor, "objects k"]
     second: Float[Tensor, "objects k"]
     noise: Float[Tensor, "objects k"]
     steps: int = 0
+    refused: int = 0
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"]) -> UpdateState:
@@ -40,6 +47,25 @@ def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "ob
     return centred * (largest / size.clamp_min(largest))
 
 
+def _accept(
+    psi: Float[Tensor, "objects k"],
+    moved: Float[Tensor, "objects k"],
+    before: UpdateState,
+    first: Float[Tensor, "objects k"],
+    second: Float[Tensor, "objects k"],
+    noise: Float[Tensor, "objects k"],
+) -> tuple[Float[Tensor, "objects k"], UpdateState]:
+    """The step with what it carries on, or none at all where a number of it is not finite: NaN would stay for ever.
+
+    Noise that is not known (an infinite standard error) is not carried on either, for the same reason.
+    """
+    if all(bool(torch.isfinite(values).all()) for values in (moved, first, second)):
+        noise = torch.where(torch.isfinite(noise), noise, before.noise)
+        return moved, UpdateState(first, second, noise, before.steps + 1, before.refused)
+    _log.warning("psi: a step from a gradient that is not finite was refused")
+    return psi, replace(before, refused=before.refused + 1)
+
+
 @dataclass(frozen=True)
 class SGD:
     """Gradient descent with momentum on the logits (the paper: rate 1e-5 on its own loss scale, momentum 0.9)."""
@@ -57,7 +83,7 @@ class SGD:
         """psi after one step, and the state to pass to the next."""
         velocity = self.momentum * state.first + gradient
         moved = psi + bound(-self.learning_rate * velocity, self.max_step)
-        return moved, UpdateState(velocity, state.second, state.noise, state.steps + 1)
+        return _accept(psi, moved, state, velocity, state.second, state.noise)
 
 
 @dataclass(frozen=True)
@@ -83,7 +109,7 @@ class Adam:
         unbiased = first / (1 - beta1**steps)
         scale = (second / (1 - beta2**steps)).sqrt() + self.epsilon
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
-        return moved, UpdateState(first, second, state.noise, steps)
+        return _accept(psi, moved, state, first, second, state.noise)
 
 
 @dataclass(frozen=True)
@@ -125,7 +151,7 @@ class Mirror:
         kept = told_from_noise(velocity, noise) if self.shrink else 1.0
         unbiased = kept * velocity / (1 - self.momentum**steps)
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
-        return moved, UpdateState(velocity, second, noise, steps)
+        return _accept(psi, moved, state, velocity, second, noise)
 
 
 def told_from_noise(
