@@ -16,16 +16,25 @@ from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.settings import Outer
+from neural_sim.settings import Outer, Trust
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import LanczosDamping
+from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import RelaxedDraws, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
+
+SOLVER = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
+TINY = {
+    "num_classes": 2, "image_size": 32, "anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8,
+    "head_convs": 1,
+}  # fmt: skip
+MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48}
+PROXIMAL = 20.0  # past the negative curvature of an untrained detector
+NOTHING_WILL_DO = Trust(min_signal_to_noise=math.inf)
 
 
 def _block(seed):
@@ -43,14 +52,13 @@ def scene():
     return Scene(("a", "b"), (_block(1), _block(2)), NerfRenderer(), CAMERA, synthesizer, Pose(bins=4))
 
 
-def _module(scene, estimator, iterations=2):
+def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, **outer):
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = Detector(**(TINY | (detector or {})))
     validation = join(scene.training_set(torch.zeros(2, 4), 3, generator))
-    solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     return SimulatorModule(
         scene, detector, detector.init(generator), torch.zeros(2, 4), validation,
-        Outer(Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6),
+        Outer(Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer),
         estimator, solver, batch_size=4, weight_decay=0.0, generator=generator,
     )  # fmt: skip
 
@@ -194,3 +202,60 @@ def test_cached_losses_equal_losses_from_images(scene):
     torch.testing.assert_close(cached.losses(trainable, torch.arange(8)), direct, rtol=1e-4, atol=1e-5)
     total = sum(term(trainable) for term in cached.mean_terms(chunk_size=3))
     torch.testing.assert_close(total, direct.mean(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("action", ["skip", "stop", "shrink"])
+def test_untrusted_steps_are_skipped_stop_the_loop_or_are_shrunk(scene, action):
+    estimator = StratifiedEstimator(probes_per_bin=2)
+    learned = learn_psi(
+        _module(scene, estimator, 2, detector=MICRO, trust=NOTHING_WILL_DO, on_untrusted=action), False
+    )
+    assert all("signal" in record.certificate.doubts for record in learned.records)
+    assert len(learned.records) == (1 if action == "stop" else 2)
+    if action != "shrink":
+        assert not learned.last.any()
+        return
+    one = learn_psi(_module(scene, estimator, 1, detector=MICRO, trust=NOTHING_WILL_DO), False).last
+    free = learn_psi(
+        _module(scene, estimator, 1, detector=MICRO, trust=Trust(None, None, None, None)), False
+    ).last
+    torch.testing.assert_close(one, 0.25 * free)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [StratifiedEstimator(probes_per_bin=2), pytest.param(ReinforceEstimator(), marks=pytest.mark.slow)],
+    ids=lambda e: type(e).__name__,
+)
+def test_a_step_is_certified_by_retraining_without_changing_the_run(scene, estimator):
+    plain, certified = (
+        learn_psi(_module(scene, estimator, 2, detector=MICRO, certify_every=every), False)
+        for every in (0, 2)
+    )
+    first, second = (record.certificate for record in certified.records)
+    assert math.isnan(first.cosine) and -1.0 <= second.cosine <= 1.0
+    assert certified.records[1].seconds["certify"] > 0.0
+    assert plain.records[1].probabilities == certified.records[1].probabilities
+    assert plain.records[1].certificate.solver_residual == second.solver_residual
+
+
+@pytest.mark.parametrize(
+    "damping", [GaussNewtonDamping(1.0, lanczos_steps=4), FixedDamping(0.0)], ids=lambda d: d.curvature
+)
+def test_gauss_newton_and_the_proximal_problem_run_in_the_loop(scene, damping):
+    solver = AdjointSolver(ConjugateGradient(), damping, sensitivity=True)
+    module = _module(
+        scene,
+        StratifiedEstimator(probes_per_bin=2),
+        1,
+        solver,
+        {**MICRO, "proximal": PROXIMAL},
+        learning_rate=0.0,
+    )
+    certificate = learn_psi(module, False).records[0].certificate
+    assert certificate.solver_status == "CONVERGED" and certificate.damping == damping.value
+    assert (certificate.sensitivity > 0.0) == (damping.value > 0.0)
+    if (
+        damping.curvature == "gauss_newton"
+    ):  # the proximal term's own curvature, below which a near-convex loss adds none
+        assert PROXIMAL - 1e-2 <= certificate.curvature_min < certificate.curvature_max

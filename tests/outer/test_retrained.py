@@ -1,0 +1,159 @@
+"""The implicit hypergradient of a detector against the dense oracle and against finite differences of retraining."""
+
+import math
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.base import Probes
+from neural_sim.gradient.hypergradient import hypergradient
+from neural_sim.outer.retrained import (
+    BinnedProblem,
+    as_double,
+    binned_problem,
+    centred_cosine,
+    check,
+    contrasts,
+    finite_difference,
+    first_of_every_bin,
+    merged_anchor,
+)
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import FixedDamping
+from neural_sim.solver.exact import Exact
+from neural_sim.types import LabelledImages
+
+DOUBLE = torch.float64
+BINS, PROXIMAL = 3, 1.0
+PSI = torch.tensor([[0.3, -0.5, 0.2], [0.0, 0.9, -0.4]], dtype=DOUBLE)
+
+
+def log_probabilities(psi):
+    return torch.log_softmax(psi, -1)
+
+
+def stripes(labels, bins, generator):
+    """A square of stripes on noise: the object sets the colour, the bin the stripes' width and the square's size."""
+    side, where = 10 + 4 * bins, torch.randint(1, 9, (len(bins), 2), generator=generator)
+    images, boxes = 0.3 * torch.rand(len(bins), 3, 32, 32, generator=generator), []
+    for image, label, b, s, (x, y) in zip(images, labels, bins, side, where, strict=True):
+        pattern = ((torch.arange(s) // (b + 1)) % 2).float().expand(s, s)
+        image[int(label) * 2, y : y + s, x : x + s] = 0.3 + 0.7 * pattern
+        boxes.append([[x, y, x + s, y + s]])
+    return LabelledImages(images, torch.tensor(boxes, dtype=torch.float32), labels[:, None], bins)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """Two objects, three bins, the head of a micro detector trained to stationarity; one image a bin and object."""
+    generator = torch.Generator().manual_seed(0)
+    detector = Detector(
+        2, 32, "micro", strides=(8,), anchor_sizes=((16,),), anchor_reference=32, channels=8, head_convs=1
+    )
+    params = detector.init(generator)
+    backbone, trainable = detector.split(params)
+    fixed = {name: value.double() for name, value in trainable.items() if not name.startswith("head.")}
+    head = {name: value.double() for name, value in trainable.items() if name.startswith("head.")}
+    labels, bins = torch.arange(2).repeat_interleave(BINS), torch.arange(BINS).repeat(2)
+    held, validation = (
+        CachedSet.of(detector, backbone, stripes(labels, bins, generator)).double() for _ in range(2)
+    )
+    problem = BinnedProblem(
+        lambda head, rows: held.losses({**fixed, **head}, rows),
+        [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)],
+        log_probabilities, PROXIMAL, head,
+    )  # fmt: skip
+    terms = [lambda head: validation.losses({**fixed, **head}, torch.tensor([0, 1, 5])).mean()]
+    return problem, terms, problem.retrain(PSI, head, 1e-10)
+
+
+@pytest.fixture(scope="module")
+def oracle(problem):
+    return implicit(problem, Exact("cholesky"), 1e-12, 1)
+
+
+def implicit(problem, linear, rtol, max_steps):
+    binned, terms, minimum = problem
+    estimates = {str(label): binned.estimate(PSI, label, minimum.params) for label in range(2)}
+    solver = AdjointSolver(linear, FixedDamping(0.0), rtol=rtol, max_steps=max_steps)
+    inner = binned.at(PSI, minimum.params)
+    return hypergradient(inner, terms, estimates, solver, torch.Generator().manual_seed(0))
+
+
+def test_retraining_ends_at_a_stationary_point(problem):
+    _, _, minimum = problem
+    assert minimum.converged and minimum.slope < 1e-10
+
+
+def test_the_oracle_is_the_retrained_derivative(problem, oracle):
+    binned, terms, minimum = problem
+    assert oracle.stationarity < 1e-9 and oracle.solution.residual < 1e-12
+    found = finite_difference(binned, terms, PSI, 0, minimum.params, step=1e-2, tolerance=1e-10)
+    assert found.converged and found.trainings == 2 * (BINS - 1)
+    exact = oracle.psi_gradients["0"]
+    # step^2 / 6 of a third derivative of order one, in logits
+    assert (found.gradient - exact).norm() < 1e-3 * exact.norm()
+    assert centred_cosine(found.gradient, exact) > 1 - 1e-6
+
+
+def test_conjugate_gradients_reach_the_oracle_inside_40_products(problem, oracle):
+    found = implicit(problem, ConjugateGradient(), 1e-2, 40)
+    assert found.solution.status.trusted and found.solution.products <= 40
+    exact, close = (torch.cat(list(h.psi_gradients.values())) for h in (oracle, found))
+    assert (close - exact).norm() < 1e-2 * exact.norm()
+    tight = implicit(problem, ConjugateGradient(), 1e-11, 400)
+    assert (torch.cat(list(tight.psi_gradients.values())) - exact).norm() < 1e-9 * exact.norm()
+
+
+def test_a_check_takes_any_gradient_and_says_when_it_cannot(problem, oracle, monkeypatch):
+    binned, terms, minimum = problem
+    right = oracle.psi_gradients["1"]
+    assert check(binned, terms, PSI, 1, minimum.params, right).cosine > 0.9999
+    monkeypatch.setattr("neural_sim.outer.retrained.TOLERANCE", 1e-40)
+    hopeless = check(binned, terms, PSI, 1, minimum.params, right)
+    assert math.isnan(hopeless.cosine) and not hopeless.difference.converged
+
+
+def test_weights_are_the_bins_probabilities_shared_by_their_images(problem):
+    weights = problem[0].weights(PSI)
+    torch.testing.assert_close(weights, 0.5 * torch.softmax(PSI, -1).flatten())
+
+
+def test_several_pulls_are_one(generator):
+    points = [{"w": torch.randn(4, generator=generator, dtype=DOUBLE)} for _ in range(3)]
+    weight, anchor = merged_anchor([(2.0, points[0]), (0.5, points[1])])
+    slope = 2.0 * (points[2]["w"] - points[0]["w"]) + 0.5 * (points[2]["w"] - points[1]["w"])
+    torch.testing.assert_close(weight * (points[2]["w"] - anchor["w"]), slope)
+    assert merged_anchor([(0.0, points[0])])[0] == 0.0
+
+
+def test_a_binned_problem_takes_the_first_images_of_every_bin(generator):
+    bins = torch.tensor([2, 0, 0, 1, 2])
+    kept = first_of_every_bin(Probes(torch.arange(5) + 10, bins), 1)
+    assert kept.index.tolist() == [11, 13, 10] and kept.bins.tolist() == [0, 1, 2]
+    detector = Detector(2, 32, "micro", anchor_sizes=((14,), (28,)), channels=8, head_convs=1)
+    params = detector.init(generator)
+    backbone, trainable = detector.split(params)
+    labels, every = torch.zeros(6, dtype=torch.long), torch.arange(3).repeat_interleave(2)
+    images = CachedSet.of(detector, backbone, stripes(labels, every, generator))
+    problem = binned_problem(
+        images, [Probes(torch.arange(6), every)], 1, [(1.0, trainable)], log_probabilities
+    )
+    expected = images.double().losses(as_double(trainable), torch.tensor([0, 2, 4]))
+    torch.testing.assert_close(problem.losses(as_double(trainable), torch.arange(3)), expected)
+
+
+@pytest.mark.parametrize("k", [2, 3, 8])
+def test_contrasts_are_a_basis_of_centred_logits(k):
+    rows = contrasts(k)
+    torch.testing.assert_close(rows @ rows.T, torch.eye(k - 1, dtype=DOUBLE))
+    assert rows.sum(-1).abs().max() < 1e-14
+
+
+def test_cosines_are_blind_to_a_common_shift():
+    left, right = torch.tensor([1.0, 2.0, 4.0]), torch.tensor([3.0, 4.0, 6.0])
+    assert centred_cosine(left, right) == pytest.approx(1.0)
+    assert math.isnan(centred_cosine(left, torch.ones(3)))
