@@ -60,14 +60,7 @@ def build(config: DictConfig) -> Experiment:
     Raises:
         UserError: an unknown key, a value of the wrong type or out of range, with the key and what was got.
     """
-    try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except OmegaConfBaseException as error:
-        raise UserError(f"{error.full_key or 'configuration'}: {_first_line(error)}") from error
-    if not isinstance(plain, dict):
-        raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
-    plain = {str(key): value for key, value in plain.items()}
-    _check_top(plain)
+    plain = _plain(config)
     from neural_sim.artifacts import Experiment
 
     parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
@@ -88,6 +81,32 @@ def build(config: DictConfig) -> Experiment:
         config=plain,
         **parts,
     )
+
+
+def stress(config: DictConfig, folder: Path) -> int:
+    """Run the suite of ``conf/experiment/stress.yaml``, report in ``folder``; returns how many checks failed.
+
+    Raises:
+        UserError: an unknown key or family.
+    """
+    plain = _plain(config)
+    suite = _instantiate(plain["stress"], "stress")
+    from neural_sim.report.stress import report
+
+    return report(suite.run(plain["seed"], plain["progress"]), plain, folder)
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    """The configuration as plain values, its top level checked."""
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise UserError(f"{error.full_key or 'configuration'}: {_first_line(error)}") from error
+    if not isinstance(plain, dict):
+        raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
+    plain = {str(key): value for key, value in plain.items()}
+    _check_top(plain)
+    return plain
 
 
 def _check_top(plain: Mapping[str, Any]) -> None:
@@ -167,17 +186,29 @@ def _task(config: DictConfig) -> float | None:
     # Libraries on each other's deprecations: nothing that a user of this program can act on.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
+    folder = Path(runtime.runtime.output_dir)
     try:
+        if "stress" in config:
+            return _finish_stress(stress(config, folder), runtime.mode)
         experiment = build(config)
         from neural_sim.pipeline import run
 
-        return run(experiment, Path(runtime.runtime.output_dir))
+        return run(experiment, folder)
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise
         _log.debug("details", exc_info=True)
         print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _finish_stress(failed: int, mode: RunMode | None) -> float:
+    """Exit status 1 where a check failed; in a sweep the job raises, so that the others go on."""
+    if failed and mode == RunMode.MULTIRUN:
+        raise RuntimeError(f"stress: {failed} checks failed")
+    if failed:
+        sys.exit(1)
+    return 0.0
 
 
 def main() -> None:

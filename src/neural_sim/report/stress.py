@@ -1,0 +1,91 @@
+"""What the stress suite leaves: stress.json with every check, stress.md, a table on the screen, a run in MLflow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neural_sim.report import tracking
+from neural_sim.stress.cases import Result
+
+
+def by_case(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Results of each case, in the order they came."""
+    cases: dict[str, list[Result]] = {}
+    for result in results:
+        cases.setdefault(result.case, []).append(result)
+    return cases
+
+
+def failures(results: Sequence[Result]) -> list[Result]:
+    """The checks that failed."""
+    return [result for result in results if not result.passed]
+
+
+def table(results: Sequence[Result]) -> str:
+    """One line a case: its checks, the largest part of a tolerance that was used up, its seconds; then what failed."""
+    head = f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"
+    lines = [head]
+    for name, held in by_case(results).items():
+        used = max(result.used for result in held)
+        spent = sum(result.seconds for result in held)
+        lines.append(f"{name:<38}{len(held):>7}{len(failures(held)):>7}{used:>9.1g}{spent:>9.2f}")
+    wrong = failures(results)
+    lines += [
+        f"FAILED {r.case}: {r.quantity}: {r.value:.3g}, tolerance {r.tolerance:.3g} {r.status}" for r in wrong
+    ]
+    spent = sum(result.seconds for result in results)
+    lines.append(
+        f"{len(results)} checks in {len(by_case(results))} cases, {len(wrong)} failed, {spent:.1f} s"
+    )
+    return "\n".join(lines)
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """Every check as a table, case by case."""
+    parts = ["# Stress suite", f"{len(results)} checks, {len(failures(results))} failed."]
+    for name, held in by_case(results).items():
+        rows = [
+            f"| {r.quantity.replace('|', chr(92) + '|')} | {r.value:.3g} | {r.tolerance:.3g} | {r.status} | "
+            f"{'passed' if r.passed else '**failed**'} | {r.seconds:.3f} |"
+            for r in held
+        ]
+        header = ["| quantity | value | tolerance | status | | seconds |", "|---|---|---|---|---|---|"]
+        parts += [f"## {name}", "\n".join([*header, *rows])]
+    return "\n\n".join(parts) + "\n"
+
+
+def write(results: Sequence[Result], folder: Path) -> Path:
+    """stress.json (numbers that do not exist are null) and stress.md in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "stress.md").write_text(markdown(results), encoding="utf-8")
+    path = folder / "stress.json"
+    path.write_text(json.dumps([result.record() for result in results], indent=1, allow_nan=False))
+    return path
+
+
+def track(results: Sequence[Result], config: Mapping[str, Any], uri: str, folder: Path) -> str:
+    """The suite as a run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
+    metrics = {"checks": float(len(results)), "failed": float(len(failures(results)))}
+    for name, held in by_case(results).items():
+        metrics |= {
+            f"{name}/failed": float(len(failures(held))),
+            f"{name}/used": max(result.used for result in held),
+            f"{name}/seconds": sum(result.seconds for result in held),
+        }
+    name = f"seed {config['seed']}"
+    parameters = tracking.flatten({"stress": config["stress"], "seed": config["seed"]})
+    tags = {"seed": str(config["seed"])}
+    return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder)
+
+
+def report(results: Sequence[Result], config: Mapping[str, Any], folder: Path) -> int:
+    """Write, log and print; returns the number of checks that failed."""
+    path = write(results, folder)
+    uri = tracking.tracking_uri(config["paths"]["mlflow"])
+    track(results, config, uri, folder)
+    print(table(results))
+    print(f"results: {path}\nmlflow ui --backend-store-uri {uri}")
+    return len(failures(results))

@@ -1,0 +1,271 @@
+"""Inner problems that are far from stationary, flat, indefinite or of any unit, where the implicit derivative
+is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.base import MixedDerivative, Params
+from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import LinearSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import FixedDamping, LanczosDamping
+from neural_sim.solver.exact import Exact
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.hvp import gradient
+from neural_sim.solver.minres import MinimumResidual
+from neural_sim.solver.solution import Status
+from neural_sim.stress.cases import Check, Checks, Scope, case, eps
+from neural_sim.stress.linear import CONVERGED, UNTRUSTED, logarithmic, system
+from neural_sim.types import LabelledImages
+
+DOUBLE = torch.float64
+ROWS, SIZE, PSI = 12, 6, 3
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """``L_train = s (sum_i (a_i theta - c_i - d_i psi)^2 / 2 N + lambda |theta|^2 / 2)``, ``L_val = |B theta
+    - t|^2 / 2``.
+
+    At psi = 0 the minimiser is ``(A^T A / N + lambda)^-1 A^T c / N``, and at any theta the implicit formula gives
+    ``D^T A (A^T A / N + lambda)^-1 B^T (B theta - t) / N``, which is dL_val/dpsi at the minimiser only.
+    """
+
+    a: Tensor
+    c: Tensor
+    d: Tensor
+    b: Tensor
+    t: Tensor
+    damping: float = 0.1
+    unit: float = 1.0
+
+    @staticmethod
+    def random(generator: torch.Generator) -> Quadratic:
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=DOUBLE)
+
+        return Quadratic(normal(ROWS, SIZE), normal(ROWS), normal(ROWS, PSI), normal(4, SIZE), normal(4))
+
+    @property
+    def hessian(self) -> Tensor:
+        return self.a.T @ self.a / ROWS + self.damping * torch.eye(SIZE, dtype=DOUBLE)
+
+    @property
+    def minimiser(self) -> Tensor:
+        return torch.linalg.solve(self.hessian, self.a.T @ self.c / ROWS)
+
+    def implicit(self, theta: Tensor) -> Tensor:
+        slope = self.b.T @ (self.b @ theta - self.t)
+        return self.d.T @ self.a @ torch.linalg.solve(self.hessian, slope) / ROWS
+
+    def solved(self, theta: Tensor, solver: LinearSolver, rtol: float) -> Hypergradient:
+        """The code's own way, with the proximal term as damping."""
+        params = {"w": theta[:2].clone(), "v": theta[2:].clone()}
+        weights = torch.full((ROWS,), self.unit / ROWS, dtype=DOUBLE)
+        anchor = {name: torch.zeros_like(value) for name, value in params.items()}
+
+        def losses(params: Params, rows: Tensor) -> Tensor:
+            return 0.5 * (self.a[rows] @ flatten(params) - self.c[rows]).square()
+
+        def estimate(vector: Params) -> MixedDerivative:
+            value = -self.unit * self.d.T @ (self.a @ flatten(vector)) / ROWS
+            return MixedDerivative(value, torch.zeros_like(value))
+
+        inner = InnerProblem(params, losses, weights, 5, self.unit * self.damping, anchor)
+        adjoint = AdjointSolver(solver, FixedDamping(0.0), rtol=rtol, max_steps=100)
+        terms = [lambda p: 0.5 * (self.b @ flatten(p) - self.t).square().sum()]
+        return hypergradient(inner, terms, {"x": estimate}, adjoint, torch.Generator())
+
+
+@case
+def far_from_stationary(scope: Scope) -> Checks:
+    """theta = theta* + delta for |delta| from 0 to 1e6: the stationarity is |H delta|, and the implicit
+    gradient is off by D^T A H^-1 B^T B delta / N, both closed forms. The quantity states by how much it
+    misses dL_val/dpsi at theta*.
+
+    Rounding: N eps of the terms summed; the solve's rtol and n^2 eps through |H^-1| onto the gradient.
+    """
+    problem = Quadratic.random(scope.generator())
+    towards = torch.randn(SIZE, generator=scope.generator(), dtype=DOUBLE)
+    towards = towards / towards.norm()
+    best, hessian = problem.minimiser, problem.hessian
+    truth = problem.implicit(best)
+    rtol = SIZE**2 * eps(DOUBLE)
+    for distance in (0.0, 1e-6, 1.0, 1e3, 1e6):
+        theta = best + distance * towards
+        stated = float((problem.implicit(theta) - truth).norm() / truth.norm())
+        for name, solver in (("exact", Exact()), ("cg", ConjugateGradient()), ("minres", MinimumResidual())):
+            found = problem.solved(theta, solver, rtol)
+            label = f"{name}, |delta| = {distance:g}"
+            size = (
+                float(hessian.norm()) * float(theta.norm()) + float((problem.a.T @ problem.c).norm()) / ROWS
+            )
+            error = abs(found.stationarity - float((hessian @ (theta - best)).norm()))
+            status = found.solution.status.name
+            yield Check(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, status, (CONVERGED,))
+            lifted = float((problem.d.T @ problem.a).norm() / ROWS * torch.linalg.inv(hessian).norm())
+            slope = float((problem.b.T @ (problem.b @ theta - problem.t)).norm())
+            bound = lifted * slope * (rtol + 2 * SIZE**2 * eps(DOUBLE)) * float(torch.linalg.cond(hessian))
+            value = float((found.psi_gradients["x"] - problem.implicit(theta)).norm())
+            yield Check(f"gradient ({stated:.1e} off the truth): {label}", value, bound, status, (CONVERGED,))
+
+
+@case
+def implicit_against_retraining(scope: Scope) -> Checks:
+    """At theta* the implicit gradient is the derivative of the retrained problem. That is quadratic in psi,
+    so the central difference of any step is exact but for rounding, 4 eps L_val / step: here with steps of 1.
+    """
+    problem = Quadratic.random(scope.generator())
+
+    def retrained(psi: Tensor) -> Tensor:
+        theta = torch.linalg.solve(problem.hessian, problem.a.T @ (problem.c + problem.d @ psi) / ROWS)
+        return 0.5 * (problem.b @ theta - problem.t).square().sum()
+
+    steps = torch.eye(PSI, dtype=DOUBLE)
+    ends = torch.stack([torch.stack([retrained(e), retrained(-e)]) for e in steps])
+    truth = 0.5 * (ends[:, 0] - ends[:, 1])
+    found = problem.solved(problem.minimiser, Exact(), 1e-12)
+    bound = 4 * SIZE**2 * eps(DOUBLE) * float(ends.max() * torch.linalg.cond(problem.hessian))
+    error = float((found.psi_gradients["x"] - truth).abs().max())
+    yield Check("against differences of size 1", error, bound, found.solution.status.name, (CONVERGED,))
+
+
+@case
+def units(scope: Scope) -> Checks:
+    """L_train in another unit leaves dL_val/dpsi as it is; powers of two change no digit."""
+    problem = Quadratic.random(scope.generator())
+    plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
+    for power in (-200, -60, 60, 200):
+        scaled = Quadratic(problem.a, problem.c, problem.d, problem.b, problem.t, unit=2.0**power)
+        found = scaled.solved(problem.minimiser, ConjugateGradient(), 1e-10)
+        change = float((found.psi_gradients["x"] - plain.psi_gradients["x"]).abs().max())
+        yield Check(f"change by a unit of 2^{power}", change, 0.0, found.solution.status.name, (CONVERGED,))
+
+
+@case
+def degenerate(scope: Scope) -> Checks:
+    """A flat inner problem without damping has no inverse: v = 0 and a status; with lambda, v = b / lambda. A loss that
+    is NaN or overflows has a status and v = 0. One parameter: v = b / (h + lambda).
+    """
+    b = torch.randn(SIZE, generator=scope.generator(), dtype=DOUBLE)
+    params = {"x": torch.ones(SIZE, dtype=DOUBLE)}
+    flat = {"linear": lambda p: p["x"].sum(), "constant": lambda p: 0.0 * p["x"].square().sum()}
+    for name, solver in (("cg", ConjugateGradient()), ("minres", MinimumResidual()), ("exact", Exact())):
+        for label, term in flat.items():
+            found = AdjointSolver(solver, FixedDamping(0.0)).solve([term], params, b, None, torch.Generator())
+            status = found.solution.status.name
+            yield Check(f"|v|: {name}, {label}", float(found.vector.norm()), 0.0, status, UNTRUSTED)
+            found = AdjointSolver(solver, FixedDamping(1e-3)).solve(
+                [term], params, b, None, torch.Generator()
+            )
+            error = float((found.vector * 1e-3 - b).norm() / b.norm())
+            status = found.solution.status.name
+            yield Check(
+                f"v with damping: {name}, {label}", error, SIZE**2 * eps(DOUBLE), status, (CONVERGED,)
+            )
+        bad = {
+            "NaN": lambda p: (p["x"] * math.nan).square().sum(),
+            "overflow": lambda p: (p["x"] * 1e200).square().sum().square(),
+        }
+        for label, term in bad.items():
+            found = AdjointSolver(solver, LanczosDamping()).solve([term], params, b, None, torch.Generator())
+            status = found.solution.status.name
+            value = float(found.vector.norm())
+            yield Check(f"|v|: {name}, {label}", value, 0.0, status, (Status.NON_FINITE.name,))
+        one = {"x": torch.tensor([2.0], dtype=DOUBLE)}
+        found = AdjointSolver(solver, FixedDamping(0.5)).solve(
+            [lambda p: 1.5 * p["x"].square().sum()], one, b[:1], None, torch.Generator()
+        )
+        error = abs(float(found.vector) * 3.5 / float(b[0]) - 1.0)
+        yield Check(
+            f"one parameter: {name}", error, 8 * eps(DOUBLE), found.solution.status.name, (CONVERGED,)
+        )
+
+
+@case
+def indefinite_hessians(scope: Scope) -> Checks:
+    """The default damping on Hessians of any sign and condition, with as many Lanczos steps as parameters.
+
+    It must pass the most negative eigenvalue by its margin (to the rounding n eps |H| of a Ritz value), and the solve
+    reach the dense one: condition of the damped matrix times rtol and n^2 eps.
+    """
+    spectra = {
+        "definite, condition 1e12": logarithmic(1e12),
+        "one negative": torch.cat([logarithmic(1e2)[:-1], torch.tensor([-0.5], dtype=DOUBLE)]),
+        "both signs, 1e6": 1e6 * logarithmic(1e3) * torch.tensor([1.0, -1.0], dtype=DOUBLE).repeat(12),
+        "all negative": -logarithmic(1e2),
+        "zero": torch.zeros(24, dtype=DOUBLE),
+    }
+    damping = LanczosDamping(lanczos_steps=24)
+    for label, values in spectra.items():
+        problem = system(values, scope.generator())
+        params = {"x": torch.zeros(24, dtype=DOUBLE)}
+        terms = [lambda p, matrix=problem.matrix: 0.5 * p["x"] @ (matrix @ p["x"])]
+        rhs = problem.x
+        for name, solver in (("cg", ConjugateGradient()), ("minres", MinimumResidual())):
+            adjoint = AdjointSolver(solver, damping, rtol=1e-10, max_steps=400)
+            found = adjoint.solve(terms, params, rhs, None, scope.generator())
+            status, chosen = found.solution.status.name, found.damping.value
+            rounding = 24 * eps(DOUBLE) * float(values.abs().max())
+            least = 1.25 * max(0.0, -float(values.min()))
+            yield Check(
+                f"lambda short of its margin: {name}, {label}", max(0.0, least - chosen), 4 * rounding
+            )
+            damped = problem.matrix + chosen * torch.eye(24, dtype=DOUBLE)
+            truth = torch.linalg.solve(damped, rhs)
+            condition = float((values + chosen).abs().max() / (values + chosen).abs().min())
+            error = float((found.vector - truth).norm() / truth.norm())
+            bound = condition * (1e-10 + 2 * 24**2 * eps(DOUBLE))
+            yield Check(f"v: {name}, {label}", error, bound, status, (CONVERGED,))
+
+
+@case
+def untrained_detector(scope: Scope) -> Checks:
+    """A real detector at its random start, 10 times and 100 times that: its stationarity against the directional
+    derivative of the loss along the gradient itself, extrapolated from two central differences (Richardson). The
+    tolerance is that reference's own error: what the extrapolation changed, and eps L / step.
+    """
+    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    start = {name: value.double() for name, value in detector.init(scope.generator()).items()}
+    backbone, head = detector.split(start)
+    pixels = torch.rand(3, 3, 32, 32, generator=scope.generator(), dtype=DOUBLE)
+    boxes = torch.tensor([[4.0, 4, 15, 14], [8, 9, 26, 27], [12, 2, 30, 18]], dtype=DOUBLE)[:, None]
+    images = LabelledImages(pixels, boxes, torch.tensor([[0], [1], [0]]), torch.full((3,), -1))
+    cached = CachedSet.of(detector, backbone, images)
+    for factor in (1.0, 10.0, 100.0):
+        params = {name: factor * value for name, value in head.items()}
+        inner = InnerProblem(params, cached.losses, torch.full((3,), 1.0 / 3.0, dtype=DOUBLE))
+        slope = gradient(inner.terms(), params)
+        along, point = slope / slope.norm(), flatten(params)
+        problem = hypergradient(inner, cached.mean_terms(), {}, _default(), scope.generator())
+
+        def loss(
+            step: float, inner: InnerProblem = inner, point: Tensor = point, along: Tensor = along
+        ) -> float:
+            moved = unflatten(point + step * along, inner.params)
+            with torch.no_grad():
+                return float(sum(term(moved) for term in inner.terms()))
+
+        step = 1e-4 * float(point.norm()) / len(point) ** 0.5
+        coarse, fine = ((loss(h) - loss(-h)) / (2 * h) for h in (step, 0.5 * step))
+        truth = fine + (fine - coarse) / 3.0
+        tolerance = abs(truth - fine) + 64 * eps(DOUBLE) * abs(loss(0.0)) / step
+        status = problem.solution.status.name
+        quantity = f"stationarity, {problem.stationarity:.1e}: {factor:g} times the start"
+        yield Check(quantity, abs(problem.stationarity - truth), tolerance, status)
+        yield Check(
+            f"numbers not finite: {factor:g} times the start",
+            float((~torch.isfinite(problem.solution.value)).sum()), 0.0, status,
+        )  # fmt: skip
+
+
+def _default() -> AdjointSolver:
+    return AdjointSolver(ConjugateGradient(), LanczosDamping())

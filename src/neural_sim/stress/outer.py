@@ -1,0 +1,227 @@
+"""Stiff outer dynamics: the steps of psi at any learning rate, from gradients of any size, and the loop around them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.base import MixedDerivative
+from neural_sim.outer.module import SimulatorModule, learn_psi
+from neural_sim.parameter import bins as binned
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.settings import OnUntrusted, Outer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.stress.cases import Check, Checks, Scope, case, eps
+from neural_sim.stress.rendering import block
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+DOUBLE = torch.float64
+FLOOR, MAX_STEP = 0.005, 0.5
+UPDATES: dict[str, Callable[[float], Update]] = {
+    "sgd": lambda rate: SGD(learning_rate=rate, max_step=MAX_STEP),
+    "adam": lambda rate: Adam(learning_rate=rate, max_step=MAX_STEP),
+    "mirror": lambda rate: Mirror(learning_rate=rate, max_step=MAX_STEP),
+}
+RATES = (1e-6, 1e-3, 1.0, 1e3)
+
+
+@dataclass
+class Worst:
+    """The worst seen over a run: numbers not finite, steps beyond their bound, p off the simplex or below its floor."""
+
+    not_finite: float = 0.0
+    excess: float = 0.0
+    off_simplex: float = 0.0
+
+    def see(self, before: Tensor, after: Tensor) -> None:
+        self.not_finite += float((~torch.isfinite(after)).sum())
+        # psi + step and its difference round by eps |psi| each.
+        excess = (after - before).abs() - MAX_STEP - 2 * eps(DOUBLE) * after.abs()
+        self.excess = max(self.excess, float(excess.max()))
+        p = binned.log_probabilities(after, FLOOR).exp()
+        below = float((FLOOR - p).max())
+        self.off_simplex = max(self.off_simplex, below, float((p.sum(-1) - 1.0).abs().max()))
+
+    def checks(self, label: str) -> Checks:
+        yield Check(f"psi not finite: {label}", self.not_finite, 0.0)
+        yield Check(f"step beyond max_step: {label}", self.excess, 8 * eps(DOUBLE) * MAX_STEP)
+        # log p carries eps |psi| of the softmax part (at most 30 nats of it show beside the floor) and k roundings.
+        yield Check(f"p off its simplex: {label}", self.off_simplex, (8 + 30) * 8 * eps(DOUBLE))
+
+
+def slope(psi: Tensor, costs: Tensor) -> Tensor:
+    """Gradient in psi of each object's mean cost over its bins."""
+    leaf = psi.detach().requires_grad_()
+    mean = (binned.log_probabilities(leaf, FLOOR).exp() * costs).sum()
+    return torch.autograd.grad(mean, leaf)[0]
+
+
+def step(
+    update: Update, psi: Tensor, gradient: Tensor, error: Tensor, state: UpdateState
+) -> tuple[Tensor, UpdateState]:
+    return update.step(psi, binned.log_probabilities(psi, FLOOR), gradient, error, state)
+
+
+@case
+def learning_rates(scope: Scope) -> Checks:
+    """Rates from 1e-6 to 1e3 on noisy costs of 1e-6, 1 and 1e6 (one scale an object), from uniform p and from
+    bins 1000 nats below: at every step psi is finite, p on its simplex and the step at most ``max_step``,
+    which ``bound`` promises.
+    """
+    steps = 300 if scope.full else 40
+    costs = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    costs = costs * torch.tensor([[1e-6], [1.0], [1e6]], dtype=DOUBLE)
+    deep = torch.zeros(3, 8, dtype=DOUBLE)
+    deep[:, ::2] = -1000.0
+    for name, make in UPDATES.items():
+        for rate in RATES:
+            for where, start in (("uniform", torch.zeros_like(deep)), ("bins at the floor", deep)):
+                generator, update, psi, state = scope.generator(), make(rate), start, UpdateState.zeros(start)
+                worst = Worst()
+                for _ in range(steps):
+                    noise = torch.randn(3, 8, generator=generator, dtype=DOUBLE)
+                    gradient = slope(psi, costs * (1.0 + noise))
+                    moved, state = step(update, psi, gradient, gradient.abs() * 0.1, state)
+                    worst.see(psi, moved)
+                    psi = moved
+                yield from worst.checks(f"{name}, rate {rate:g}, {where}")
+
+
+@case
+def flat_loss(scope: Scope) -> Checks:
+    """A gradient of exactly zero moves nothing, by any update at any rate, from any psi: no digit changes."""
+    far = 100.0 * torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    for name, make in UPDATES.items():
+        for rate in RATES:
+            moved = 0.0
+            for psi in (torch.zeros_like(far), far):
+                for error in (0.0, 1.0, math.inf):
+                    state = UpdateState.zeros(psi)
+                    for _ in range(3):
+                        after, state = step(
+                            make(rate), psi, torch.zeros_like(psi), torch.full_like(psi, error), state
+                        )
+                        moved = max(moved, float((after - psi).abs().max()))
+            yield Check(f"change of psi: {name}, rate {rate:g}", moved, 0.0)
+
+
+@case
+def cliff(scope: Scope) -> Checks:
+    """One gradient of 1e30 and above, infinite or NaN, between usual ones: the step is bounded, or refused
+    and counted, and psi stays finite and bounded in the 30 steps after it. Up to 1e100 every square is finite
+    and the step is taken; inf and NaN are refused; between, where squares overflow, either is right.
+    """
+    costs = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    shape = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    for name, make in UPDATES.items():
+        for size in (1e-300, 1e30, 1e100, 1e160, 1e300, math.inf, math.nan):
+            worst, refused = Worst(), 0
+            for rate in RATES:
+                psi = torch.zeros(3, 8, dtype=DOUBLE)
+                state = UpdateState.zeros(psi)
+                for index in range(35):
+                    gradient = slope(psi, costs)
+                    if index == 4:
+                        gradient = (
+                            torch.where(shape > 1.0, size, gradient) if not size < 1e200 else size * shape
+                        )
+                    moved, state = step(make(rate), psi, gradient, torch.zeros_like(psi), state)
+                    worst.see(psi, moved)
+                    psi = moved
+                refused += state.refused
+            status = "REFUSED" if refused == len(RATES) else "BOUNDED" if refused == 0 else "BOTH"
+            wanted = ("BOUNDED",) if size <= 1e100 else ("REFUSED", "BOUNDED", "BOTH")
+            if not math.isfinite(size):
+                wanted = ("REFUSED",)
+            yield Check(f"psi not finite: {name}, gradient {size:g}", worst.not_finite, 0.0, status, wanted)
+            yield Check(
+                f"step beyond max_step: {name}, gradient {size:g}", worst.excess, 8 * eps(DOUBLE) * MAX_STEP
+            )
+
+
+@case
+def standard_errors(scope: Scope) -> Checks:
+    """Standard errors of any size, infinite or NaN beside a sound gradient: a bounded step; where they are
+    not known they shrink nothing, and are forgotten: the next step is what it would be had they been zero.
+    Noise far above the gradient holds psi where it is, exactly.
+    """
+    gradient = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    psi = torch.zeros(3, 8, dtype=DOUBLE)
+    update = Mirror(max_step=MAX_STEP)
+    none = torch.zeros_like(psi)
+    first, known = step(update, psi, gradient, none, UpdateState.zeros(psi))
+    second, _ = step(update, first, gradient, none, known)
+    for size in (math.inf, math.nan, 1e200):
+        moved, state = step(update, psi, gradient, torch.full_like(psi, size), UpdateState.zeros(psi))
+        after, _ = step(update, moved, gradient, none, state)
+        yield Check(f"step: standard error {size:g}", float((moved - first).abs().max()), 0.0)
+        yield Check(f"next step: standard error {size:g}", float((after - second).abs().max()), 0.0)
+    for size in (1e6, 1e100):
+        moved, _ = step(update, psi, gradient, torch.full_like(psi, size), UpdateState.zeros(psi))
+        yield Check(f"step: standard error {size:g}", float(moved.abs().max()), 0.0)
+
+
+@dataclass(frozen=True)
+class Constant:
+    """An estimator that returns one number for everything."""
+
+    value: float
+    relaxed: ClassVar[None] = None
+    probes_per_bin: ClassVar[int] = 0
+
+    def estimate(self, losses: Any, params: Any, vector: Any, images: Any, probes: Any) -> MixedDerivative:
+        shape = torch.linspace(-1.0, 1.0, images.psi.numel(), dtype=images.psi.dtype)
+        return MixedDerivative(self.value * shape, torch.zeros_like(shape))
+
+
+@case
+def loop(scope: Scope) -> Checks:
+    """The whole psi loop on a cube of 4 bins whose estimator returns NaN, inf, 1e30 or 0: psi is finite and
+    within the bound of its steps, a gradient that is not finite moves nothing and its certificate says what
+    was done, zero moves nothing.
+    """
+    iterations = 2
+    actions = {"shrink": "skipped", "skip": "skipped", "stop": "stopped"}
+    trials: tuple[tuple[float, OnUntrusted], ...] = (
+        (math.nan, "shrink"), (1e30, "shrink"), (math.nan, "skip"), (math.nan, "stop"), (math.inf, "shrink"),
+        (0.0, "shrink"),
+    )  # fmt: skip
+    for value, choice in trials if scope.full else trials[:2]:
+        learned = learn_psi(_module(Constant(value), choice, iterations, scope), progress=False)
+        moved = float(learned.last.abs().max())
+        status = learned.records[0].certificate.action
+        wanted = (actions[choice],) if not math.isfinite(value) else ()
+        bound = iterations * MAX_STEP * (1 + 4 * eps(DOUBLE)) if value == 1e30 else 0.0
+        yield Check(f"psi moved: estimate {value:g}, {choice}", moved, bound, status, wanted)
+
+
+def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Scope) -> SimulatorModule:
+    generator = scope.generator()
+    camera = PinholeCamera(32, 32, math.radians(40.0))
+    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+    scene = Scene(
+        ("x",), (block(30.0, half=0.5, cells=4),), NerfRenderer(), camera, synthesizer, Pose(bins=4)
+    )
+    network = Detector(1, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    psi = torch.zeros(1, 4)
+    validation = join(scene.training_set(psi, 2, generator))
+    settings = Outer(
+        Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
+        on_untrusted=choice,
+    )  # fmt: skip
+    return SimulatorModule(
+        scene, network, network.init(generator), psi, validation, settings,
+        estimator,  # pyright: ignore[reportArgumentType]  (stands in for the estimators of conf/gradient)
+        AdjointSolver(max_steps=4), batch_size=3, weight_decay=0.0, generator=generator,
+    )  # fmt: skip
