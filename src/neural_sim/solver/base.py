@@ -27,19 +27,27 @@ class Iterate:
 
 
 @dataclass(frozen=True)
+class System:
+    """``operator x = rhs`` as a solver's iteration gets it: ``rhs`` has a norm in [1, 2), ``tolerance`` is absolute."""
+
+    operator: Watched
+    rhs: Float[Tensor, "n"]
+    start: Float[Tensor, "n"]
+    tolerance: float
+    max_steps: int
+
+    def first_residual(self) -> Float[Tensor, "n"]:
+        """The residual at ``start``, without a product where that is zero."""
+        return self.rhs - self.operator(self.start) if bool(self.start.any()) else self.rhs
+
+
+@dataclass(frozen=True)
 class LinearSolver(abc.ABC):
     """Solves ``A x = b`` for symmetric A given by its products. Subclasses hold typed hyper-parameters."""
 
     @abc.abstractmethod
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        """Iterate from ``start`` until the residual's norm is below ``tolerance``; ``rhs`` has a norm in [1, 2)."""
+    def iterate(self, system: System) -> Iterate:
+        """Iterate until the residual's norm is at most the system's tolerance or its steps are spent."""
 
     def solve(
         self,
@@ -70,7 +78,7 @@ class LinearSolver(abc.ABC):
         size = norm(rhs)
         start = _warm_start(operator, rhs, None if x0 is None else x0 / scale / unit)
         try:
-            end = self.iterate(operator, rhs, start, rtol * size, max_steps)
+            end = self.iterate(System(operator, rhs, start, rtol * size, max_steps))
             residual = norm(rhs - operator(end.value)) / size
         except NonFiniteProduct as error:
             logger.warning("%s: %s", type(self).__name__, error)
@@ -123,6 +131,12 @@ def _warm_start(
         return guess
     logger.info("warm start dropped: its relative residual is %.3g, that of zero is 1", residual)
     return zero
+
+
+def check_restart_gain(solver: str, restart_gain: float) -> None:
+    """Raises ``ValueError`` unless the factor by which a restart must shrink the residual lies in (0, 1)."""
+    if not 0.0 < restart_gain < 1.0:
+        raise ValueError(f"{solver}: restart_gain must lie in (0, 1), got {restart_gain}")
 
 
 def _check(b: Tensor, x0: Tensor | None, rtol: float, max_steps: int) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from neural_sim.solver.base import Iterate, LinearSolver
-from neural_sim.solver.operator import Matvec, Watched, dot, norm
+from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
+from neural_sim.solver.operator import Matvec, dot, norm
 from neural_sim.solver.solution import Status
 
 
@@ -22,38 +20,25 @@ class ConjugateGradient(LinearSolver):
     restart_gain: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.restart_gain < 1.0:
-            raise ValueError(f"cg: restart_gain must lie in (0, 1), got {self.restart_gain}")
+        check_restart_gain("cg", self.restart_gain)
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        return conjugate_gradients(operator, rhs, start, tolerance, max_steps, self.restart_gain)
+    def iterate(self, system: System) -> Iterate:
+        return conjugate_gradients(system, self.restart_gain)
 
 
 def conjugate_gradients(
-    operator: Watched,
-    rhs: Float[Tensor, "n"],
-    start: Float[Tensor, "n"],
-    tolerance: float,
-    max_steps: int,
-    restart_gain: float,
-    precondition: Matvec = lambda residual: residual,
+    system: System, restart_gain: float, precondition: Matvec = lambda residual: residual
 ) -> Iterate:
     """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse."""
-    value = best = start
-    residual = rhs - operator(start) if bool(start.any()) else rhs
+    operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
+    value = best = system.start
+    residual = system.first_residual()
     confirmed = best_norm = norm(residual)
     if confirmed <= tolerance:
         return Iterate(best, Status.CONVERGED, 0)
     direction = precondition(residual)
     energy = dot(residual, direction)
-    for step in range(1, max_steps + 1):
+    for step in range(1, system.max_steps + 1):
         product = operator(direction)
         curvature = dot(direction, product)
         # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich), so one
@@ -79,4 +64,4 @@ def conjugate_gradients(
         conditioned = precondition(residual)
         before, energy = energy, dot(residual, conditioned)
         direction = conditioned if restart else conditioned + (energy / before) * direction
-    return Iterate(best, Status.MAX_STEPS, max_steps)
+    return Iterate(best, Status.MAX_STEPS, system.max_steps)

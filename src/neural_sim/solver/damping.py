@@ -114,8 +114,9 @@ class LanczosDamping(Damping):
             )
             return Damped(self.minimum, spectrum)
         value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
-        searched = self.start == "rhs" and usable and spectrum.krylov is not None
-        return Damped(value, spectrum, spectrum.krylov.solve(value) if searched else None)
+        if self.start == "random" or not usable or spectrum.krylov is None:
+            return Damped(value, spectrum)
+        return Damped(value, spectrum, spectrum.krylov.solve(value))
 
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0

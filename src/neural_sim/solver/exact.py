@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.base import Iterate, LinearSolver, System
 from neural_sim.solver.operator import Watched, norm
 from neural_sim.solver.solution import Status
 
@@ -30,15 +30,8 @@ class Exact(LinearSolver):
         if self.method not in get_args(Method):
             raise ValueError(f"exact: method must be one of {get_args(Method)}, got {self.method!r}")
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        size = rhs.numel()
+    def iterate(self, system: System) -> Iterate:
+        operator, rhs, size = system.operator, system.rhs, system.rhs.numel()
         if size > self.max_size:
             raise ValueError(
                 f"exact: got {size} unknowns, max_size is {self.max_size}; use an iterative solver"
@@ -49,7 +42,7 @@ class Exact(LinearSolver):
         return (
             self._cholesky(matrix, rhs)
             if self.method == "cholesky"
-            else self._eigen(operator, matrix, rhs, tolerance)
+            else self._eigen(operator, matrix, rhs, system.tolerance)
         )
 
     def _cholesky(self, matrix: Float[Tensor, "n n"], rhs: Float[Tensor, "n"]) -> Iterate:

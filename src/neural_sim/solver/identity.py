@@ -5,11 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from jaxtyping import Float
-from torch import Tensor
-
-from neural_sim.solver.base import Iterate, LinearSolver
-from neural_sim.solver.operator import Watched
+from neural_sim.solver.base import Iterate, LinearSolver, System
 from neural_sim.solver.solution import Status
 
 
@@ -23,12 +19,5 @@ class Identity(LinearSolver):
         if not (math.isfinite(self.scale) and self.scale != 0.0):
             raise ValueError(f"identity: scale must be finite and not 0, got {self.scale}")
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        return Iterate(self.scale * rhs, Status.APPROXIMATE, 0)
+    def iterate(self, system: System) -> Iterate:
+        return Iterate(self.scale * system.rhs, Status.APPROXIMATE, 0)

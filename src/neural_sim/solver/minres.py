@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
 from neural_sim.solver.operator import Watched, dot, norm
 from neural_sim.solver.solution import Status
 
@@ -23,24 +23,17 @@ class MinimumResidual(LinearSolver):
     restart_gain: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.restart_gain < 1.0:
-            raise ValueError(f"minres: restart_gain must lie in (0, 1), got {self.restart_gain}")
+        check_restart_gain("minres", self.restart_gain)
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        value, steps = start, 0
-        residual = rhs - operator(start) if bool(start.any()) else rhs
+    def iterate(self, system: System) -> Iterate:
+        operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
+        value, steps = system.start, 0
+        residual = system.first_residual()
         size = norm(residual)
         while size > tolerance:
-            if steps >= max_steps:
+            if steps >= system.max_steps:
                 return Iterate(value, Status.MAX_STEPS, steps)
-            cycle = _cycle(operator, residual, tolerance, max_steps - steps)
+            cycle = _cycle(operator, residual, tolerance, system.max_steps - steps)
             steps += cycle.steps
             candidate = value + cycle.value
             after = rhs - operator(candidate)

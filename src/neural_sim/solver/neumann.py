@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
-from torch import Tensor
-
-from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.base import Iterate, LinearSolver, System
 from neural_sim.solver.lanczos import lanczos
-from neural_sim.solver.operator import NonFiniteProduct, Watched, norm
+from neural_sim.solver.operator import NonFiniteProduct, norm
 from neural_sim.solver.solution import Status
 
 
@@ -30,26 +27,20 @@ class Neumann(LinearSolver):
                 f"neumann: want scale in (0, 2) and lanczos_steps >= 1, got {self.scale}, {self.lanczos_steps}"
             )
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
-        value = best = start
-        residual = rhs - operator(start) if bool(start.any()) else rhs
+    def iterate(self, system: System) -> Iterate:
+        operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
+        value = best = system.start
+        residual = system.first_residual()
         smallest = size = norm(residual)
         if size <= tolerance:
-            return Iterate(start, Status.CONVERGED, 0)
+            return Iterate(system.start, Status.CONVERGED, 0)
         spectrum = lanczos(operator, residual, self.lanczos_steps)
         if not spectrum.finite:
             raise NonFiniteProduct("the operator is not finite on the Lanczos vectors")
         if spectrum.smallest <= 0.0:
-            return Iterate(start, Status.NEGATIVE_CURVATURE, 0)
+            return Iterate(system.start, Status.NEGATIVE_CURVATURE, 0)
         rate = self.scale / (spectrum.largest + spectrum.largest_error)
-        for step in range(1, max_steps + 1):
+        for step in range(1, system.max_steps + 1):
             value = value + rate * residual
             residual = rhs - operator(value)
             size = norm(residual)
@@ -61,4 +52,4 @@ class Neumann(LinearSolver):
                 return Iterate(best, Status.NEGATIVE_CURVATURE, step)
             if size > 10.0 * smallest:
                 return Iterate(best, Status.DIVERGED, step)
-        return Iterate(best, Status.MAX_STEPS, max_steps)
+        return Iterate(best, Status.MAX_STEPS, system.max_steps)

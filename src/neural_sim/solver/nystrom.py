@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.base import Iterate, LinearSolver
+from neural_sim.solver.base import Iterate, LinearSolver, System
 from neural_sim.solver.cg import conjugate_gradients
 from neural_sim.solver.operator import Watched
 from neural_sim.solver.solution import Status
@@ -24,8 +24,8 @@ class Nystrom(LinearSolver):
 
     Args:
         rank: products spent on the sketch (no more than half of max_steps where refinement is on).
-        sketch: ``columns`` of H at random (the paper), or products with ``gaussian`` vectors (Frangella et
-        al. 2023). refine: use what is left of max_steps for ``x += P (b - A x)`` while the residual falls.
+        sketch: ``columns`` of H at random (the paper), or products with ``gaussian`` vectors (Frangella et al. 2023).
+        refine: use what is left of max_steps for ``x += P (b - A x)`` while the residual falls.
         shift: the multiple of the identity in A; None reads it off a ``Shifted`` operator.
         seed: of the sketch's generator, so that the same system gives the same answer.
 
@@ -44,21 +44,15 @@ class Nystrom(LinearSolver):
         if self.sketch not in get_args(Sketch):
             raise ValueError(f"nystrom: sketch must be one of {get_args(Sketch)}, got {self.sketch!r}")
 
-    def iterate(
-        self,
-        operator: Watched,
-        rhs: Float[Tensor, "n"],
-        start: Float[Tensor, "n"],
-        tolerance: float,
-        max_steps: int,
-    ) -> Iterate:
+    def iterate(self, system: System) -> Iterate:
+        operator, rhs, max_steps = system.operator, system.rhs, system.max_steps
         shift = operator.shift if self.shift is None else self.shift
         if not shift > 0.0:
             raise ValueError(f"nystrom: want a positive damping in the operator, got {shift}")
         rank = min(self.rank, rhs.numel(), max(1, max_steps // 2) if self.refine else max_steps)
         basis, values = self._low_rank(operator, rhs, shift, rank)
         if bool((values + shift <= 0.0).any()):
-            return Iterate(start, Status.NEGATIVE_CURVATURE, rank)
+            return Iterate(system.start, Status.NEGATIVE_CURVATURE, rank)
         gain = 1.0 / (values + shift) - 1.0 / shift
 
         def inverse(vector: Tensor) -> Tensor:
@@ -66,7 +60,8 @@ class Nystrom(LinearSolver):
 
         if not self.refine:
             return Iterate(inverse(rhs), Status.APPROXIMATE, rank)
-        end = conjugate_gradients(operator, rhs, start, tolerance, max(1, max_steps - rank), 0.5, inverse)
+        left = replace(system, max_steps=max(1, max_steps - rank))
+        end = conjugate_gradients(left, 0.5, inverse)
         return Iterate(end.value, end.status, end.steps + rank)
 
     def _low_rank(
