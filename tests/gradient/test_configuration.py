@@ -1,0 +1,45 @@
+"""What the command line makes of the pathwise estimator's choices, each one override away."""
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.main import UserError, build, conf_directory
+from neural_sim.synthesis.scene import RelaxedDraws
+
+
+def experiment(*overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return build(compose("config", list(overrides)))
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("gradient.mode=forward", RelaxedDraws(tangents=True)),
+        ("gradient.mode=reverse", RelaxedDraws()),
+        ("gradient.relaxation=straight_through", RelaxedDraws("straight_through", tangents=True)),
+        ("gradient.relaxation=gumbel_rao", RelaxedDraws("gumbel_rao", tangents=True)),
+        ("gradient.antithetic=true", RelaxedDraws(antithetic=True, tangents=True)),
+        ("gradient.common_backgrounds=true", RelaxedDraws(common_backgrounds=True, tangents=True)),
+    ],
+)
+def test_each_choice_is_one_override(override, expected):
+    assert experiment("gradient=pathwise", override).gradient.relaxed == expected
+
+
+def test_the_papers_variant_is_its_plain_form():
+    paper = experiment("+variant=paper")
+    assert paper.gradient == PathwiseEstimator(mode="reverse")
+    assert paper.gradient.relaxed == RelaxedDraws()
+    assert paper.pose.bin_mean == "linear" and paper.synthesis.label_gradient == "ignored"
+
+
+def test_boxes_move_by_one_override():
+    assert experiment("synthesis.label_gradient=differentiable").synthesis.label_gradient == "differentiable"
+
+
+@pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.relaxation=concrete"])
+def test_other_choices_are_refused_by_name(override):
+    with pytest.raises(UserError, match=override.split("=")[0]):
+        experiment("gradient=pathwise", override)
