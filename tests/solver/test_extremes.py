@@ -13,6 +13,7 @@ from neural_sim.solver.identity import Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.neumann import Neumann
 from neural_sim.solver.nystrom import Nystrom
+from neural_sim.solver.operator import norm
 from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
@@ -48,13 +49,23 @@ def test_right_hand_sides_of_any_size_solve_alike(solver, dtype, scale, symmetri
 
 
 @pytest.mark.parametrize("solver", WITHOUT_UNIT, ids=name)
-@pytest.mark.parametrize("scale", [1e-12, 1e12])
+@pytest.mark.parametrize("scale", [1e-200, 1e-12, 1e12, 1e200])
 def test_residual_does_not_change_with_the_operators_unit(solver, scale, symmetric, right_hand_side, spread):
     matrix, b = symmetric(0.5 + spread(1e1)), right_hand_side()
     plain = solver.solve(lambda v: matrix @ v, b, rtol=1e-5, max_steps=200)
     scaled = solver.solve(lambda v: scale * (matrix @ v), b, rtol=1e-5, max_steps=200)
     assert (scaled.status, scaled.steps) == (plain.status, plain.steps)
     assert scaled.residual == pytest.approx(plain.residual, rel=1e-2, abs=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_norms_of_any_size(dtype):
+    unit = torch.tensor([3.0, -4.0, 0.0], dtype=dtype)
+    for power in (-1000, -600, -120, 0, 120, 600, 1000):
+        if abs(power) < 126 or dtype is DOUBLE:
+            assert norm(unit * 2.0**power) == 5.0 * 2.0**power
+    assert norm(torch.zeros(3, dtype=dtype)) == 0.0
+    assert math.isnan(norm(unit * math.nan)) and norm(unit[:2] * math.inf) == math.inf
 
 
 @pytest.mark.parametrize("solver", ALL, ids=name)
@@ -77,7 +88,7 @@ def test_non_finite_inputs_give_a_status(solver, bad):
 
 
 @pytest.mark.parametrize("solver", WITHOUT_UNIT, ids=name)
-@pytest.mark.parametrize("entry", [3.0, 1e-20, 1e20])
+@pytest.mark.parametrize("entry", [3.0, 1e-300, 1e-20, 1e20, 1e300])
 def test_one_unknown(solver, entry):
     solution = solver.solve(lambda v: entry * v, torch.tensor([6.0], dtype=DOUBLE), rtol=1e-6)
     assert solution.status is Status.CONVERGED

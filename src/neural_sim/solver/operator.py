@@ -29,8 +29,14 @@ class Shifted:
 
 
 def norm(vector: Tensor) -> float:
-    """Euclidean norm accumulated in float64, so that float32 entries up to 1e38 do not overflow when squared."""
-    return float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+    """Euclidean norm accumulated in float64, of float32 entries up to 1e38 and float64 entries of any size."""
+    size = float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+    if 1e-140 < size < 1e150 or not bool(torch.isfinite(vector).all()):
+        return size
+    # Squares leave the range of float64: the same after scaling by a power of two, which is exact.
+    exponent = math.frexp(float(vector.abs().max()))[1]
+    scaled = torch.ldexp(vector.double(), torch.tensor(-exponent))
+    return math.ldexp(float(torch.linalg.vector_norm(scaled)), exponent)
 
 
 def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
@@ -66,7 +72,7 @@ class Watched:
             raise NonFiniteProduct(f"product {self.products} of the operator is not finite")
         size = norm(vector)
         if size > 0.0:
-            quotient = dot(vector, product) / size**2
+            quotient = dot(vector, product) / size / size
             self.observe(quotient, quotient)
         return product
 

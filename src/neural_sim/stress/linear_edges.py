@@ -61,6 +61,27 @@ def right_hand_side_sizes(scope: Scope) -> Checks:
 
 
 @case
+def operator_units(scope: Scope) -> Checks:
+    """An operator in another unit: x changes by its inverse, and by a power of two no digit of it, out to where
+    squares of its entries leave the range of the arithmetic. Neumann's rate is LAPACK's eigenvalue, which scales by
+    factors of its own: known to n eps, which each of the steps takes up.
+    """
+    for dtype, powers in ((torch.float32, (-90, 90)), (torch.float64, (-900, -600, 600, 900))):
+        problem = system(logarithmic(1e3), scope.generator())
+        matrix, b = problem.matrix.to(dtype), problem.b.to(dtype)
+        for name in ("cg", "minres", "exact", "cholesky", "neumann"):
+            plain = ALL[name].solve(product(matrix), b, rtol=1e-4, max_steps=200)
+            for power in powers:
+                found = ALL[name].solve(product(matrix * 2.0**power), b, rtol=1e-4, max_steps=200)
+                change = float((found.value.double() * 2.0**power - plain.value.double()).abs().max())
+                label = f"{name}, unit 2^{power}, {str(dtype).removeprefix('torch.')}"
+                bound = (
+                    found.steps * SIZE * eps(dtype) * float(plain.value.norm()) if name == "neumann" else 0.0
+                )
+                yield Check(f"change: {label}", change, bound, found.status.name, (plain.status.name,))
+
+
+@case
 def single_precision(scope: Scope) -> Checks:
     """float32 against the float64 solution of the very same rounded system, by the bound of
     ``condition_numbers`` with float32's eps; where that bound exceeds 1 no digit is promised, and the claim
@@ -95,7 +116,7 @@ def single_precision(scope: Scope) -> Checks:
 def one_parameter(scope: Scope) -> Checks:
     """One unknown: x = b / a to a few roundings, whatever the size or (where the solver takes it) sign of a."""
     b = torch.tensor([6.0], dtype=torch.float64)
-    for entry in (3.0, 1e-20, 1e20, -3.0):
+    for entry in (3.0, 1e-300, 1e-20, 1e20, 1e300, -3.0):
         for name in ("cg", "minres", "exact", "cholesky", "neumann"):
             found = ALL[name].solve(lambda v, entry=entry: entry * v, b, rtol=1e-9)
             label = f"{name}, a = {entry:g}"
