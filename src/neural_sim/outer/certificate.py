@@ -111,7 +111,7 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
         *([] if math.isnan(c.cosine) else [f"cos {c.cosine:.2f}"]),
         c.action if not c.doubts else f"{c.action} ({', '.join(c.doubts)})",
     ]
-    return " | ".join(parts)
+    return "; ".join(parts)
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class AdjointSolver:
     linear: LinearSolver = field(default_factory=ConjugateGradient)
     damping: Damping = field(default_factory=LanczosDamping)
     mode: Mode = "reverse_over_reverse"
-    rtol: float = 1e-2
+    rtol: float = 1e-3
     max_steps: int = 40
     retain_graph: bool = True
     max_raises: int = 3
