@@ -9,6 +9,7 @@ from typing import Literal, get_args
 from neural_sim.parameter.update import Update
 from neural_sim.types import PinholeCamera
 
+Start = Literal["previous", "warm", "fresh"]
 OnUntrusted = Literal["shrink", "skip", "stop"]
 
 
@@ -101,6 +102,10 @@ class Trust:
 class Outer:
     """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
 
+    Each iteration's training starts from the pyramid and head of the iteration before (``previous``, the paper), of the
+    warm start (``warm``) or from new ones, always the same (``fresh``). A detector that goes on remembers bins that psi
+    has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches.
+    psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951).
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
     estimator, which replays exact draws, always renders. ``on_untrusted`` is what happens to a step that fails
@@ -113,6 +118,8 @@ class Outer:
     images_per_object: int = 50
     epochs: int = 2
     learning_rate: float = 5e-4
+    start: Start = "fresh"
+    final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
     trust: Trust = field(default_factory=Trust)
@@ -126,6 +133,10 @@ class Outer:
         _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         _at_least("outer", 0, certify_every=self.certify_every)
         _at_least("outer", 1, certify_per_bin=self.certify_per_bin)
+        if self.start not in get_args(Start):
+            raise ValueError(f"outer.start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
+        if not 0.0 < self.final_step <= 1.0:
+            raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
         if self.on_untrusted not in get_args(OnUntrusted):
             raise ValueError(
                 f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"

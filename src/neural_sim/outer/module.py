@@ -44,8 +44,8 @@ def _timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
 class SimulatorModule(pl.LightningModule):
     """psi as logits [objects, k], moved by the hypergradient; one training step is one outer iteration.
 
-    The detector goes on from ``params`` with its backbone frozen, ``settings.epochs`` epochs an iteration on freshly
-    drawn images. ``validation`` is the labelled target set; no step sees any other real image.
+    The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs an
+    iteration on freshly drawn images. ``validation`` is the labelled target set; no step sees any other real image.
     """
 
     def __init__(
@@ -80,6 +80,7 @@ class SimulatorModule(pl.LightningModule):
             self._pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self._adjoint: Tensor | None = None
         self._warm_start = detector.split(params)[1]
+        self._start = params if settings.start == "warm" else {**detector.init(generator), **self._backbone}
         # A generator of its own, so that being certified does not change a run.
         self._check_generator = torch.Generator().manual_seed(generator.initial_seed() + 1)
         self._stopped = False
@@ -128,7 +129,10 @@ class SimulatorModule(pl.LightningModule):
         moved, self._update_state = self.settings.update.step(
             self.psi, log_p, gradient, error, self._update_state
         )
-        part = self.settings.trust.shrink if certificate.action == "shrunk" else 1.0
+        done = (len(self.records) - 1) / max(1, self.settings.iterations - 1)
+        part = 1.0 + done * (self.settings.final_step - 1.0)
+        if certificate.action == "shrunk":
+            part *= self.settings.trust.shrink
         self.psi.data = self.psi + part * (moved - self.psi)
 
     def _train(self, images: LabelledImages) -> float:
@@ -136,7 +140,7 @@ class SimulatorModule(pl.LightningModule):
             return math.nan
         self.theta, history = train_detector(
             self.detector,
-            self.theta,
+            self.theta if self.settings.start == "previous" else self._start,
             images,
             self.generator,
             epochs=self.settings.epochs,

@@ -121,9 +121,9 @@ class Mirror:
     by a running root mean square over all objects and bins, so that ``learning_rate`` is in logits per
     step whatever the units of the loss.
 
-    ``shrink`` scales each object's averaged direction by max(0, 1 - its noise variance / its square), the positive-part
-    rule of James and Stein (1961): an object whose direction cannot be told from noise stays where it is, and
-    the average of several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
+    ``shrink`` scales each component of the averaged direction by max(0, 1 - its noise variance / its square), the
+    positive-part rule of James and Stein (1961): what cannot be told from noise moves nothing, and the average of
+    several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
     """
 
     learning_rate: float = 0.4
@@ -156,14 +156,11 @@ class Mirror:
 
 def told_from_noise(
     direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]
-) -> Float[Tensor, "objects 1"]:
-    """max(0, 1 - sum of the variances / squared norm) per object; 1 where a variance is not finite, 0 for a zero
-    direction.
-    """
-    squares = direction.square().sum(-1, keepdim=True)
-    noise = variance.sum(-1, keepdim=True)
-    kept = 1.0 - noise / squares.clamp_min(torch.finfo(squares.dtype).tiny)
-    return torch.where(torch.isfinite(noise), kept.clamp(0.0, 1.0), torch.ones_like(kept))
+) -> Float[Tensor, "objects k"]:
+    """max(0, 1 - variance / direction^2); 1 where a variance is not finite, 0 where a direction is zero."""
+    kept = 1.0 - variance / direction.square().clamp_min(torch.finfo(direction.dtype).tiny)
+    kept = torch.where(direction == 0.0, torch.zeros_like(kept), kept.clamp(0.0, 1.0))
+    return torch.where(torch.isfinite(variance), kept, torch.ones_like(kept))
 
 
 Update = SGD | Adam | Mirror
