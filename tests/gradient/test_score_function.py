@@ -84,6 +84,21 @@ def test_one_hot_p_gives_zero_and_no_nan(peak):
     assert not bool(found.signal_to_noise.isnan().any())
 
 
+@pytest.mark.parametrize("value", [0.1, -1e8, 1e100])
+def test_equal_scores_give_exactly_zero(value):
+    """Their rounding, of zero standard error, would pass for a certain gradient."""
+    scores, bins = torch.full((24,), value, dtype=torch.float64), torch.arange(8).repeat(3)
+    psi = torch.linspace(-1, 2, 8, dtype=torch.float64)
+    assert not stratified(scores, bins, psi, lambda x: torch.log_softmax(x, -1)).value.any()
+
+
+def test_one_hot_p_on_a_bin_without_images_is_no_nan():
+    scores, bins = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64), torch.tensor([0, 1, 2])
+    psi = torch.tensor([0.0, 0.0, 0.0, 1000.0], dtype=torch.float64)
+    estimate = stratified(scores, bins, psi, lambda x: torch.log_softmax(x, -1))
+    assert estimate.value.abs().max() == 0.0
+
+
 def test_one_bin_has_no_derivative():
     found = stratified(SCORES, torch.zeros(3, dtype=torch.long), torch.zeros(1, dtype=DOUBLE), log_softmax)
     assert found.value.tolist() == [0.0] and found.signal_to_noise.tolist() == [0.0]

@@ -71,12 +71,15 @@ def stratified(
     seen = counts > 0
     total = torch.zeros_like(counts).index_add_(0, bins, scores)
     means = total / counts.clamp_min(1.0)
+    variance = _variance_of_means(scores - means[bins], bins, counts)
     p, slopes = _jacobian(log_probabilities, psi)
+    # What all bins share moves nothing: taken out first, equal scores give 0 and not the rounding of a sum.
+    means = torch.where(seen, means - means[seen][0], 0.0)
     if not bool(seen.all()):
         logger.info("stratified: bins %s have no images", (~seen).nonzero().flatten().tolist())
-        mean = (p * means)[seen].sum() / p[seen].sum()
+        mass = p[seen].sum()  # 0 where p is one-hot on a bin without images
+        mean = (p * means)[seen].sum() / mass if mass > 0.0 else means[seen].mean()
         means = torch.where(seen, means, mean)
-    variance = _variance_of_means(scores - means[bins], bins, counts)
     # A slope of zero makes a bin's unknown mean harmless; 0 * inf would not say so.
     spread = torch.where(slopes == 0.0, torch.zeros_like(slopes), slopes.square() * variance[:, None])
     return MixedDerivative(share * (means @ slopes), share * spread.sum(0).sqrt())

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from neural_sim.stress.cases import CASES, Result, Scope, run_case
 
 FAMILIES = (
-    "linear", "linear_edges", "inner", "sampling", "simplex", "rendering", "imaging", "outer", "data",
+    "linear", "linear_edges", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer", "data",
 )  # fmt: skip
 """One file each, in the order of the loop: its cases are the functions marked ``@case``."""
 
