@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.types import RunMode
 
 import neural_sim.field.quadrature as quadrature
 import neural_sim.parameter.bins as binned
-from neural_sim.main import UserError, stress
+from neural_sim.main import UserError, _finish_stress, conf_directory, stress
+from neural_sim.report import stress as report
 from neural_sim.report.stress import failures, markdown, table, track, write
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.stress import cases, linear, rendering, sampling, simplex
@@ -152,10 +155,6 @@ def test_a_run_is_logged(tmp_path):
 
 
 def test_bad_settings_name_their_key(tmp_path):
-    from hydra import compose, initialize_config_dir
-
-    from neural_sim.main import conf_directory
-
     for override, message in (
         ("stress.families=[x]", "stress.families"),
         ("+stress.speed=1", "stress.speed"),
@@ -167,6 +166,22 @@ def test_bad_settings_name_their_key(tmp_path):
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         listed = compose("config", ["+experiment=stress"]).stress.families
     assert tuple(listed) == FAMILIES
+
+
+def test_what_failed_is_counted_written_and_decides_the_exit_status(tmp_path, monkeypatch):
+    monkeypatch.setattr(simplex, "project_sum", lambda values: values)
+    monkeypatch.setattr(report, "track", lambda *arguments: "not logged")
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        config = compose("config", ["+experiment=stress", "stress.families=[simplex]", "progress=false"])
+    failed = stress(config, tmp_path)
+    held = json.loads((tmp_path / "stress.json").read_text())
+    assert failed == sum(not row["passed"] for row in held) > 0
+    assert _finish_stress(0, RunMode.RUN) == 0.0
+    with pytest.raises(SystemExit) as caught:
+        _finish_stress(failed, RunMode.RUN)
+    assert caught.value.code == 1
+    with pytest.raises(RuntimeError, match="checks failed"):
+        _finish_stress(failed, RunMode.MULTIRUN)
 
 
 @pytest.mark.slow
