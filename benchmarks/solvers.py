@@ -2,7 +2,8 @@
 
     python benchmarks/solvers.py [--docs docs/numerics.md] [--json outputs/benchmarks/solvers.json]
 
-About three minutes on one core. Everything but the timings is float64 and deterministic.
+Minutes on one core. Everything but the timings, which are the process's own seconds on one thread, is float64 and
+deterministic.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from neural_sim.types import LabelledImages, PinholeCamera
 DOUBLE = torch.float64
 BINS = 4
 PSI = torch.tensor([[0.0, 1.0, 0.0, -0.5], [0.5, 0.0, 1.5, 0.0]], dtype=DOUBLE)
-BUDGETS = (5, 10, 15, 20, 25, 30, 40, 60, 80, 120, 200)
+BUDGETS = (5, 10, 15, 20, 25, 30, 40, 60, 80)
 CONDITIONS = (1.0, 1e2, 1e4, 1e6, 1e8, 1e10, 1e12)
 DEFAULT = AdjointSolver()
 LINEAR: dict[str, LinearSolver] = {
@@ -196,13 +197,13 @@ def systems(size: int = 200) -> list[dict[str, Any]]:
             operator = Shifted(lambda v, bare=bare: bare @ v, shift)
             b = operator(truth)
             for name, solver in LINEAR.items():
-                began = time.perf_counter()
+                began = time.process_time()
                 solution = solver.solve(operator, b, rtol=1e-10, max_steps=2000)
                 rows.append({
                     "solver": name, "condition": condition, "indefinite": indefinite,
                     "error": relative(solution.value, truth), "residual": solution.residual,
                     "status": solution.status.name, "products": solution.products,
-                    "seconds": time.perf_counter() - began,
+                    "seconds": time.process_time() - began,
                 })  # fmt: skip
     return rows
 
@@ -240,9 +241,9 @@ def product_costs(images: int = 64, repeats: int = 7) -> list[dict[str, Any]]:
 
 
 def seconds(run: Callable[[], Any]) -> float:
-    began = time.perf_counter()
+    began = time.process_time()
     run()
-    return time.perf_counter() - began
+    return time.process_time() - began
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def report(found: Mapping[str, Any]) -> str:
     machine, rows = found["machine"], found["hypergradients"]
     parts = [
         "    python benchmarks/solvers.py",
-        f"One thread, {machine['processor']}, torch {machine['torch']}.",
+        f"One thread, {machine['processor']}, torch {machine['torch']}; timings are the process's own.",
         "### The hypergradient against the oracle and against retraining",
         ORACLE,
         _oracle_table(rows),

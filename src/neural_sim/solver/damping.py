@@ -95,11 +95,13 @@ class LanczosDamping(Damping):
         _check("lanczos", self.minimum, self.lanczos_steps)
         if self.lanczos_steps < 1 or self.margin <= 0.0 or not self.max_condition > 1.0:
             raise ValueError(
-                "lanczos damping: want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
+                "solver.damping (lanczos): want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
                 f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
             )
         if self.start not in get_args(Start):
-            raise ValueError(f"lanczos damping: start must be one of {get_args(Start)}, got {self.start!r}")
+            raise ValueError(
+                f"solver.damping (lanczos): start must be one of {get_args(Start)}, got {self.start!r}"
+            )
 
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         # A zero or non-finite right-hand side has no Krylov space; its solve has a status of its own.
@@ -152,6 +154,6 @@ def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generat
 
 def _check(name: str, value: float, steps: int) -> None:
     if not (math.isfinite(value) and value >= 0.0):
-        raise ValueError(f"{name} damping: lambda must be finite and at least 0, got {value}")
+        raise ValueError(f"solver.damping ({name}): lambda must be finite and at least 0, got {value}")
     if steps < 0:
-        raise ValueError(f"{name} damping: lanczos_steps must be at least 0, got {steps}")
+        raise ValueError(f"solver.damping ({name}): lanczos_steps must be at least 0, got {steps}")
