@@ -7,7 +7,7 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "cameras", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver",
-         "gradient", "settings", "outer", "stress", "store", "codec", "report", "artifacts", "pipeline",
+         "gradient", "settings", "outer", "stress", "store", "codec", "report", "experiment", "artifacts", "pipeline",
          "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 

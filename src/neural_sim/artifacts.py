@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,62 +15,19 @@ from neural_sim.cameras import orbit
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
+from neural_sim.experiment import Account, Experiment
 from neural_sim.field.base import RadianceField
-from neural_sim.field.recipe import FieldRecipe
 from neural_sim.field.training import field_from_state, field_state
-from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.outer.module import SimulatorModule, learn_psi
-from neural_sim.parameter.pose import Pose
-from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.views import choose_mesh_renderer, render_views
-from neural_sim.settings import Outer, Training, Views
-from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.store import Entry, Store, code_version, tensor_digest
+from neural_sim.store import Store, code_version, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
-from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
-
-@dataclass(frozen=True)
-class Experiment:
-    """All parts of a run, built and validated; ``config`` is what they were built from, for keys and reports."""
-
-    name: str
-    method: str
-    optimise: bool
-    seed: int
-    stages: tuple[str, ...]
-    store: Path
-    mlflow: str
-    progress: bool
-    accelerator: str
-    objects: Any
-    views: Views
-    field: FieldRecipe
-    renderer: NerfRenderer
-    pose: Pose
-    synthesis: Synthesizer
-    target: Any
-    detector: Callable[..., Detector]
-    training: Training
-    outer: Outer
-    solver: AdjointSolver
-    gradient: Estimator
-    config: dict[str, Any]
-
-
-@dataclass
-class Account:
-    """What a run cost and what it did not have to do."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    left_out: list[dict[str, str]] = field(default_factory=list)
-
-    def note(self, stage: str, entry: Entry, what: str) -> None:
-        if entry.found:
-            self.left_out.append({"stage": stage, "what": what, "why": "found in the store"})
+DISTRIBUTIONS = ("parameter/bins", "parameter/distributions", "parameter/pose")
+"""What draws poses; how psi steps (``parameter/update``) matters to the psi loop alone."""
 
 
 class Artifacts:
@@ -173,7 +128,7 @@ class Artifacts:
 
     def _scene_key(self) -> dict[str, Any]:
         parts = self._config("renderer", "parameter", "synthesis", "training")
-        version = code_version("field", "renderer/nerf", "parameter", "synthesis", "detector", "cameras")
+        version = code_version("field", "renderer/nerf", *DISTRIBUTIONS, "synthesis", "detector", "cameras")
         return {
             "fields": [self._field_key(n) for n in self.names],
             "names": self.names,
@@ -195,7 +150,7 @@ class Artifacts:
         key = {
             "objects": self.digests, "names": self.names, "seed": self.x.seed,
             **self._config("target", "parameter", "synthesis", "views"), "size": self.x.training.image_size,
-            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "synthesis", "parameter"),
+            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "synthesis", *DISTRIBUTIONS),
         }  # fmt: skip
         entry = self.store.fetch("target", key, make)
         return {name: codec.unpack_images(held) for name, held in entry.value.items()}
@@ -207,7 +162,7 @@ class Artifacts:
         for name in self.names:
             key = {
                 "object": self.digests[name], **self._config("parameter", "views"),
-                "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "parameter"),
+                "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", *DISTRIBUTIONS),
             }  # fmt: skip
             camera = self.x.views.camera(48)
             entry = self.store.fetch(
@@ -273,7 +228,7 @@ class Artifacts:
 
         key = {
             "warm_start": self._trained_key(initial), **self._config("target", "outer", "gradient", "solver"),
-            "code": code_version("outer", "gradient", "solver"),
+            "code": code_version("outer", "gradient", "solver", "parameter/update"),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
 

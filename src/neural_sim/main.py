@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 if TYPE_CHECKING:
-    from neural_sim.artifacts import Experiment
+    from neural_sim.experiment import Experiment
 
 # Spinning OpenMP threads starve each other where processes share cores (sweeps, tests); read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -61,7 +61,7 @@ def build(config: DictConfig) -> Experiment:
         UserError: an unknown key, a value of the wrong type or out of range, with the key and what was got.
     """
     plain = _plain(config)
-    from neural_sim.artifacts import Experiment
+    from neural_sim.experiment import Experiment
 
     parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
     parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}

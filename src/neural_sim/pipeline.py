@@ -11,7 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from neural_sim.artifacts import Artifacts, Experiment
+from neural_sim.artifacts import Artifacts
+from neural_sim.experiment import Experiment
 from neural_sim.report.run import (
     RunResults,
     track,

@@ -20,7 +20,7 @@ from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
 from neural_sim.gradient.estimators import Probes
 from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
 from neural_sim.gradient.mixed import scores
-from neural_sim.gradient.stratified import importance_weights, stratified
+from neural_sim.gradient.stratified import importance_weights
 from neural_sim.solver.hvp import Term
 from neural_sim.solver.newton import Minimum, minimise
 
@@ -69,7 +69,12 @@ class BinnedProblem:
 
         def exact(vector: Params) -> MixedDerivative:
             along = scores(self.losses, params, vector, part.index, self.chunk_size)
-            return stratified(along, part.bins, psi[label], self.log_probabilities, 1.0 / len(self.probes))
+            leaf = psi[label].detach().requires_grad_()
+            with torch.enable_grad():
+                p = self.log_probabilities(leaf).exp()
+                total = importance_weights(p, part.bins, 1.0 / len(self.probes)) @ along
+            value = torch.autograd.grad(total, leaf)[0]
+            return MixedDerivative(value, torch.zeros_like(value))
 
         return exact
 

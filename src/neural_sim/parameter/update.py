@@ -118,22 +118,22 @@ class Mirror:
 
     The step in the logits is the gradient with respect to p, which is the one in the logits over p (centred):
     a bin that p has left gets as long a step as one it favours. Momentum averages the direction; its scale is taken out
-    by a running root mean square over all objects and bins, so that ``learning_rate`` is in logits per
-    step whatever the units of the loss.
+    by the largest root mean square over all objects and bins seen so far, so that ``learning_rate`` is in logits per
+    step whatever the units of the loss, and steps shorten as the gradient does. (A scale that forgets would blow up
+    what little gradient is left at the end, and the objects that have none to speak of would wander with it.)
 
     ``shrink`` scales each component of the averaged direction by max(0, 1 - its noise variance / its square), the
     positive-part rule of James and Stein (1961): what cannot be told from noise moves nothing, and the average of
     several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
     """
 
-    learning_rate: float = 0.4
+    learning_rate: float = 1.0
     momentum: float = 0.6
-    max_step: float = 0.8
-    scale_memory: float = 0.9
+    max_step: float = 1.0
     shrink: bool = True
 
     def __post_init__(self) -> None:
-        _check(self.learning_rate, self.max_step, momentum=self.momentum, scale_memory=self.scale_memory)
+        _check(self.learning_rate, self.max_step, momentum=self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
@@ -143,15 +143,16 @@ class Mirror:
         p = log_p.exp()
         direction = gradient / p
         direction = direction - direction.mean(-1, keepdim=True)
-        memory = self.scale_memory
-        second = memory * state.second + (1 - memory) * direction.square().mean().expand_as(psi)
-        scale = (second / (1 - memory**steps)).sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
         velocity = self.momentum * state.first + rest * direction
         noise = self.momentum**2 * state.noise + rest**2 * (standard_error / p).square()
-        kept = told_from_noise(velocity, noise) if self.shrink else 1.0
-        unbiased = kept * velocity / (1 - self.momentum**steps)
+        unbiased = velocity / (1 - self.momentum**steps)
+        # Of all that was seen, noise as well: scaled by what is left of it, shrunk noise would be as long as before.
+        largest = state.second.maximum(unbiased.square().mean())
+        if self.shrink:
+            unbiased = unbiased * told_from_noise(velocity, noise)
+        scale = largest.sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
-        return _accept(psi, moved, state, velocity, second, noise)
+        return _accept(psi, moved, state, velocity, largest, noise)
 
 
 def told_from_noise(

@@ -1,0 +1,58 @@
+"""A run as it was asked for, and the account of what it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neural_sim.detector.retinanet import Detector
+from neural_sim.field.recipe import FieldRecipe
+from neural_sim.gradient.estimators import Estimator
+from neural_sim.parameter.pose import Pose
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.settings import Outer, Training, Views
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.store import Entry
+from neural_sim.synthesis.training_set import Synthesizer
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All parts of a run, built and validated; ``config`` is what they were built from, for keys and reports."""
+
+    name: str
+    method: str
+    optimise: bool
+    seed: int
+    stages: tuple[str, ...]
+    store: Path
+    mlflow: str
+    progress: bool
+    accelerator: str
+    objects: Any
+    views: Views
+    field: FieldRecipe
+    renderer: NerfRenderer
+    pose: Pose
+    synthesis: Synthesizer
+    target: Any
+    detector: Callable[..., Detector]
+    training: Training
+    outer: Outer
+    solver: AdjointSolver
+    gradient: Estimator
+    config: dict[str, Any]
+
+
+@dataclass
+class Account:
+    """What a run cost and what it did not have to do."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+
+    def note(self, stage: str, entry: Entry, what: str) -> None:
+        if entry.found:
+            self.left_out.append({"stage": stage, "what": what, "why": "found in the store"})
