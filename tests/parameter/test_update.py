@@ -137,6 +137,20 @@ def test_mirror_moves_what_is_told_from_noise_and_holds_the_rest():
     assert 0.45 < drift[True] / drift[False] < 0.7
 
 
+def test_mirror_goes_on_after_a_cliff():
+    """One gradient of 1e12 among ordinary ones costs steps of a tenth, not all that follow."""
+    update, psi = Mirror(learning_rate=0.3, momentum=0.5), torch.zeros(1, 4, dtype=torch.float64)
+    state, exact = UpdateState.zeros(psi), torch.zeros_like(psi)
+    slope = torch.tensor([[-1.0, 0.5, 0.25, 0.25]], dtype=torch.float64)
+    for step in range(60):
+        p = torch.softmax(psi, -1)
+        size = 1e12 if step == 5 else 1.0
+        psi, state = update.step(psi, p.log(), size * p * (slope - (p * slope).sum()), exact, state)
+        if step == 45:  # momentum has forgotten the cliff: 1e12 * 0.5^40 = 1
+            before = psi.clone()
+    assert (psi - before)[0, 0] > 13 * 0.3 / 10
+
+
 @pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0), lambda: Adam(betas=(1.0, 0.9)),
                                   lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0)])  # fmt: skip
 def test_bad_settings_are_refused(make):

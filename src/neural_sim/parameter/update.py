@@ -11,6 +11,9 @@ from torch import Tensor
 
 _log = logging.getLogger(__name__)
 
+CLIFF = 10.0
+"""The mirror step clips gradients to this many times its scale."""
+
 
 @dataclass(frozen=True)
 class UpdateState:
@@ -143,8 +146,9 @@ class Mirror:
         p = log_p.exp()
         direction = gradient / p
         direction = direction - direction.mean(-1, keepdim=True)
-        velocity = self.momentum * state.first + rest * direction
-        noise = self.momentum**2 * state.noise + rest**2 * (standard_error / p).square()
+        clipped = self._clipped(direction, state)
+        velocity = self.momentum * state.first + rest * clipped * direction
+        noise = self.momentum**2 * state.noise + (rest * clipped * standard_error / p).square()
         unbiased = velocity / (1 - self.momentum**steps)
         # Of all that was seen, noise as well: scaled by what is left of it, shrunk noise would be as long as before.
         largest = state.second.maximum(unbiased.square().mean())
@@ -153,6 +157,13 @@ class Mirror:
         scale = largest.sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
         return _accept(psi, moved, state, velocity, largest, noise)
+
+    def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
+        """The part of a direction that counts: the scale never falls, so one freak gradient must not set it."""
+        size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
+        return torch.where(
+            known > 0.0, (CLIFF * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)
+        )
 
 
 def told_from_noise(
