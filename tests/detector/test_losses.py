@@ -43,6 +43,12 @@ def test_pseudo_huber_meets_its_limits():
     torch.testing.assert_close(box_loss(large, "l1", 0.1), large.abs())
 
 
+def test_pseudo_huber_keeps_its_digits_in_float32():
+    residual = torch.logspace(-6, 2, 33)
+    exact = 0.1 * (torch.sqrt(1 + (residual.double() / 0.1) ** 2) - 1)
+    torch.testing.assert_close(box_loss(residual, "pseudo_huber", 0.1).double(), exact, rtol=2e-6, atol=0)
+
+
 def test_pseudo_huber_has_two_derivatives():
     residual = torch.tensor([-2.0, -0.05, 0.0, 0.05, 2.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradgradcheck(

@@ -33,4 +33,6 @@ def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Floa
     """
     if kind == "l1":
         return residual.abs()
-    return delta * (torch.sqrt(1 + (residual / delta) ** 2) - 1)
+    square = (residual / delta) ** 2
+    # sqrt(1 + square) - 1, without the difference that cancels every digit of a small residual.
+    return delta * square / (torch.sqrt(1 + square) + 1)
