@@ -14,7 +14,8 @@ def replace_section(path: Path, name: str, markdown: str) -> None:
         ValueError: where the file has one marker without the other, out of order, or more than once.
     """
     begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-    block = f"{begin}\n## {name}\n\n{markdown.rstrip().lstrip('\n')}\n\n{end}\n"
+    body = markdown.rstrip().lstrip("\n")  # spaces at the beginning make a code block
+    block = f"{begin}\n## {name}\n\n{body}\n\n{end}\n"
     text = path.read_text() if path.exists() else ""
     counts = text.count(begin), text.count(end)
     if counts == (0, 0):
