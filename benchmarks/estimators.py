@@ -207,9 +207,10 @@ component times max(0, 1 - noise / square), as the psi update does it."""
 
 def markdown(worlds: list[dict[str, Any]], modes: list[dict[str, Any]], settings: dict[str, Any]) -> str:
     """The section of docs/numerics.md."""
-    parts = [f"`{settings['command']}`", DEFINITIONS.format(**settings)]
+    parts = [f"    {settings['command']}", DEFINITIONS.format(**settings)]
     for world in worlds:
         parts.append(_world_table(world))
+        parts.append(_verdict(world, settings["truth_images"]))
     rows = [
         f"| {row['mode']} | {1e3 * row['seconds']:.0f} | {row['difference']:.0e} |"
         if "difference" in row
@@ -243,6 +244,26 @@ def _world_table(world: dict[str, Any]) -> str:
         f"**{world['world']}** ({', '.join(world['objects'])}; v {world['solve']}). Ceilings: hard {ceilings['hard']}, "
         f"relaxed {ceilings['relaxed']}; cosine of the two truths: {agreement}.\n\n" + "\n".join(lines)
     )
+
+
+def _verdict(world: dict[str, Any], truth_images: int) -> str:
+    """Who is first at 64 images, and whether the truths can tell."""
+    rows = [row for row in world["rows"] if row["images"] == 64]
+    first = {
+        "in logits": max(rows, key=lambda row: row["hard"]["cosine"]),
+        "in p": max(rows, key=lambda row: row["hard"]["cosine_in_p"]),
+        "by error": min(rows, key=lambda row: row["hard"]["error"]),
+    }
+    text = "First at N = 64 against the hard truth: " + ", ".join(
+        f"{how} {row['estimator']}" for how, row in first.items()
+    )
+    weak = [which for which, ceilings in world["ceiling"].items() if min(ceilings) < 0.8]
+    if weak:
+        text += (
+            f". {truth_images} images do not settle the {' and the '.join(weak)} truth of every object (ceiling below "
+            "0.8): cosines with it say little"
+        )
+    return text + "."
 
 
 def _cell(held: dict[str, Any]) -> str:
