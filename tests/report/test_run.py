@@ -18,6 +18,7 @@ def results():
     record = {
         "probabilities": uniform.tolist(), "entropies": [1.0, 1.0], "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
+        "images_without_box": 3,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
             "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "action": "shrunk",
@@ -39,13 +40,14 @@ def test_results_are_json_by_the_standard(results, tmp_path):
     assert held["ap"]["ns"]["per_class"]["b"] is None
     assert held["total_variation"]["a"] == {"initial": pytest.approx(0.6), "learned": 0.0}
     assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
+    assert held["images_without_box"] == 6
     assert held["psi"]["a"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
 
 
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = "untrusted psi steps: 2 of 2; shrunk 2; signal 2; cosine with retrained differences 0.90, 0.90"
-    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", trust):
+    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", "without a box: 6", trust):
         assert word in text
 
 

@@ -67,6 +67,7 @@ class RunResults:
                 "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
                 "certificates": untrusted(self.records),
+                "images_without_box": self.images_without_box(),
                 "iterations": list(self.records),
                 "fields": {name: history[-1] for name, history in self.fields.items() if history},
                 "seconds": dict(self.seconds),
@@ -74,6 +75,10 @@ class RunResults:
                 "left_out": list(self.left_out),
             }
         )
+
+    def images_without_box(self) -> int:
+        """Training images of the psi loop in which the object was out of frame or too small to get a box."""
+        return sum(record["images_without_box"] for record in self.records)
 
     def total_variations(self) -> dict[str, dict[str, float]]:
         """Distance of the initial and the learned distribution from the target, per object."""
@@ -95,6 +100,8 @@ class RunResults:
             lines.append(f"  {which:<18}{row}")
         if self.records:
             lines.append(_trust_line(untrusted(self.records)))
+        if self.images_without_box():
+            lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
         lines.append(f"seconds: {spent}; peak memory {self.peak_memory_mb:.0f} MB")
         if self.left_out:
