@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from hydra import compose, initialize_config_dir
 from hydra.types import RunMode
 
@@ -193,4 +192,4 @@ def test_the_command_line_writes_every_family_and_exits_by_what_failed(tmp_path)
     held = json.loads((tmp_path / "run" / "stress.json").read_text())
     assert {row["case"].split("/")[0] for row in held} == set(FAMILIES)
     assert all(row["passed"] for row in held)
-    assert torch.tensor([row["tolerance"] for row in held]).isfinite().all()
+    assert all(math.isfinite(row["tolerance"]) for row in held)
