@@ -5,6 +5,7 @@ Seconds are the process's CPU time, which other work on the machine disturbs les
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass, field
 
@@ -24,6 +25,35 @@ from neural_sim.types import SceneDraw
 
 COUNTS = (16, 32, 64, 128)
 UNIT = COUNTS[0]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A pathwise estimator with the settings of other rooms that belong to it."""
+
+    estimator: PathwiseEstimator
+    bin_mean: str = "circular"
+    label_gradient: str = "differentiable"
+
+    def of(self, world: World) -> World:
+        pose = dataclasses.replace(world.scene.pose, bin_mean=self.bin_mean)
+        synthesizer = dataclasses.replace(world.scene.synthesizer, label_gradient=self.label_gradient)
+        scene = dataclasses.replace(world.scene, pose=pose, synthesizer=synthesizer)
+        return dataclasses.replace(world, scene=scene)
+
+
+RELAXED = "circular, boxes"
+PATHWISE = {
+    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear", "ignored"),
+    "linear": Variant(PathwiseEstimator(), "linear", "ignored"),
+    "circular": Variant(PathwiseEstimator(), "circular", "ignored"),
+    "linear, boxes": Variant(PathwiseEstimator(), "linear"),
+    RELAXED: Variant(PathwiseEstimator()),
+    "antithetic": Variant(PathwiseEstimator(antithetic=True)),
+    "common backgrounds": Variant(PathwiseEstimator(common_backgrounds=True)),
+    "straight-through": Variant(PathwiseEstimator(relaxation="straight_through")),
+    "Gumbel-Rao": Variant(PathwiseEstimator(relaxation="gumbel_rao", conditional_draws=16)),
+}
 
 
 @dataclass

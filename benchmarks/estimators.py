@@ -15,13 +15,14 @@ import dataclasses
 import json
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from estimator_runs import (  # the modules beside this one
     COUNTS,
+    PATHWISE,
+    RELAXED,
     UNIT,
     Result,
     pathwise_result,
@@ -36,38 +37,9 @@ from torch import Tensor
 from worlds import WORLDS, Truth, World, hard_truth, make_world
 
 from neural_sim.cameras import orbit
-from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents
+from neural_sim.gradient.pathwise import contract, draw_cotangents
 from neural_sim.synthesis.motion import pose_rates
 from neural_sim.types import Maps, PinholeCamera
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A pathwise estimator with the settings of other rooms that belong to it."""
-
-    estimator: PathwiseEstimator
-    bin_mean: str = "circular"
-    label_gradient: str = "differentiable"
-
-    def of(self, world: World) -> World:
-        pose = dataclasses.replace(world.scene.pose, bin_mean=self.bin_mean)
-        synthesizer = dataclasses.replace(world.scene.synthesizer, label_gradient=self.label_gradient)
-        scene = dataclasses.replace(world.scene, pose=pose, synthesizer=synthesizer)
-        return dataclasses.replace(world, scene=scene)
-
-
-RELAXED = "circular, boxes"
-PATHWISE = {
-    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear", "ignored"),
-    "linear": Variant(PathwiseEstimator(), "linear", "ignored"),
-    "circular": Variant(PathwiseEstimator(), "circular", "ignored"),
-    "linear, boxes": Variant(PathwiseEstimator(), "linear"),
-    RELAXED: Variant(PathwiseEstimator()),
-    "antithetic": Variant(PathwiseEstimator(antithetic=True)),
-    "common backgrounds": Variant(PathwiseEstimator(common_backgrounds=True)),
-    "straight-through": Variant(PathwiseEstimator(relaxation="straight_through")),
-    "Gumbel-Rao": Variant(PathwiseEstimator(relaxation="gumbel_rao", conditional_draws=16)),
-}
 
 
 def compare(world: World, repeats: int, truth_images: int) -> dict[str, Any]:

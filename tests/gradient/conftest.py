@@ -9,9 +9,17 @@ import pytest
 import torch
 
 from neural_sim import cameras
+from neural_sim.detector.retinanet import Detector
+from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.parameter.pose import Pose
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.motion import pose_rates
+from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 DOUBLE = torch.float64
@@ -134,3 +142,86 @@ def stand_in_tangents():
 @pytest.fixture
 def problem() -> Bilevel:
     return Bilevel()
+
+
+COUNT = 4
+ROOMS_CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.0))
+
+
+class Rooms:
+    """Four images of one textured block, their detector, and everything between psi and their losses."""
+
+    def __init__(self) -> None:
+        generator = torch.Generator().manual_seed(5)
+        self.field = GridField().double().eval()
+        self.field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6, dtype=DOUBLE), 0.3)
+        with torch.no_grad():
+            self.field.table.copy_(
+                torch.randn(self.field.table.shape, generator=generator, dtype=DOUBLE) + 1.0
+            )
+        self.field.requires_grad_(False)
+        self.pose = Pose(bins=4, temperature=0.8)
+        self.psi = torch.randn(4, generator=generator, dtype=DOUBLE)
+        self.noise = self.pose.draw_noise(COUNT, generator, DOUBLE)
+        self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+        self.nuisance = self.synthesizer.draw_nuisance(COUNT, ROOMS_CAMERA, generator)
+        self.detector = Detector(2, 32, anchor_sizes=((10,), (18,)), channels=8, head_convs=1)
+        params = {name: value.double() for name, value in self.detector.init(generator).items()}
+        self.backbone, self.trainable = self.detector.split(params)
+        flat = flatten(self.trainable)
+        noise = torch.randn(2, flat.numel(), generator=generator, dtype=DOUBLE)
+        self.trainable = unflatten(flat + 0.05 * noise[0], self.trainable)
+        self.vector = unflatten(noise[1], self.trainable)
+        labelled = self.compose(*self.render(self.psi))
+        self.images, self.targets = labelled.images, self.detector.assign(labelled.boxes, labelled.labels)
+        self.features = self.detector.features(self.backbone, self.images)
+
+    def render_rays(self, rays: Rays):
+        return NerfRenderer(termination=0.0).render_rays(self.field, rays)
+
+    def render(self, psi):
+        draw = self.pose.relaxed(psi, self.noise)
+        bundle = cameras.rays(ROOMS_CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
+        rgb, opacity = self.render_rays(Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)))
+        return rgb.view(COUNT, 32, 32, 3), opacity.view(COUNT, 32, 32)
+
+    def tangents(self, draw, names):
+        poses, rates = cameras.orbit(draw.phi, draw.rho, draw.distance), pose_rates(draw, names)
+        _, moved = NerfRenderer(termination=0.0).render_with_tangents(self.field, ROOMS_CAMERA, poses, rates)
+        return dict(zip(names, moved, strict=True))
+
+    def compose(self, rgb, opacity):
+        return self.synthesizer.compose(rgb, opacity, self.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
+
+    def loss_of(self, params, images, index, boxes=None):
+        features = self.detector.features(self.backbone, images)
+        targets = self.targets.select(index)
+        if boxes is not None:
+            targets = self.detector.assign(boxes, torch.ones(len(boxes), 1, dtype=torch.long))
+        return self.detector.per_image_loss(params, features, targets)
+
+    def losses(self, params, index):
+        features = [level[index] for level in self.features]
+        return self.detector.per_image_loss(params, features, self.targets.select(index))
+
+    def object_images(self) -> ObjectImages:
+        with torch.no_grad():
+            draw = self.pose.relaxed(self.psi, self.noise)
+            rgb, opacity = self.render(self.psi)
+        path = RenderedPath(
+            relaxed=lambda psi: self.pose.relaxed(psi, self.noise),
+            render_rays=self.render_rays,
+            compose=lambda rgb, opacity: self.compose(rgb, opacity).images,
+            camera=ROOMS_CAMERA,
+            rgb=rgb,
+            opacity=opacity,
+        )
+        weights = torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE)
+        return ObjectImages(
+            self.psi, self.pose.log_probabilities, self.images, torch.arange(COUNT), weights, draw, path
+        )
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Rooms:
+    return Rooms()
