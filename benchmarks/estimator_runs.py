@@ -36,9 +36,12 @@ class Variant:
     label_gradient: str = "differentiable"
 
     def of(self, world: World) -> World:
-        pose = dataclasses.replace(world.scene.pose, bin_mean=self.bin_mean)
+        (factor,) = world.scene.distribution.factors
+        distribution = dataclasses.replace(
+            world.scene.distribution, factors=(dataclasses.replace(factor, bin_mean=self.bin_mean),)
+        )
         synthesizer = dataclasses.replace(world.scene.synthesizer, label_gradient=self.label_gradient)
-        scene = dataclasses.replace(world.scene, pose=pose, synthesizer=synthesizer)
+        scene = dataclasses.replace(world.scene, distribution=distribution, synthesizer=synthesizer)
         return dataclasses.replace(world, scene=scene)
 
 
@@ -90,7 +93,7 @@ def differentiate(
     losses = Losses(unavailable, from_images)
     weights = torch.full((len(images),), len(rendered) / len(images))  # every object's own sum to 1
     held = object_images(world.scene, rendered, world.psi, weights)
-    return [estimator.estimate(losses, world.trainable, world.vector, part, None) for part in held.values()]
+    return [estimator.estimate(losses, world.trainable, world.vector, part, {}) for part in held.values()]
 
 
 def score(
@@ -105,14 +108,14 @@ def score(
     still = torch.zeros(count)
     held = ObjectImages(
         world.psi[label].float(),
-        world.scene.pose.log_probabilities,
+        world.scene.distribution,
         torch.zeros(count, 3, 1, 1),
         drawn.index,
         torch.full((count,), 1.0 / count),
-        SceneDraw(still, still, still, drawn.bins),
+        SceneDraw(still, still, still, drawn.bins[:, None]),
     )
     losses = Losses(cached.losses, unavailable, cached.losses)
-    return estimator.estimate(losses, world.trainable, world.vector, held, drawn)
+    return estimator.estimate(losses, world.trainable, world.vector, held, {"pose": drawn})
 
 
 def unavailable(*_: object) -> Tensor:
@@ -131,7 +134,7 @@ def pathwise_result(units: Tensor, seconds: float) -> Result:
 def run_stratified(world: World, pool: int) -> dict[str, Result]:
     """Disjoint parts of ``pool`` images of every bin; as it is, and shrunk by its noise as the psi update does it."""
     probes, cached, seconds = draw_bins(world, pool, torch.Generator().manual_seed(31))
-    bins, plain, shrunk = world.scene.pose.bins, Result(), Result()
+    bins, plain, shrunk = world.scene.distribution.size, Result(), Result()
     for count in COUNTS:
         per_bin, values, kept = count // bins, [], []
         began = time.process_time()
@@ -160,7 +163,7 @@ def run_reinforce(world: World, pool: int) -> Result:
         began, found = time.process_time(), []
         for first in range(0, pool - count + 1, count):
             rows = torch.arange(first, first + count)
-            drawn = [Probes(label * pool + rows, part.draw.bins[rows]) for label, part in enumerate(parts)]
+            drawn = [Probes(label * pool + rows, part.draw.bins[rows, 0]) for label, part in enumerate(parts)]
             found.append(
                 centred(
                     [score(world, ReinforceEstimator(), cached, p, label) for label, p in enumerate(drawn)]

@@ -44,7 +44,7 @@ from neural_sim.types import Maps, PinholeCamera
 
 def compare(world: World, repeats: int, truth_images: int) -> dict[str, Any]:
     """Every estimator on one world, with both truths."""
-    hard = hard_truth(world, truth_images // world.scene.pose.bins, seed=21)
+    hard = hard_truth(world, truth_images // world.scene.distribution.size, seed=21)
     base = PATHWISE[RELAXED]
     found, _ = run_pathwise(base.of(world), base.estimator, truth_images // UNIT, seed=22)
     relaxed = Truth(found.mean(0), found.std(0) / len(found) ** 0.5)
@@ -56,10 +56,10 @@ def compare(world: World, repeats: int, truth_images: int) -> dict[str, Any]:
         found, seconds = run_pathwise(variant.of(world), variant.estimator, units, seed=100)
         results[f"pathwise: {name}"] = pathwise_result(found, seconds)
         print(f"{world.name}: {name}, {seconds * 1e3:.1f} ms an image", flush=True)
-    results |= run_stratified(world, repeats * COUNTS[-1] // world.scene.pose.bins)
+    results |= run_stratified(world, repeats * COUNTS[-1] // world.scene.distribution.size)
     results["reinforce"] = run_reinforce(world, repeats * COUNTS[-1])
     truths = {"hard": hard, "relaxed": relaxed}
-    p = world.scene.pose.log_probabilities(world.psi).exp().float()
+    p = world.scene.distribution.probabilities(world.psi)["pose"].float()
     rows = [summary(name, result, count, truths, p) for name, result in results.items() for count in COUNTS]
     return {
         "world": world.name,
@@ -111,7 +111,7 @@ def compare_modes(world: World, size: int = 96, count: int = 8) -> list[dict[str
         world.scene, camera=PinholeCamera(size, size, world.scene.camera.field_of_view)
     )
     generator = torch.Generator().manual_seed(51)
-    draw = scene.pose.hard(world.psi[0].float(), scene.pose.draw_noise(count, generator))
+    draw = scene.distribution.hard(world.psi[0].float(), scene.distribution.draw_noise(count, generator))
     cotangents = Maps(
         torch.randn(count, size, size, 3, generator=generator),
         torch.randn(count, size, size, generator=generator),
@@ -268,9 +268,9 @@ def main() -> None:
         "command": " ".join(
             ["python benchmarks/estimators.py", *(["--ycb ../shared/ycb"] if arguments.ycb else [])]
         ),
-        "per_bin": arguments.truth_images // worlds[0].scene.pose.bins,
+        "per_bin": arguments.truth_images // worlds[0].scene.distribution.size,
         "truth_images": arguments.truth_images,
-        "temperature": worlds[0].scene.pose.temperature,
+        "temperature": worlds[0].scene.distribution.factors[0].temperature,
         "repeats": arguments.repeats,
         "total_seconds": time.perf_counter() - began,
     }

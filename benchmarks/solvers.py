@@ -34,6 +34,7 @@ from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss, hypergrad
 from neural_sim.main import conf_directory
 from neural_sim.outer.retrained import BinnedProblem, as_double, centred_cosine, finite_difference
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import LinearSolver
@@ -83,7 +84,14 @@ def small_scene() -> Scene:
 
     camera = PinholeCamera(32, 32, math.radians(40.0))
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-    return Scene(("a", "b"), (block(1), block(2)), NerfRenderer(), camera, synthesizer, Pose(bins=BINS))
+    return Scene(
+        ("a", "b"),
+        (block(1), block(2)),
+        NerfRenderer(),
+        camera,
+        synthesizer,
+        SceneDistribution.of([Pose(bins=BINS)]),
+    )
 
 
 def detector_of(name: str, classes: int, size: int) -> Detector:
@@ -106,7 +114,9 @@ def trained_problem() -> tuple[BinnedProblem, list[Term]]:
     held = CachedSet.of(detector, backbone, probes).double()
     bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
     losses = SplitLoss(held.outputs, held.losses_of)
-    problem = BinnedProblem(losses, bins, scene.pose.log_probabilities, 0.0, as_double(warm))
+    problem = BinnedProblem(
+        losses, bins, scene.distribution.factors[0].log_probabilities, 0.0, as_double(warm)
+    )
     return problem, CachedSet.of(detector, backbone, validation).double().mean_terms()
 
 

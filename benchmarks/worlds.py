@@ -84,7 +84,7 @@ def hard_truth(world: World, per_bin: int, seed: int) -> Truth:
     found = [
         stratified(
             scores(cached.losses, world.trainable, world.vector, probe.index), probe.bins,
-            world.psi[label].float(), world.scene.pose.log_probabilities,
+            world.psi[label].float(), world.scene.distribution.factors[0].log_probabilities,
         )
         for label, probe in enumerate(probes)
     ]  # fmt: skip
@@ -102,12 +102,15 @@ def draw_bins(
 ) -> tuple[list[Probes], CachedSet, float]:
     """Images of every bin of every object, their features, and the seconds an image took."""
     began = time.process_time()
-    parts = [world.scene.probes(label, per_bin, generator) for label in range(len(world.scene.names))]
+    parts = [
+        world.scene.probes(label, "pose", per_bin, world.psi[label], generator)
+        for label in range(len(world.scene.names))
+    ]
     images = join(parts)
     cached = CachedSet.of(world.detector, world.backbone, images)
     each = len(parts[0].images)
     probes = [
-        Probes(torch.arange(each) + label * each, world.scene.pose.bin_of(part.draw))
+        Probes(torch.arange(each) + label * each, world.scene.distribution.bins_of(part.draw)[:, 0])
         for label, part in enumerate(parts)
     ]
     return probes, cached, (time.process_time() - began) / len(images)

@@ -35,13 +35,13 @@ def test_one_run_from_objects_to_a_report(tmp_path):
         results
     )
     assert set(results["ap"]) == {"ns", "learned", "matched"}
-    assert set(results["psi"]["pitcher"]) == {"initial", "learned", "target"}
-    for distribution in results["psi"]["pitcher"].values():
+    assert set(results["psi"]["pitcher"]["pose"]) == {"initial", "learned", "target"}
+    for distribution in results["psi"]["pitcher"]["pose"].values():
         assert sum(distribution) == pytest.approx(1.0, abs=1e-6)
-    assert results["symmetric_bins"]["drill"] == [[b] for b in range(1, 9)]
-    assert results["psi"]["pitcher"]["learned"] != results["psi"]["pitcher"]["initial"]
+    assert results["symmetric_bins"]["drill"]["pose"] == [[b] for b in range(1, 9)]
+    assert results["psi"]["pitcher"]["pose"]["learned"] != results["psi"]["pitcher"]["pose"]["initial"]
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
-    assert figures == {"psi.png", "ap.png", "training_images.png", "detections.png"}
+    assert figures == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}
     coco = json.loads((tmp_path / "run" / "training_set" / "annotations.json").read_text())
     assert coco["images"] and "phi" in coco["images"][0]["pose"]
 

@@ -26,8 +26,10 @@ from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
-DISTRIBUTIONS = ("parameter/bins", "parameter/distributions", "parameter/pose")
-"""What draws poses; how psi steps (``parameter/update``) matters to the psi loop alone."""
+DISTRIBUTIONS = tuple(
+    f"parameter/{name}" for name in ("bins", "distributions", "factor", "pose", "product", "zoom")
+)
+"""What draws scenes; how psi steps (``parameter/update``) matters to the psi loop alone."""
 
 
 class Artifacts:
@@ -39,9 +41,9 @@ class Artifacts:
         self.account = Account()
         self.names: list[str] = experiment.objects.names()
         self.device = torch.device("cuda" if experiment.accelerator == "gpu" else "cpu")
-        unknown = set(experiment.pose.biased or {}) - set(self.names)
+        unknown = set(experiment.distribution.biased) - set(self.names)
         if unknown:
-            raise ValueError(f"parameter.pose.biased names {sorted(unknown)}, objects are {self.names}")
+            raise ValueError(f"parameter: biased names {sorted(unknown)}, objects are {self.names}")
 
     @cached_property
     def digests(self) -> dict[str, str]:
@@ -116,18 +118,18 @@ class Artifacts:
             field_from_state(self.field(name)["field"]).to(self.device) for name in self.names
         )
         camera = self.x.views.camera(self.x.training.image_size)
-        return Scene(tuple(self.names), fields, self.x.renderer, camera, self.x.synthesis, self.x.pose)
+        return Scene(
+            tuple(self.names), fields, self.x.renderer, camera, self.x.synthesis, self.x.distribution
+        )
 
     # --- distributions and sets ---
 
     def psi(self, which: str) -> Tensor:
         """Configured logits of all objects: ``initial`` or ``target``."""
-        return torch.stack(
-            [self.x.pose.logits(self.x.pose.probabilities(which, name)) for name in self.names]
-        )
+        return self.x.distribution.psi(which, self.names)
 
     def _scene_key(self) -> dict[str, Any]:
-        parts = self._config("renderer", "parameter", "synthesis", "training")
+        parts = self._config("renderer", "parameter", "unlearned", "synthesis", "training")
         version = code_version("field", "renderer/nerf", *DISTRIBUTIONS, "synthesis", "detector", "cameras")
         return {
             "fields": [self._field_key(n) for n in self.names],
@@ -143,35 +145,36 @@ class Artifacts:
 
         def make() -> Any:
             made = self.x.target.sets(
-                self.meshes, self.mesh_renderer, self.x.pose, camera, self.x.synthesis, self.x.seed
+                self.meshes, self.mesh_renderer, self.x.distribution, camera, self.x.synthesis, self.x.seed
             )
             return {name: codec.pack_images(images) for name, images in made.items()}
 
         key = {
             "objects": self.digests, "names": self.names, "seed": self.x.seed,
-            **self._config("target", "parameter", "synthesis", "views"), "size": self.x.training.image_size,
+            **self._config("target", "parameter", "unlearned", "synthesis", "views"),
+            "size": self.x.training.image_size,
             "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "synthesis", *DISTRIBUTIONS),
         }  # fmt: skip
         entry = self.store.fetch("target", key, make)
         return {name: codec.unpack_images(held) for name, held in entry.value.items()}
 
     @cached_property
-    def symmetric_bins(self) -> dict[str, list[list[int]]]:
-        """Groups of bins, numbered from 1, that each object's symmetry makes the same."""
-        found = {}
-        for name in self.names:
-            key = {
-                "object": self.digests[name], **self._config("parameter", "views"),
-                "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", *DISTRIBUTIONS),
-            }  # fmt: skip
+    def symmetric_bins(self) -> dict[str, dict[str, list[list[int]]]]:
+        """By object and angle: groups of bins, numbered from 1, that the object's symmetry makes the same."""
+        angles = [f.name for f in self.x.distribution.factors if f.coordinate in ("phi", "rho")]
+        return {name: {angle: self._equivalent(name, angle) for angle in angles} for name in self.names}
+
+    def _equivalent(self, name: str, angle: str) -> list[list[int]]:
+        key = {
+            "object": self.digests[name], "factor": angle, **self._config("parameter", "unlearned", "views"),
+            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", *DISTRIBUTIONS),
+        }  # fmt: skip
+
+        def make() -> list[list[int]]:
             camera = self.x.views.camera(48)
-            entry = self.store.fetch(
-                "symmetry", key, lambda name=name, camera=camera: equivalent_bins(
-                    self.meshes[name], self.mesh_renderer, self.x.pose, camera
-                ),
-            )  # fmt: skip
-            found[name] = [[b + 1 for b in group] for group in entry.value]
-        return found
+            return equivalent_bins(self.meshes[name], self.mesh_renderer, self.x.distribution, angle, camera)
+
+        return [[b + 1 for b in group] for group in self.store.fetch("symmetry", key, make).value]
 
     # --- detectors ---
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -34,6 +35,13 @@ def orbit(
 def focal_length(camera: PinholeCamera) -> float:
     """Focal length in pixels."""
     return 0.5 * camera.height / math.tan(0.5 * camera.field_of_view)
+
+
+def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
+    """The camera with ``magnification`` times its focal length."""
+    return replace(
+        camera, field_of_view=2.0 * math.atan(math.tan(0.5 * camera.field_of_view) / magnification)
+    )
 
 
 def pixel_directions(

@@ -10,7 +10,7 @@ from typing import Any
 from neural_sim.detector.retinanet import Detector
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
-from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import Outer, Training, Views
 from neural_sim.solver.adjoint import AdjointSolver
@@ -35,7 +35,7 @@ class Experiment:
     views: Views
     field: FieldRecipe
     renderer: NerfRenderer
-    pose: Pose
+    distribution: SceneDistribution
     synthesis: Synthesizer
     target: Any
     detector: Callable[..., Detector]

@@ -65,8 +65,8 @@ def build(config: DictConfig) -> Experiment:
 
     parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
     parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}
-    if set(parameters) != {"pose"}:
-        raise UserError(f"parameter: this version optimises [pose], got {sorted(parameters)}")
+    if not parameters:
+        raise UserError("parameter: want at least one of pose, zoom, got none")
     return Experiment(
         name=plain["name"],
         method=plain["baseline"]["name"],
@@ -77,10 +77,19 @@ def build(config: DictConfig) -> Experiment:
         mlflow=plain["paths"]["mlflow"],
         progress=plain["progress"],
         accelerator=plain["trainer"]["accelerator"],
-        pose=parameters["pose"],
+        distribution=_product(parameters, _instantiate(plain["unlearned"], "unlearned")),
         config=plain,
         **parts,
     )
+
+
+def _product(parameters: Mapping[str, Any], unlearned: Any) -> Any:
+    from neural_sim.parameter.product import SceneDistribution
+
+    try:
+        return SceneDistribution.of(parameters.values(), unlearned)
+    except ValueError as error:
+        raise UserError(_first_line(error)) from error
 
 
 def stress(config: DictConfig, folder: Path) -> int:

@@ -110,17 +110,20 @@ class SceneDraw:
     """Scene parameters V of one object's images, drawn from p_psi (paper, Sec. 3.1, Tool 1).
 
     ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the
-    origin in object radii. ``bins`` is the index of the drawn (or largest relaxed) pose bin, from 0. Fields may carry
-    gradients with respect to psi.
+    origin in object radii, ``magnification`` its focal length in units of the camera's own (None: 1). ``bins`` are
+    the indices of the drawn (or largest relaxed) bins from 0, a column for each factor of p_psi. The numbers may
+    carry gradients with respect to psi.
     """
 
     phi: Float[Tensor, "images"]
     rho: Float[Tensor, "images"]
     distance: Float[Tensor, "images"]
-    bins: Int[Tensor, "images"]
+    bins: Int[Tensor, "images factors"]
+    magnification: Float[Tensor, "images"] | None = None
 
     def __len__(self) -> int:
         return self.phi.shape[0]
 
     def select(self, index: Tensor | slice) -> SceneDraw:
-        return SceneDraw(**{f.name: getattr(self, f.name)[index] for f in fields(SceneDraw)})
+        held = {f.name: getattr(self, f.name) for f in fields(SceneDraw)}
+        return SceneDraw(**{name: value[index] for name, value in held.items() if value is not None})

@@ -15,6 +15,7 @@ from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.synthesis.background import ProceduralClutter
@@ -74,7 +75,7 @@ class Bilevel:
     def relaxed(self, psi):
         weights = torch.softmax((self.gumbel + torch.log_softmax(psi, -1)) / 0.7, -1)
         phi = weights @ self.centres + 0.2 * self.within
-        return SceneDraw(phi, self.other * 0.3, 3.0 + 0.1 * torch.sin(phi), weights.argmax(-1))
+        return SceneDraw(phi, self.other * 0.3, 3.0 + 0.1 * torch.sin(phi), weights.argmax(-1)[:, None])
 
     def compose(self, rgb, opacity):
         return rgb.permute(0, 3, 1, 2) + (1.0 - opacity[:, None]) * self.background
@@ -129,7 +130,7 @@ def pathwise():
 
     def estimate(loss_of, params, vector, batch, **settings):
         losses = Losses(lambda p, rows: loss_of(p, batch.images[rows], rows), loss_of)
-        return PathwiseEstimator(**settings).estimate(losses, params, vector, batch, None)
+        return PathwiseEstimator(**settings).estimate(losses, params, vector, batch, {})
 
     return estimate
 
@@ -160,9 +161,9 @@ class Rooms:
                 torch.randn(self.field.table.shape, generator=generator, dtype=DOUBLE) + 1.0
             )
         self.field.requires_grad_(False)
-        self.pose = Pose(bins=4, temperature=0.8)
+        self.distribution = SceneDistribution.of([Pose(bins=4, temperature=0.8)])
         self.psi = torch.randn(4, generator=generator, dtype=DOUBLE)
-        self.noise = self.pose.draw_noise(COUNT, generator, DOUBLE)
+        self.noise = self.distribution.draw_noise(COUNT, generator, DOUBLE)
         self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
         self.nuisance = self.synthesizer.draw_nuisance(COUNT, ROOMS_CAMERA, generator)
         self.detector = Detector(2, 32, anchor_sizes=((10,), (18,)), channels=8, head_convs=1)
@@ -180,7 +181,7 @@ class Rooms:
         return NerfRenderer(termination=0.0).render_rays(self.field, rays)
 
     def render(self, psi):
-        draw = self.pose.relaxed(psi, self.noise)
+        draw = self.distribution.relaxed(psi, self.noise)
         bundle = cameras.rays(ROOMS_CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
         rgb, opacity = self.render_rays(Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)))
         return rgb.view(COUNT, 32, 32, 3), opacity.view(COUNT, 32, 32)
@@ -206,10 +207,10 @@ class Rooms:
 
     def object_images(self) -> ObjectImages:
         with torch.no_grad():
-            draw = self.pose.relaxed(self.psi, self.noise)
+            draw = self.distribution.relaxed(self.psi, self.noise)
             rgb, opacity = self.render(self.psi)
         path = RenderedPath(
-            relaxed=lambda psi: self.pose.relaxed(psi, self.noise),
+            relaxed=lambda psi: self.distribution.relaxed(psi, self.noise),
             render_rays=self.render_rays,
             compose=lambda rgb, opacity: self.compose(rgb, opacity).images,
             camera=ROOMS_CAMERA,
@@ -218,7 +219,7 @@ class Rooms:
         )
         weights = torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE)
         return ObjectImages(
-            self.psi, self.pose.log_probabilities, self.images, torch.arange(COUNT), weights, draw, path
+            self.psi, self.distribution, self.images, torch.arange(COUNT), weights, draw, path
         )
 
 

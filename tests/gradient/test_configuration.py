@@ -32,7 +32,7 @@ def test_the_papers_variant_is_its_plain_form():
     paper = experiment("+variant=paper")
     assert paper.gradient == PathwiseEstimator(mode="reverse")
     assert paper.gradient.relaxed == RelaxedDraws()
-    assert paper.pose.bin_mean == "linear" and paper.synthesis.label_gradient == "ignored"
+    assert paper.distribution.factors[0].bin_mean == "linear" and paper.synthesis.label_gradient == "ignored"
 
 
 def test_boxes_move_by_one_override():

@@ -14,13 +14,16 @@ from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
+from neural_sim.parameter.zoom import Zoom
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import Outer, Trust
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
 from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RelaxedDraws, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
@@ -49,15 +52,23 @@ def _block(seed):
 @pytest.fixture(scope="module")
 def scene():
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-    return Scene(("a", "b"), (_block(1), _block(2)), NerfRenderer(), CAMERA, synthesizer, Pose(bins=4))
+    return Scene(
+        ("a", "b"),
+        (_block(1), _block(2)),
+        NerfRenderer(),
+        CAMERA,
+        synthesizer,
+        SceneDistribution.of([Pose(bins=4)]),
+    )
 
 
-def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, **outer):
+def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
     generator = torch.Generator().manual_seed(0)
     detector = Detector(**(TINY | (detector or {})))
-    validation = join(scene.training_set(torch.zeros(2, 4), 3, generator))
+    psi = torch.zeros(2, 4) if psi is None else psi
+    validation = join(scene.training_set(psi, 3, generator))
     return SimulatorModule(
-        scene, detector, detector.init(generator), torch.zeros(2, 4), validation,
+        scene, detector, detector.init(generator), psi, validation,
         Outer(Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer),
         estimator, solver, batch_size=4, weight_decay=0.0, generator=generator,
     )  # fmt: skip
@@ -77,8 +88,8 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     learned = learn_psi(module, progress=False)
     assert len(learned.records) == 2
     first = learned.records[0]
-    assert first.probabilities == [[0.25] * 4] * 2
-    assert first.entropies == pytest.approx([math.log(4)] * 2)
+    assert first.probabilities["pose"] == [[0.25] * 4] * 2
+    assert first.entropies["pose"] == pytest.approx([math.log(4)] * 2)
     assert math.isfinite(first.validation_loss) and first.certificate.damping > 0
     assert {"render", "train", "hypergradient", "hypergradient_solve"} <= set(first.seconds)
     assert torch.isfinite(learned.last).all() and (learned.last != 0).any()
@@ -102,9 +113,9 @@ def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
     generator = torch.Generator().manual_seed(3)
     psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
     part = scene.draw(1, psi, 4, generator, RelaxedDraws())
-    draw = scene.pose.relaxed(psi, part.noise)
+    draw = scene.distribution.relaxed(psi, part.noise)
     torch.testing.assert_close(draw.phi, part.draw.phi)
-    again = scene.synthesizer.compose(part.rgb, part.opacity, part.nuisance, 1, part.draw.bins)
+    again = scene.synthesizer.compose(part.rgb, part.opacity, part.nuisance, 1, part.draw.bins[:, 0])
     assert torch.equal(again.images, part.images.images) and torch.equal(again.boxes, part.images.boxes)
 
 
@@ -123,9 +134,9 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
 ):
     """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
     fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
-    pose = Pose(bins=4, temperature=1.0, bin_mean=bin_mean)
+    distribution = SceneDistribution.of([Pose(bins=4, temperature=1.0, bin_mean=bin_mean)])
     synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
-    wide = dataclasses.replace(scene, fields=fields, pose=pose, synthesizer=synthesizer)
+    wide = dataclasses.replace(scene, fields=fields, distribution=distribution, synthesizer=synthesizer)
     generator = torch.Generator().manual_seed(1)
     detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
     params = {name: value.double() for name, value in detector.init(generator).items()}
@@ -145,7 +156,7 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
         for patch_size in (64, 10**6):
             reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size, **settings)
             found = [
-                estimator.estimate(losses, trainable, vector, batch, None).value
+                estimator.estimate(losses, trainable, vector, batch, {}).value
                 for estimator, batch in ((forward, held), (reverse, bare))
             ]
             assert found[0].dtype == torch.float64 and float(found[1].norm()) > 0.0
@@ -160,7 +171,7 @@ def test_pairs_share_what_they_are_asked_to_share(scene):
     assert torch.equal(backgrounds[:, 0], backgrounds[:, 1])
     assert not torch.equal(backgrounds[0, 0], backgrounds[1, 0])
     assert torch.equal(part.nuisance.shifts[::2], part.nuisance.shifts[1::2])
-    uniform = torch.exp(-torch.exp(-part.noise.gumbel.double())).unflatten(0, (3, 2))
+    uniform = torch.exp(-torch.exp(-part.noise.bins["pose"].gumbel.double())).unflatten(0, (3, 2))
     torch.testing.assert_close(uniform.sum(1), torch.ones(3, 4, dtype=torch.float64), rtol=0.0, atol=1e-5)
     held = object_images(scene, [part], psi[None], torch.full((6,), 1 / 6))
     assert held["a"].group == 2
@@ -186,9 +197,9 @@ def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
 
 
 def test_probes_cover_every_bin_equally(scene):
-    part = scene.probes(0, 3, torch.Generator().manual_seed(0))
-    assert part.draw.bins.tolist() == [b for b in range(4) for _ in range(3)]
-    assert torch.equal(scene.pose.bin_of(part.draw), part.draw.bins)
+    part = scene.probes(0, "pose", 3, torch.zeros(4), torch.Generator().manual_seed(0))
+    assert part.draw.bins[:, 0].tolist() == [b for b in range(4) for _ in range(3)]
+    assert torch.equal(scene.distribution.bins_of(part.draw), part.draw.bins)
 
 
 def test_cached_losses_equal_losses_from_images(scene):
@@ -202,6 +213,29 @@ def test_cached_losses_equal_losses_from_images(scene):
     torch.testing.assert_close(cached.losses(trainable, torch.arange(8)), direct, rtol=1e-4, atol=1e-5)
     total = sum(term(trainable) for term in cached.mean_terms(chunk_size=3))
     torch.testing.assert_close(total, direct.mean(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+def test_every_factor_of_a_product_is_learned(scene, estimator):
+    joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
+    scene = dataclasses.replace(scene, distribution=joint)
+    module = _module(scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2)
+    module.settings = dataclasses.replace(module.settings, update=Mirror(shrink=False))
+    learned = learn_psi(module, progress=False)
+    assert set(learned.records[0].probabilities) == {"pose", "zoom"}
+    assert all((part.abs().amax(-1) > 0.0).all() for part in joint.split(learned.last).values())
+
+
+def test_the_pool_holds_every_combination_of_bins(scene):
+    joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
+    generator, psi = torch.Generator().manual_seed(0), torch.zeros(5)
+    pool = ImagePool.render(dataclasses.replace(scene, distribution=joint), 4, generator)
+    held = pool.objects[0].draw
+    assert len(held) == 2 * 6  # 4 a bin of the finest factor: 2 in each of 3 x 2 cells
+    assert torch.equal(joint.bins_of(held), held.bins)
+    drawn = pool.draw(1, psi, 200, generator).draw
+    assert torch.equal(joint.bins_of(drawn), drawn.bins)
+    assert pool.probes(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
 
 
 @pytest.mark.parametrize("action", ["skip", "stop", "shrink"])

@@ -8,28 +8,34 @@ import torch
 from scipy.integrate import quad
 
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+
+
+def only(**settings):
+    """p_psi of a run that learns nothing but the pose."""
+    return SceneDistribution.of([Pose(**settings)])
 
 
 def test_hard_draws_lie_in_their_bins_and_follow_p(generator):
-    pose = Pose(floor=0.0)
-    p = pose.probabilities("initial", "any")
+    pose = only(floor=0.0)
+    (p,) = pose.probabilities(pose.psi("initial", ["any"]))["pose"]
     noise = pose.draw_noise(8_000, generator, torch.float64)
-    draw = pose.hard(pose.logits(p), noise)
-    assert torch.equal(pose.bin_of(draw), draw.bins)
-    share = draw.bins.bincount(minlength=8) / 8_000
+    draw = pose.hard(pose.psi("initial", ["any"])[0], noise)
+    assert torch.equal(pose.bins_of(draw), draw.bins)
+    share = draw.bins[:, 0].bincount(minlength=8) / 8_000
     assert (share - p).abs().max() < 4 * math.sqrt(0.125 * 0.875 / 8_000)
     assert draw.rho.abs().max() <= math.pi / 4 and draw.distance.min() >= 2.4 and draw.distance.max() <= 4.0
 
 
 def test_same_noise_same_draw(generator):
-    pose = Pose()
+    pose = only()
     noise = pose.draw_noise(10, generator)
-    psi = pose.logits(pose.probabilities("initial", "x")).float()
+    psi = pose.psi("initial", ["x"])[0].float()
     assert torch.equal(pose.relaxed(psi, noise).phi, pose.relaxed(psi, noise).phi)
 
 
 def test_relaxed_tends_to_hard_as_temperature_falls(generator):
-    pose = Pose(temperature=1e-4)
+    pose = only(temperature=1e-4)
     psi = torch.randn(8, generator=generator, dtype=torch.float64)
     noise = pose.draw_noise(200, generator, torch.float64)
     hard, relaxed = pose.hard(psi, noise), pose.relaxed(psi, noise)
@@ -39,7 +45,7 @@ def test_relaxed_tends_to_hard_as_temperature_falls(generator):
 
 @pytest.mark.parametrize("bin_mean", ["linear", "circular"])
 def test_relaxed_derivative_against_central_differences(bin_mean, generator):
-    pose = Pose(temperature=1.0, bin_mean=bin_mean)
+    pose = only(temperature=1.0, bin_mean=bin_mean)
     psi = torch.randn(8, generator=generator, dtype=torch.float64, requires_grad=True)
     noise = pose.draw_noise(6, generator, torch.float64)
     cotangent = torch.randn(6, generator=generator, dtype=torch.float64)
@@ -65,7 +71,7 @@ def _contributions(pose, psi, noise, relaxation, cotangent):
 
 @pytest.mark.parametrize("bin_mean", ["linear", "circular"])
 def test_straight_through_is_the_hard_draw_with_the_relaxed_slope(bin_mean, generator):
-    pose = Pose(temperature=0.7, bin_mean=bin_mean)
+    pose = only(temperature=0.7, bin_mean=bin_mean)
     psi = torch.randn(8, generator=generator, dtype=torch.float64, requires_grad=True)
     noise = pose.draw_noise(20, generator, torch.float64)
     hard, through = pose.hard(psi, noise), pose.relaxed(psi, noise, "straight_through")
@@ -78,7 +84,7 @@ def test_straight_through_is_the_hard_draw_with_the_relaxed_slope(bin_mean, gene
 
 @pytest.mark.parametrize("bin_mean", ["linear", "circular"])
 def test_gumbel_rao_has_the_mean_of_straight_through_and_less_variance(bin_mean, generator):
-    pose = Pose(bins=4, temperature=0.3, bin_mean=bin_mean, floor=0.01)
+    pose = only(bins=4, temperature=0.3, bin_mean=bin_mean, floor=0.01)
     psi = torch.tensor([0.5, -0.5, 1.0, 0.0], dtype=torch.float64, requires_grad=True)
     count = 4_000
     noise = pose.draw_noise(count, generator, torch.float64, conditional=16)
@@ -99,10 +105,12 @@ def test_gumbel_rao_has_the_mean_of_straight_through_and_less_variance(bin_mean,
 def test_gumbel_rao_equals_the_integral_over_the_noise_given_the_bin(generator):
     """Two bins: the difference of perturbed logits is logistic about psi_0 - psi_1, cut off at 0 by the choice."""
     tau, gap = 0.5, 0.8
-    pose = Pose(bins=2, temperature=tau, bin_mean="linear", floor=0.0)
+    pose = only(bins=2, temperature=tau, bin_mean="linear", floor=0.0)
     psi = torch.tensor([gap, 0.0], dtype=torch.float64, requires_grad=True)
     noise = pose.draw_noise(2, generator, torch.float64, conditional=100_000)
-    noise = dataclasses.replace(noise, gumbel=torch.tensor([[9.0, 0.0], [0.0, 9.0]], dtype=torch.float64))
+    gumbel = torch.tensor([[9.0, 0.0], [0.0, 9.0]], dtype=torch.float64)
+    held = dataclasses.replace(noise.bins["pose"], gumbel=gumbel)
+    noise = dataclasses.replace(noise, bins={"pose": held})
     found = _contributions(pose, psi, noise, "gumbel_rao", torch.ones_like)[:, 0]
 
     def integrand(x):
@@ -118,7 +126,7 @@ def test_gumbel_rao_equals_the_integral_over_the_noise_given_the_bin(generator):
 
 @pytest.mark.parametrize("relaxation", ["gumbel_softmax", "straight_through"])
 def test_antithetic_pairs_have_the_mean_of_independent_draws(relaxation, generator):
-    pose = Pose(bins=4, temperature=0.5, floor=0.01)
+    pose = only(bins=4, temperature=0.5, floor=0.01)
     psi = torch.tensor([0.5, -0.5, 1.0, 0.0], dtype=torch.float64)
     count = 20_000
     plain, paired = (
@@ -134,40 +142,41 @@ def test_antithetic_pairs_have_the_mean_of_independent_draws(relaxation, generat
 
 
 def test_gumbel_rao_wants_its_noise(generator):
-    pose = Pose()
+    pose = only()
     with pytest.raises(ValueError, match="conditional"):
         pose.relaxed(torch.zeros(8), pose.draw_noise(2, generator), "gumbel_rao")
 
 
 def test_further_noise_leaves_the_other_noise_as_it_was():
-    plain, more = (Pose().draw_noise(4, torch.Generator().manual_seed(0), conditional=n) for n in (0, 3))
-    assert torch.equal(plain.gumbel, more.gumbel) and torch.equal(plain.distance, more.distance)
-    assert plain.exponential is None and more.exponential.shape == (4, 3, 8)
+    plain, more = (only().draw_noise(4, torch.Generator().manual_seed(0), conditional=n) for n in (0, 3))
+    assert torch.equal(plain.bins["pose"].gumbel, more.bins["pose"].gumbel)
+    assert torch.equal(plain.uniform["distance"], more.uniform["distance"])
+    assert plain.bins["pose"].exponential is None and more.bins["pose"].exponential.shape == (4, 3, 8)
 
 
 def test_log_prob_sums_to_one_over_bins():
-    pose = Pose()
+    pose = only()
     psi = torch.linspace(-2, 2, 8, dtype=torch.float64)
-    assert pose.log_prob(psi, torch.arange(8)).exp().sum().item() == pytest.approx(1.0)
+    assert pose.log_prob(psi, torch.arange(8)[:, None]).exp().sum().item() == pytest.approx(1.0)
 
 
 def test_biased_objects_have_their_own_distributions():
-    pose = Pose(biased={"pitcher": {"initial": {"dominant": 7}, "target": {"dominant": 3}}})
+    (pose,) = Pose(biased={"pitcher": {"initial": {"dominant": 7}, "target": {"dominant": 3}}}).factors
     assert pose.probabilities("initial", "pitcher").argmax() == 6
     assert pose.probabilities("target", "pitcher").argmax() == 2
     assert pose.probabilities("target", "can").max().item() == pytest.approx(1 / 8)
 
 
 def test_azimuth_bins_the_other_angle(generator):
-    pose = Pose(axis="azimuth", other_range_deg=(45.0, 135.0))
+    pose = only(axis="azimuth")
     draw = pose.hard(torch.zeros(8), pose.draw_noise(500, generator))
-    assert torch.equal(pose.bin_of(draw), draw.bins)
+    assert torch.equal(pose.bins_of(draw), draw.bins)
     assert draw.phi.min() >= math.pi / 4 and draw.phi.max() <= 3 * math.pi / 4
 
 
 @pytest.mark.parametrize(
     "bad", [{"bins": 0}, {"axis": "roll"}, {"bin_mean": "mode"}, {"temperature": 0.0}, {"floor": 0.2},
-            {"distance_range": (0.5, 2.0)}, {"other_range_deg": (10.0, -10.0)}]
+            {"other_range_deg": (10.0, -10.0)}]
 )  # fmt: skip
 def test_bad_settings_name_their_key(bad):
     with pytest.raises(ValueError, match=f"parameter.pose.{next(iter(bad))}"):

@@ -16,7 +16,7 @@ def results():
     uniform = torch.full((2, 4), 0.25, dtype=torch.float64)
     peaked = torch.tensor([[0.85, 0.05, 0.05, 0.05], [0.25] * 4], dtype=torch.float64)
     record = {
-        "probabilities": uniform.tolist(), "entropies": [1.0, 1.0], "gradient_norms": [0.1, 0.2],
+        "probabilities": {"pose": uniform.tolist()}, "entropies": {"pose": [1.0, 1.0]}, "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
         "images_without_box": 3,
         "certificate": {
@@ -28,7 +28,7 @@ def results():
     scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"a": 0.6, "b": float("nan")}, "per_class_ap50": {}}
     return RunResults(
         "pose_gap", "neural_sim", 3, ("a", "b"), ("a",),
-        {"initial": uniform, "learned": peaked, "target": peaked}, [record, record],
+        {"initial": {"pose": uniform}, "learned": {"pose": peaked}, "target": {"pose": peaked}}, [record, record],
         {"ns": scores, "learned": scores, "matched": scores}, {"a": [{"psnr": 30.0, "ssim": 0.9}], "b": []},
         {"psi": 1.5}, 512.0, [{"stage": "views", "what": "views of a", "why": "found in the store"}],
         {"seed": 3, "parameter": {"pose": {"bins": 4}}},
@@ -38,10 +38,10 @@ def results():
 def test_results_are_json_by_the_standard(results, tmp_path):
     held = json.loads(write_results(results, tmp_path).read_text(), parse_constant=pytest.fail)
     assert held["ap"]["ns"]["per_class"]["b"] is None
-    assert held["total_variation"]["a"] == {"initial": pytest.approx(0.6), "learned": 0.0}
+    assert held["total_variation"]["a"]["pose"] == {"initial": pytest.approx(0.6), "learned": 0.0}
     assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
     assert held["images_without_box"] == 6
-    assert held["psi"]["a"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
+    assert held["psi"]["a"]["pose"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
 
 
 def test_summary_names_every_method_and_object(results):
@@ -65,7 +65,7 @@ def test_figures_are_written(results, tmp_path):
         "labels": torch.tensor([1]),
     }
     made = write_figures(results, images, images, [found, nothing, found], tmp_path)
-    assert {path.name for path in made} == {"psi.png", "ap.png", "training_images.png", "detections.png"}
+    assert {path.name for path in made} == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}
     assert all(path.read_bytes()[:4] == b"\x89PNG" and path.stat().st_size > 5000 for path in made)
 
 
@@ -78,7 +78,7 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
     assert run.data.params["parameter.pose.bins"] == "4"
     assert run.data.metrics["evaluate/learned/ap"] == 0.5
     assert "evaluate/ns/ap_b" not in run.data.metrics
-    steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/bin_1")
+    steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/pose/bin_1")
     assert [point.step for point in steps] == [0, 1]
     assert [item.path for item in MlflowClient(uri).list_artifacts(run.info.run_id)] == ["results.json"]
 

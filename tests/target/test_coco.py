@@ -10,6 +10,7 @@ from PIL import Image
 
 from neural_sim.objects.mesh import normalise
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export import write_coco
@@ -110,7 +111,7 @@ def test_sets_split_the_file(tmp_path: Path) -> None:
     camera, synthesizer = PinholeCamera(24, 16, 0.7), Synthesizer(ProceduralClutter())
     meshes = {name: normalise(trimesh.creation.box(), name, "test") for name in NAMES}
     target = CocoTarget(write(tmp_path), val_fraction=0.5)
-    made = target.sets(meshes, RaycastRenderer(), Pose(), camera, synthesizer, seed=3)
+    made = target.sets(meshes, RaycastRenderer(), SceneDistribution.of([Pose()]), camera, synthesizer, seed=3)
     assert {name: part.images.shape for name, part in made.items()} == {
         "val": (1, 3, 16, 24), "test": (1, 3, 16, 24),
     }  # fmt: skip

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
@@ -52,7 +53,7 @@ def synthesizer() -> Synthesizer:
 def draw_at(distances: list[float]) -> SceneDraw:
     distance = torch.tensor(distances)
     zero = torch.zeros_like(distance)
-    return SceneDraw(zero + 1.0, zero, distance, torch.arange(len(distance)))
+    return SceneDraw(zero + 1.0, zero, distance, torch.arange(len(distance))[:, None])
 
 
 def test_images_boxes_and_labels_of_spheres(
@@ -94,7 +95,7 @@ def test_a_draw_per_object_is_wanted(
 def test_sets_follow_the_target_distribution_and_share_nothing(
     meshes: dict[str, ObjectMesh], synthesizer: Synthesizer
 ) -> None:
-    pose = Pose(biased={"mug": {"target": {"dominant": 3}}})
+    pose = SceneDistribution.of([Pose(biased={"mug": {"target": {"dominant": 3}}})])
     target = RenderedTarget(val_per_object=30, test_per_object=20, test_per_biased_object=40)
     made = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)
     again = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 Params = dict[str, Tensor]
@@ -42,7 +43,7 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class Probes:
-    """Images of one object drawn from every bin on purpose: their rows among all probes, and their bins."""
+    """Images of one object drawn from every bin of one factor on purpose: their rows among all probes, and bins."""
 
     index: Int[Tensor, "m"]
     bins: Int[Tensor, "m"]
@@ -68,7 +69,7 @@ class RenderedPath:
     derivatives by the numbers of the draw that psi moves.
     """
 
-    relaxed: Callable[[Float[Tensor, "k"]], SceneDraw]
+    relaxed: Callable[[Float[Tensor, "K"]], SceneDraw]
     render_rays: Callable[[Rays], tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]]
     compose: Callable[[Float[Tensor, "n h w 3"], Float[Tensor, "n h w"]], Float[Tensor, "n 3 h w"]]
     camera: PinholeCamera
@@ -82,14 +83,14 @@ class RenderedPath:
 class ObjectImages:
     """One object's training images at one psi step.
 
-    ``psi`` logits; ``log_probabilities`` maps them to log p over the bins. ``index`` are the images' rows in
+    ``psi`` is the object's part of all factors of ``distribution``, p_psi. ``index`` are the images' rows in
     the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
     ``draw`` is where they were rendered. ``path`` is needed by the pathwise estimator only. Each ``group`` of
     consecutive images shares randomness (1: all are independent).
     """
 
-    psi: Float[Tensor, "k"]
-    log_probabilities: Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
+    psi: Float[Tensor, "K"]
+    distribution: SceneDistribution
     images: Float[Tensor, "n 3 h w"]
     index: Int[Tensor, "n"]
     weights: Float[Tensor, "n"]
@@ -106,17 +107,17 @@ class MixedDerivative:
     told.
     """
 
-    value: Float[Tensor, "k"]
-    standard_error: Float[Tensor, "k"]
+    value: Float[Tensor, "K"]
+    standard_error: Float[Tensor, "K"]
 
     @property
-    def signal_to_noise(self) -> Float[Tensor, "k"]:
+    def signal_to_noise(self) -> Float[Tensor, "K"]:
         """``|value| / standard_error`` per component; 0 where both vanish."""
         ratio = self.value.abs() / self.standard_error
         return torch.where(self.value == 0.0, torch.zeros_like(ratio), ratio)
 
 
-def from_contributions(contributions: Float[Tensor, "n k"], group: int = 1) -> MixedDerivative:
+def from_contributions(contributions: Float[Tensor, "n K"], group: int = 1) -> MixedDerivative:
     """The sum of per-image contributions, and the standard error of that sum.
 
     Every ``group`` of consecutive images may depend on each other, groups may not. Raises ``ValueError`` for a

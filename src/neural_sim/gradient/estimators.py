@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
@@ -16,7 +18,7 @@ from neural_sim.gradient.stratified import stratified
 
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Mean scores of every bin from images drawn from it on purpose, see :mod:`gradient.stratified`.
+    """Mean scores of every bin of every factor from images drawn from it on purpose, see :mod:`gradient.stratified`.
 
     An outer iteration pays one Jacobian-vector product over the predictor for its probes.
     """
@@ -30,16 +32,25 @@ class StratifiedEstimator:
             raise ValueError(f"gradient.probes_per_bin must be at least 1, got {self.probes_per_bin}")
 
     def estimate(
-        self, losses: Losses, params: Params, vector: Params, images: ObjectImages, probes: Probes | None
+        self,
+        losses: Losses,
+        params: Params,
+        vector: Params,
+        images: ObjectImages,
+        probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
-        if probes is None or losses.probes is None:
-            raise ValueError("stratified: got no probes, which this estimator scores")
-        along = scores(losses.probes, params, vector, probes.index, self.chunk_size)
-        share = float(images.weights.sum())
-        return stratified(
-            along.to(images.psi.dtype), probes.bins, images.psi, images.log_probabilities, share
-        )
+        if losses.probes is None or set(probes) != set(images.distribution.names):
+            raise ValueError(
+                f"stratified: wants probes of {images.distribution.names}, which it scores, got {list(probes)}"
+            )
+        share, psi, parts = float(images.weights.sum()), images.distribution.split(images.psi), []
+        for factor in images.distribution.factors:
+            held = probes[factor.name]
+            along = scores(losses.probes, params, vector, held.index, self.chunk_size).to(images.psi.dtype)
+            parts.append(stratified(along, held.bins, psi[factor.name], factor.log_probabilities, share))
+        values, errors = ([getattr(part, name) for part in parts] for name in ("value", "standard_error"))
+        return MixedDerivative(torch.cat(values), torch.cat(errors))
 
 
 @dataclass(frozen=True)
@@ -51,14 +62,19 @@ class ReinforceEstimator:
     chunk_size: int = 64
 
     def estimate(
-        self, losses: Losses, params: Params, vector: Params, images: ObjectImages, probes: Probes | None
+        self,
+        losses: Losses,
+        params: Params,
+        vector: Params,
+        images: ObjectImages,
+        probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
         along = scores(losses.cached, params, vector, images.index, self.chunk_size)
         share = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:
-            return images.log_probabilities(psi)[images.draw.bins]
+            return images.distribution.log_prob(psi, images.draw.bins)
 
         return reinforce(along.to(images.psi.dtype), log_prob, images.psi, share)
 

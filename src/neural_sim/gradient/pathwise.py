@@ -28,8 +28,8 @@ from neural_sim.gradient.base import (
     from_contributions,
 )
 from neural_sim.gradient.mixed import ThetaMode, input_cotangents
-from neural_sim.parameter.pose import Relaxation
-from neural_sim.synthesis.motion import CONTINUOUS
+from neural_sim.parameter.factor import Relaxation
+from neural_sim.synthesis.motion import RIGID
 from neural_sim.synthesis.scene import RelaxedDraws
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
@@ -44,7 +44,7 @@ class PathwiseEstimator:
     Args:
         mode: how images are differentiated by V. ``forward``: along with the first render; ``reverse``: the paper's
             second forward, patch by patch.
-        relaxation: how draws depend on psi, see :meth:`Pose.relaxed`: ``gumbel_softmax`` (the paper's),
+        relaxation: how draws depend on psi, see :meth:`BinnedFactor.relaxed`: ``gumbel_softmax`` (the paper's),
             ``straight_through`` or ``gumbel_rao``.
         conditional_draws: Gumbel noises averaged for each image of ``gumbel_rao``.
         antithetic: draw Gumbel noise in pairs from uniforms u and 1 - u.
@@ -89,7 +89,12 @@ class PathwiseEstimator:
         )
 
     def estimate(
-        self, losses: Losses, params: Params, vector: Params, images: ObjectImages, probes: Probes | None
+        self,
+        losses: Losses,
+        params: Params,
+        vector: Params,
+        images: ObjectImages,
+        probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
@@ -150,15 +155,15 @@ def draw_cotangents(
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
-    total = {name: torch.zeros_like(getattr(draw, name)) for name in CONTINUOUS}
+    total = {name: torch.zeros_like(getattr(draw, name)) for name in RIGID}
     for pixels in live.split(patch_size) if len(live) else ():
-        leaves = {name: getattr(draw, name).detach().requires_grad_() for name in CONTINUOUS}
+        leaves = {name: getattr(draw, name).detach().requires_grad_() for name in RIGID}
         with torch.enable_grad():
             rendered = render_rays(patch_rays(camera, cameras.orbit(**leaves), pixels))
         parts = torch.autograd.grad(
             rendered, list(leaves.values()), (rgb[pixels], opacity[pixels]), materialize_grads=True
         )
-        for name, part in zip(CONTINUOUS, parts, strict=True):
+        for name, part in zip(RIGID, parts, strict=True):
             total[name] += part
     return total
 
@@ -172,10 +177,10 @@ def contract(tangents: Mapping[str, Maps], maps: Maps) -> dict[str, Float[Tensor
 
 
 def psi_contributions(
-    relaxed: Callable[[Float[Tensor, "k"]], SceneDraw],
-    psi: Float[Tensor, "k"],
+    relaxed: Callable[[Float[Tensor, "K"]], SceneDraw],
+    psi: Float[Tensor, "K"],
     cotangents: Mapping[str, Float[Tensor, "n"]],
-) -> Float[Tensor, "n k"]:
+) -> Float[Tensor, "n K"]:
     """Every image's part in the derivative by psi: its draw's cotangents through the replayed relaxed draw
     (Tool 1).
 

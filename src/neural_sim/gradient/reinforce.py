@@ -13,8 +13,8 @@ from neural_sim.gradient.base import MixedDerivative, from_contributions
 
 def reinforce(
     scores: Float[Tensor, "n"],
-    log_prob: Callable[[Float[Tensor, "k"]], Float[Tensor, "n"]],
-    psi: Float[Tensor, "k"],
+    log_prob: Callable[[Float[Tensor, "K"]], Float[Tensor, "n"]],
+    psi: Float[Tensor, "K"],
     share: float = 1.0,
 ) -> MixedDerivative:
     """``share * d/dpsi E[s]`` from n >= 2 independent draws: mean of ``(s_i - b_i) dlog p(V_i)/dpsi``.

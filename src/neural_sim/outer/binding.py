@@ -46,11 +46,11 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPat
         raise ValueError("pathwise: these images were not drawn from psi afresh")
 
     def compose(rgb: Tensor, opacity: Tensor) -> LabelledImages:
-        return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins)
+        return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins[:, 0])
 
     moving = scene.synthesizer.label_gradient == "differentiable"
     return RenderedPath(
-        relaxed=lambda psi: scene.pose.relaxed(psi, noise, relaxed.relaxation),
+        relaxed=lambda psi: scene.distribution.relaxed(psi, noise, relaxed.relaxation),
         render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
         compose=lambda rgb, opacity: compose(rgb, opacity).images,
         camera=scene.camera,
@@ -71,7 +71,7 @@ def object_images(
         first += len(part.images)
         bound[scene.names[label]] = ObjectImages(
             psi=psi[label].detach().to(part.rgb.dtype),
-            log_probabilities=scene.pose.log_probabilities,
+            distribution=scene.distribution,
             images=part.images.images,
             index=index,
             weights=weights[index],

@@ -42,7 +42,7 @@ def _timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
 
 
 class SimulatorModule(pl.LightningModule):
-    """psi as logits [objects, k], moved by the hypergradient; one training step is one outer iteration.
+    """psi [objects, K], all factors of p_psi, moved by the hypergradient; one training step is one outer iteration.
 
     The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs an
     iteration on freshly drawn images. ``validation`` is the labelled target set; no step sees any other real image.
@@ -53,7 +53,7 @@ class SimulatorModule(pl.LightningModule):
         scene: Scene,
         detector: Detector,
         params: Parameters,
-        psi: Float[Tensor, "objects k"],
+        psi: Float[Tensor, "objects K"],
         validation: LabelledImages,
         settings: Outer,
         estimator: Estimator,
@@ -70,11 +70,12 @@ class SimulatorModule(pl.LightningModule):
         self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
         self.records: list[IterationRecord] = []
         self.best_psi, self.best_loss = self.psi.detach().clone(), math.inf
-        self._update_state = UpdateState.zeros(self.psi)
+        parts = scene.distribution.split(self.psi)
+        self._update_states = {name: UpdateState.zeros(part) for name, part in parts.items()}
         self._backbone, _ = detector.split(params)
         self._validation = CachedSet.of(detector, self._backbone, validation)
         self._probe_set: CachedSet | None = None
-        self._probes: dict[int, Probes] = {}
+        self._probes: list[dict[str, Probes]] = [{} for _ in scene.names]
         self._pool: ImagePool | None = None
         if settings.pool_per_bin and not estimator.relaxed:
             self._pool = ImagePool.render(scene, settings.pool_per_bin, generator)
@@ -125,15 +126,20 @@ class SimulatorModule(pl.LightningModule):
             torch.stack([values[name] for name in self.scene.names]).to(self.psi)
             for values in (result.psi_gradients, result.standard_errors)
         )
-        log_p = self.scene.pose.log_probabilities(self.psi)
-        moved, self._update_state = self.settings.update.step(
-            self.psi, log_p, gradient, error, self._update_state
-        )
+        distribution = self.scene.distribution
+        psi, slope, noise = (distribution.split(values) for values in (self.psi, gradient, error))
+        moved = {}
+        for factor in distribution.factors:
+            name = factor.name
+            log_p = factor.log_probabilities(psi[name])
+            moved[name], self._update_states[name] = self.settings.update.step(
+                psi[name], log_p, slope[name], noise[name], self._update_states[name]
+            )
         done = (len(self.records) - 1) / max(1, self.settings.iterations - 1)
         part = 1.0 + done * (self.settings.final_step - 1.0)
         if certificate.action == "shrunk":
             part *= self.settings.trust.shrink
-        self.psi.data = self.psi + part * (moved - self.psi)
+        self.psi.data = self.psi + part * (distribution.join(moved) - self.psi)
 
     def _train(self, images: LabelledImages) -> float:
         if self.settings.epochs == 0:
@@ -169,8 +175,8 @@ class SimulatorModule(pl.LightningModule):
         losses = bound_losses(cached, self._backbone, images.labels, self._probe_set)
         held = object_images(self.scene, rendered, self.psi, weights)
         estimates = {
-            name: self._bind(losses, part, self._probes.get(label))
-            for label, (name, part) in enumerate(held.items())
+            name: self._bind(losses, part, probes)
+            for (name, part), probes in zip(held.items(), self._probes, strict=True)
         }
         result = hypergradient(
             inner, self._validation.mean_terms(), estimates, self.solver, self.generator, self._adjoint
@@ -178,7 +184,7 @@ class SimulatorModule(pl.LightningModule):
         self._adjoint = result.solution.value
         return result
 
-    def _bind(self, losses: Losses, held: ObjectImages, probes: Probes | None) -> Callable:
+    def _bind(self, losses: Losses, held: ObjectImages, probes: dict[str, Probes]) -> Callable:
         _, trainable = self.detector.split(self.theta)
         return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
 
@@ -193,22 +199,32 @@ class SimulatorModule(pl.LightningModule):
         if self.estimator.probes_per_bin:
             self._probes, self._probe_set = self._every_bin(self.estimator.probes_per_bin, self.generator)
 
-    def _every_bin(self, per_bin: int, generator: torch.Generator) -> tuple[dict[int, Probes], CachedSet]:
-        """``per_bin`` images of every bin of every object, with their features."""
-        source = self._pool.every_bin if self._pool else self.scene.probes
-        drawn = [source(label, per_bin, generator) for label in range(len(self.scene.names))]
-        each = self.scene.pose.bins * per_bin
-        probes = {
-            label: Probes(torch.arange(each) + label * each, self.scene.pose.bin_of(part.draw))
-            for label, part in enumerate(drawn)
-        }
+    def _every_bin(
+        self, per_bin: int, generator: torch.Generator
+    ) -> tuple[list[dict[str, Probes]], CachedSet]:
+        """``per_bin`` images of every bin of every factor of every object, with their features."""
+        source = self._pool.probes if self._pool else self.scene.probes
+        drawn: list[RenderedObject] = []
+        probes: list[dict[str, Probes]] = []
+        first = 0
+        for label in range(len(self.scene.names)):
+            probes.append({})
+            for column, factor in enumerate(self.scene.distribution.factors):
+                part = source(label, factor.name, per_bin, self.psi[label], generator)
+                index = torch.arange(first, first + len(part.images))
+                probes[label][factor.name] = Probes(
+                    index, self.scene.distribution.bins_of(part.draw)[:, column]
+                )
+                first += len(index)
+                drawn.append(part)
         return probes, CachedSet.of(self.detector, self._backbone, join(drawn))
 
     def _check(self, result: Hypergradient) -> Check | None:
-        """Every ``certify_every`` steps, one object's gradient against the retrained problem of this step's probes.
+        """Every ``certify_every`` steps, one object's gradient of one factor against a retrained problem, in turn.
 
-        That problem has the proximal term whose exact derivative the step's solve took: its damping, held at the
-        parameters of this step, beside the detector's own. Estimators without probes get images drawn for the purpose.
+        That problem is the one of this step's probes, with the proximal term whose exact derivative the step's solve
+        took: its damping, held at the parameters of this step, beside the detector's own. Estimators without probes
+        get images drawn for the purpose.
         """
         every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
         done = len(self.records) + 1
@@ -217,14 +233,17 @@ class SimulatorModule(pl.LightningModule):
         probes, held = self._probes, self._probe_set
         if held is None or self.estimator.probes_per_bin < per_bin:
             probes, held = self._every_bin(per_bin, self._check_generator)
-        label = (done // every - 1) % len(self.scene.names)
+        distribution = self.scene.distribution
+        turn, label = divmod(done // every - 1, len(self.scene.names))
+        factor = distribution.factors[turn % len(distribution.factors)]
         trainable = self.detector.split(self.theta)[1]
         pulls = [(self.detector.proximal, self._warm_start), (result.damping.value, trainable)]
-        ordered = [probes[i] for i in range(len(self.scene.names))]
-        problem = binned_problem(held, ordered, per_bin, pulls, self.scene.pose.log_probabilities)
+        ordered = [part[factor.name] for part in probes]
+        problem = binned_problem(held, ordered, per_bin, pulls, factor.log_probabilities)
         validation = self._validation.double().mean_terms()
-        gradient = result.psi_gradients[self.scene.names[label]]
-        return check(problem, validation, self.psi.detach(), label, as_double(trainable), gradient)
+        psi = distribution.split(self.psi.detach())[factor.name]
+        gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
+        return check(problem, validation, psi, label, as_double(trainable), gradient)
 
     def _record(
         self,
@@ -234,15 +253,17 @@ class SimulatorModule(pl.LightningModule):
         training_loss: float,
         seconds: dict[str, float],
     ) -> None:
-        log_p = self.scene.pose.log_probabilities(self.psi.detach())
+        probabilities = self.scene.distribution.probabilities(self.psi.detach())
         _, trainable = self.detector.split(self.theta)
         with torch.no_grad():
             validation_loss = float(sum(term(trainable) for term in self._validation.mean_terms()))
         if validation_loss < self.best_loss:
             self.best_loss, self.best_psi = validation_loss, self.psi.detach().clone()
         record = IterationRecord(
-            probabilities=log_p.exp().tolist(),
-            entropies=(-(log_p.exp() * log_p).sum(-1)).tolist(),
+            probabilities={name: p.tolist() for name, p in probabilities.items()},
+            entropies={
+                name: (-torch.special.xlogy(p, p).sum(-1)).tolist() for name, p in probabilities.items()
+            },
             gradient_norms=[float(result.psi_gradients[name].norm()) for name in self.scene.names],
             validation_loss=validation_loss,
             training_loss=training_loss,

@@ -12,10 +12,11 @@ from neural_sim.outer.certificate import Certificate
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """What one outer iteration did; probabilities are those the images were drawn from, before the step."""
+    """What one outer iteration did; probabilities, by factor and object, are those the images were drawn from, before
+    the step."""
 
-    probabilities: list[list[float]]
-    entropies: list[float]
+    probabilities: dict[str, list[list[float]]]
+    entropies: dict[str, list[float]]
     gradient_norms: list[float]
     validation_loss: float
     training_loss: float
@@ -28,6 +29,6 @@ class IterationRecord:
 class LearnedPsi:
     """The loop's outcome. ``last`` is what the method reports; ``best`` had the lowest validation loss."""
 
-    last: Float[Tensor, "objects k"]
-    best: Float[Tensor, "objects k"]
+    last: Float[Tensor, "objects K"]
+    best: Float[Tensor, "objects K"]
     records: list[IterationRecord] = field(default_factory=list)

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
-from neural_sim.gradient.estimators import Probes
+from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params, Probes
 from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.stratified import importance_weights

@@ -37,18 +37,24 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def psi_figure(
-    history: Mapping[str, Sequence[Sequence[float]]], target: Mapping[str, Sequence[float]], title: str
+    history: Mapping[str, Sequence[Sequence[float]]],
+    target: Mapping[str, Sequence[float]],
+    title: str,
+    factor: str,
 ) -> Figure:
     """p over the bins at every iteration, stacked, with the target distribution as a bar beside it.
 
     ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them.
+    ``factor`` names what the bins are of; only a pose's colours close the circle.
     """
     names = list(history)
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
     bins = len(next(iter(target.values())))
-    colours = matplotlib.colormaps["twilight_shifted"](np.linspace(0.08, 0.92, bins))
+    colours = matplotlib.colormaps["twilight_shifted" if factor == "pose" else "viridis"](
+        np.linspace(0.08, 0.92, bins)
+    )
     figure.suptitle(title, color=INK, fontsize=11)
     for place, name in enumerate(names, 1):
         axes = figure.add_subplot(rows, columns, place)
@@ -71,7 +77,7 @@ def psi_figure(
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
     figure.legend(
         handles, [str(b + 1) for b in range(bins)], loc="outside lower center", ncols=min(bins, 16),
-        title="pose bin (x: outer iteration, y: probability)", fontsize=8, title_fontsize=8, frameon=False,
+        title=f"{factor} bin (x: outer iteration, y: probability)", fontsize=8, title_fontsize=8, frameon=False,
     )  # fmt: skip
     return figure
 

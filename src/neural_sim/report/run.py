@@ -30,9 +30,10 @@ _CERTIFIED = (
 
 @dataclass(frozen=True)
 class RunResults:
-    """Everything the report shows. Probabilities are [objects, k]; ``ap`` maps ns, learned, matched to scores.
+    """Everything the report shows. ``probabilities`` are those of initial, learned and target, by factor, [objects, k];
+    ``ap`` maps ns, learned, matched to scores.
 
-    ``symmetric_bins`` groups bins (from 1) whose views an object's symmetry makes the same.
+    ``symmetric_bins`` groups bins (from 1), by object and angle, whose views an object's symmetry makes the same.
     """
 
     experiment: str
@@ -40,7 +41,7 @@ class RunResults:
     seed: int
     names: Sequence[str]
     biased: Sequence[str]
-    probabilities: Mapping[str, Tensor]
+    probabilities: Mapping[str, Mapping[str, Tensor]]
     records: Sequence[Mapping[str, Any]]
     ap: Mapping[str, Mapping[str, Any]]
     fields: Mapping[str, Sequence[Mapping[str, float]]]
@@ -48,12 +49,15 @@ class RunResults:
     peak_memory_mb: float
     left_out: Sequence[Mapping[str, str]]
     config: Mapping[str, Any]
-    symmetric_bins: Mapping[str, Sequence[Sequence[int]]] = field(default_factory=dict)
+    symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
         psi = {
-            name: {which: p[label].tolist() for which, p in self.probabilities.items()}
+            name: {
+                factor: {which: p[factor][label].tolist() for which, p in self.probabilities.items()}
+                for factor in self.factors
+            }
             for label, name in enumerate(self.names)
         }
         return _finite(
@@ -80,11 +84,21 @@ class RunResults:
         """Training images of the psi loop in which the object was out of frame or too small to get a box."""
         return sum(record["images_without_box"] for record in self.records)
 
-    def total_variations(self) -> dict[str, dict[str, float]]:
-        """Distance of the initial and the learned distribution from the target, per object."""
-        target = self.probabilities["target"]
-        distances = {w: total_variation(self.probabilities[w], target) for w in ("initial", "learned")}
-        return {n: {w: float(d[i]) for w, d in distances.items()} for i, n in enumerate(self.names)}
+    @property
+    def factors(self) -> tuple[str, ...]:
+        """Names of what is learned, in order."""
+        return tuple(self.probabilities["target"])
+
+    def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Distance of the initial and the learned distribution from the target, by object and factor."""
+        found: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
+        for factor in self.factors:
+            target = self.probabilities["target"][factor]
+            for which in ("initial", "learned"):
+                distances = total_variation(self.probabilities[which][factor], target).tolist()
+                for name, distance in zip(self.names, distances, strict=True):
+                    found[name].setdefault(factor, {})[which] = distance
+        return found
 
     def summary(self) -> str:
         """The table printed at the end of a run."""
@@ -93,11 +107,12 @@ class RunResults:
         for method, scores in self.ap.items():
             values = [*(scores["per_class"][name] for name in self.names), scores["ap"]]
             lines.append(f"{method:<20}" + "".join(f"{100 * value:>13.1f}" for value in values))
-        lines.append(f"{'distance to target':<20}")
         distances = self.total_variations()
-        for which in ("initial", "learned"):
-            row = "".join(f"{distances[name][which]:>13.2f}" for name in self.names)
-            lines.append(f"  {which:<18}{row}")
+        for factor in self.factors:
+            lines.append(f"distance to target, {factor}")
+            for which in ("initial", "learned"):
+                row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
+                lines.append(f"  {which:<18}{row}")
         if self.records:
             lines.append(_trust_line(untrusted(self.records)))
         if self.images_without_box():
@@ -137,13 +152,14 @@ def write_figures(
 ) -> list[Path]:
     """The run's figures as PNG files."""
     names, made = list(results.names), []
-    target = {name: results.probabilities["target"][i].tolist() for i, name in enumerate(names)}
-    if results.records:
-        steps = [record["probabilities"] for record in results.records]
-        last = results.probabilities["learned"].tolist()
-        history = {name: [*(p[i] for p in steps), last[i]] for i, name in enumerate(names)}
-        title = f"{results.experiment}: learned pose distributions, {results.method}, seed {results.seed}"
-        made.append(figures.save(figures.psi_figure(history, target, title), folder / "psi.png"))
+    for factor in results.factors if results.records else ():
+        target = results.probabilities["target"][factor].tolist()
+        steps = [*(r["probabilities"][factor] for r in results.records)]
+        steps.append(results.probabilities["learned"][factor].tolist())
+        history = {name: [p[i] for p in steps] for i, name in enumerate(names)}
+        title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
+        drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor)
+        made.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
     if results.ap:
         made.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))
     chosen = _spread(drawn, 32)
@@ -162,10 +178,9 @@ def write_figures(
 
 def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], folder: Path) -> Path:
     """The final training set as COCO: images and a JSON that holds every image's pose."""
-    poses = {
-        key: torch.cat([getattr(part.draw, key) for part in parts])
-        for key in ("phi", "rho", "distance", "bins")
-    }
+    named = ("phi", "rho", "distance", "magnification", "bins")
+    held = {key: [getattr(part.draw, key) for part in parts] for key in named}
+    poses = {key: torch.cat(values) for key, values in held.items() if values[0] is not None}
     poses["camera_to_world"] = orbit(poses["phi"], poses["rho"], poses["distance"])
     return write_coco(join(parts), list(names), folder, poses)
 
@@ -205,8 +220,9 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
     for which, scores in results.ap.items():
         metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
         metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
-    for name, distances in results.total_variations().items():
-        metrics |= {f"psi/{name}/distance_{which}": value for which, value in distances.items()}
+    for name, factors in results.total_variations().items():
+        for factor, distances in factors.items():
+            metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
     return tracking.log_run(
         uri,
         results.experiment,
@@ -228,9 +244,10 @@ def _series(results: RunResults) -> dict[str, list[float]]:
     series: dict[str, list[float]] = {}
     for record in results.records:
         for i, name in enumerate(results.names):
-            for b, p in enumerate(record["probabilities"][i]):
-                series.setdefault(f"psi/{name}/bin_{b + 1}", []).append(p)
-            series.setdefault(f"psi/{name}/entropy", []).append(record["entropies"][i])
+            for factor, probabilities in record["probabilities"].items():
+                for b, p in enumerate(probabilities[i]):
+                    series.setdefault(f"psi/{name}/{factor}/bin_{b + 1}", []).append(p)
+                series.setdefault(f"psi/{name}/{factor}/entropy", []).append(record["entropies"][factor][i])
             series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
             for b, ratio in enumerate(record["certificate"]["signal_to_noise"][i]):
                 series.setdefault(f"psi/{name}/signal_to_noise_{b + 1}", []).append(ratio)

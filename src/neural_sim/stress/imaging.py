@@ -11,6 +11,7 @@ from torch import Tensor
 from neural_sim import cameras
 from neural_sim.field.grid import GridField
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution, SceneNoise, Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
 from neural_sim.stress.rendering import EXACT, SINGLE, block, chord, opacity_of, raw_density
@@ -95,12 +96,11 @@ def zoom_ends(scope: Scope) -> Checks:
     Beyond the lattice steps that the arithmetic can count, a camera is refused (it used to walk for ever).
     """
     for low, high in ((2.4, 4.0), (1.0 + 1e-6, 1e5)):
-        pose = Pose(distance_range=(low, high))
-        noise = pose.draw_noise(2, scope.generator(), torch.float64)
-        noise = type(noise)(
-            noise.gumbel, noise.within, noise.other, torch.tensor([0.0, 1.0], dtype=torch.float64)
-        )
-        draw = pose.hard(torch.zeros(8, dtype=torch.float64), noise)
+        scene = SceneDistribution.of([Pose()], Unlearned(distance=(low, high)))
+        noise = scene.draw_noise(2, scope.generator(), torch.float64)
+        ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        noise = SceneNoise(noise.bins, {**noise.uniform, "distance": ends})
+        draw = scene.hard(torch.zeros(8, dtype=torch.float64), noise)
         gap = float((draw.distance / torch.tensor([low, high], dtype=torch.float64) - 1.0).abs().max())
         yield Check(f"distances drawn: {low:g} to {high:g}", gap, 4 * eps(torch.float64))
     half = 0.55  # within the unit sphere to its corners

@@ -15,6 +15,7 @@ from neural_sim.gradient.base import MixedDerivative
 from neural_sim.outer.module import SimulatorModule, learn_psi
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import OnUntrusted, Outer
@@ -211,7 +212,12 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
     camera = PinholeCamera(32, 32, math.radians(40.0))
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
     scene = Scene(
-        ("x",), (block(30.0, half=0.5, cells=4),), NerfRenderer(), camera, synthesizer, Pose(bins=4)
+        ("x",),
+        (block(30.0, half=0.5, cells=4),),
+        NerfRenderer(),
+        camera,
+        synthesizer,
+        SceneDistribution.of([Pose(bins=4)]),
     )
     network = Detector(1, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
     psi = torch.zeros(1, 4)

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
+from neural_sim.parameter.factor import BinNoise
 from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.stress.cases import FALSE_ALARM, Check, Checks, Scope, case, eps
 
 CIRCLE = 2.0 * math.pi
@@ -43,7 +45,8 @@ def one_hot(scope: Scope) -> Checks:
     roundings, every draw is of that bin (Gumbel noise spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000)
     underflows to 0.
     """
-    pose = Pose(floor=0.0)
+    scene = SceneDistribution.of([Pose(floor=0.0)])
+    (pose,) = scene.factors
     for dtype in DTYPES:
         psi = torch.zeros(8, dtype=dtype)
         psi[5] = 1000.0
@@ -51,8 +54,8 @@ def one_hot(scope: Scope) -> Checks:
         truth = torch.where(torch.arange(8) == 5, 0.0, -1000.0)
         bound = 4 * eps(dtype) * 1000.0
         yield Check(f"log p, {_name(dtype)}", float((log_p - truth).abs().max()), bound)
-        noise = pose.draw_noise(2000, scope.generator(), dtype)
-        hard, relaxed = pose.hard(psi, noise), pose.relaxed(psi, noise)
+        noise = scene.draw_noise(2000, scope.generator(), dtype)
+        hard, relaxed = scene.hard(psi, noise), scene.relaxed(psi, noise)
         missed = int((hard.bins != 5).sum()) + int((relaxed.bins != 5).sum())
         yield Check(f"draws of another bin, {_name(dtype)}", float(missed), 0.0)
         # One weight of exactly 1: the circular mean is its centre, through one sine, cosine and arctangent.
@@ -150,12 +153,12 @@ def gumbel_max(scope: Scope) -> Checks:
     """
     draws = 200_000 if scope.full else 20_000
     for count in (1, 2, 8, 64):
-        pose = Pose(bins=count, floor=0.0 if count == 1 else 0.1 / count)
+        (pose,) = Pose(bins=count, floor=0.0 if count == 1 else 0.1 / count).factors
         psi = 2.0 * torch.randn(count, generator=scope.generator(), dtype=torch.float64)
         p = pose.log_probabilities(psi).exp()
-        noise = pose.draw_noise(draws, scope.generator(), torch.float64)
+        noise = BinNoise(binned.gumbel((draws, count), scope.generator(), torch.float64))
         bound = bernstein(p, draws, FALSE_ALARM / count)
-        share = pose.hard(psi, noise).bins.bincount(minlength=count) / draws
+        share = pose.hard(psi, noise).bincount(minlength=count) / draws
         yield Check(
             f"shares over their bounds: k = {count}, hard", float(((share - p).abs() / bound).max()), 1.0
         )
@@ -179,34 +182,37 @@ def bin_counts(scope: Scope) -> Checks:
     most.
     """
     for dtype in DTYPES:
-        pose = Pose(bins=1, floor=0.5)
+        scene = SceneDistribution.of([Pose(bins=1, floor=0.5)])
         psi = torch.tensor([3.0], dtype=dtype, requires_grad=True)
-        noise = pose.draw_noise(100, scope.generator(), dtype)
-        draw = pose.relaxed(psi, noise)
+        noise = scene.draw_noise(100, scope.generator(), dtype)
+        draw = scene.relaxed(psi, noise)
         (slope,) = torch.autograd.grad(draw.phi.sum(), psi, allow_unused=True, materialize_grads=True)
         yield Check(
-            f"log p: k = 1, {_name(dtype)}", float(pose.log_probabilities(psi.detach()).abs()), 2 * eps(dtype)
+            f"log p: k = 1, {_name(dtype)}",
+            float(scene.factors[0].log_probabilities(psi.detach()).abs()),
+            2 * eps(dtype),
         )
         yield Check(
             f"d angle / dpsi: k = 1, {_name(dtype)}", float(slope.abs()), 100 * 8 * eps(dtype) * math.pi
         )
         for count in (1, 2, 64):
-            pose = Pose(bins=count, floor=0.0)
+            scene = SceneDistribution.of([Pose(bins=count, floor=0.0)])
             bins = torch.arange(count).repeat_interleave(4)
             last = 1.0 - 0.5 * eps(dtype)
             within = torch.tensor([0.0, 0.5, last, 1.0], dtype=dtype).repeat(count)
-            noise = pose.draw_noise(len(bins), scope.generator(), dtype)
-            noise = type(noise)(noise.gumbel, within, noise.other, noise.distance)
-            draw = pose.at_bins(bins, noise)
+            noise = scene.draw_noise(len(bins), scope.generator(), dtype)
+            noise = SceneNoise(noise.bins, {**noise.uniform, "phi": within})
+            draw = scene.at_bins({"pose": bins}, noise)
             centre = (bins.double() + 0.5) * CIRCLE / count
             outside = (draw.phi.double() - centre).abs() - 0.5 * CIRCLE / count
             label = f"k = {count}, {_name(dtype)}"
             outside = float(outside.clamp_min(0.0).max())
             yield Check(f"angle beyond its bin: {label}", outside, 4 * eps(dtype) * CIRCLE)
             inside = within == 0.5
-            wrong = int((pose.bin_of(draw) != bins)[inside].sum())
+            found = scene.bins_of(draw)[:, 0]
+            wrong = int((found != bins)[inside].sum())
             yield Check(f"centres in another bin: {label}", float(wrong), 0.0)
-            step = (pose.bin_of(draw) - bins).remainder(count)
+            step = (found - bins).remainder(count)
             far = int(((step != 0) & (step != 1) & (step != count - 1)).sum())
             yield Check(f"edges not in a neighbouring bin: {label}", float(far), 0.0)
 

@@ -9,28 +9,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim import cameras
+from neural_sim.parameter.product import COORDINATES
 from neural_sim.types import SceneDraw
 
-CONTINUOUS = ("phi", "rho", "distance")
-"""The numbers of a ``SceneDraw`` that images depend on smoothly."""
+RIGID = ("phi", "rho", "distance")
+"""The coordinates that place the camera; the fourth, the magnification, leaves it where it is."""
 
 
-def moved_by(relaxed: Callable[[Float[Tensor, "k"]], SceneDraw], psi: Float[Tensor, "k"]) -> tuple[str, ...]:
+def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tensor, "K"]) -> tuple[str, ...]:
     """Names of the draw's numbers that depend on psi; the others need no tangent."""
     with torch.enable_grad():
         draw = relaxed(psi.detach().requires_grad_())
-    return tuple(name for name in CONTINUOUS if getattr(draw, name).requires_grad)
+    values = {name: getattr(draw, name) for name in COORDINATES}
+    return tuple(name for name, value in values.items() if value is not None and value.requires_grad)
 
 
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
     """Derivatives of every image's camera-to-world pose by each of its draw's ``names``.
 
     Raises:
-        ValueError: no name, or one that is not a continuous number of the draw.
+        ValueError: no name, or one that does not place the camera.
     """
-    if not names or set(names) - set(CONTINUOUS):
-        raise ValueError(f"pose_rates: want names among {CONTINUOUS}, got {tuple(names)}")
-    numbers = {name: getattr(draw, name).detach() for name in CONTINUOUS}
+    if not names or set(names) - set(RIGID):
+        raise ValueError(f"pose_rates: want names among {RIGID}, got {tuple(names)}")
+    numbers = {name: getattr(draw, name).detach() for name in RIGID}
     still = {name: torch.zeros_like(number) for name, number in numbers.items()}
     rates = [
         torch.func.jvp(

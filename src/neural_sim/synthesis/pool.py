@@ -7,10 +7,11 @@ each draw. Not for estimators that replay exact draws from psi (the pathwise one
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.synthesis.scene import RenderedObject, Scene
@@ -19,11 +20,12 @@ from neural_sim.types import SceneDraw
 
 @dataclass(frozen=True)
 class ObjectPool:
-    """``per_bin`` rendered maps of every bin of one object, bin after bin. RGBA premultiplied in 8 bits."""
+    """``per_cell`` rendered maps of every combination of the factors' bins of one object, the last factor's bins
+    changing fastest. RGBA premultiplied in 8 bits."""
 
     maps: Tensor
     draw: SceneDraw
-    per_bin: int
+    per_cell: int
 
 
 @dataclass(frozen=True)
@@ -35,34 +37,57 @@ class ImagePool:
 
     @staticmethod
     def render(scene: Scene, per_bin: int, generator: torch.Generator) -> ImagePool:
-        """``per_bin`` poses of every bin of every object. Raises ``ValueError`` for fewer than one."""
+        """At least ``per_bin`` poses of every bin of every factor and object.
+
+        Raises:
+            ValueError: fewer than one.
+        """
         if per_bin < 1:
             raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
+        factors = scene.distribution.factors
+        cells = math.prod(factor.bins for factor in factors)
+        per_cell = math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
+        every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
+        bins = every.repeat_interleave(per_cell, 0)
+        named = dict(zip(scene.distribution.names, bins.unbind(1), strict=True))
         pools = []
         for label in range(len(scene.names)):
-            part = scene.probes(label, per_bin, generator)
+            noise = scene.distribution.draw_noise(len(bins), generator, scene.dtype(label))
+            part = scene.render(label, scene.distribution.at_bins(named, noise), noise, generator)
             maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
-            pools.append(ObjectPool((maps * 255).round().to(torch.uint8), part.draw, per_bin))
+            pools.append(ObjectPool((maps * 255).round().to(torch.uint8), part.draw, per_cell))
         return ImagePool(scene, tuple(pools))
 
     def draw(
-        self, label: int, psi: Float[Tensor, "k"], count: int, generator: torch.Generator
+        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator
     ) -> RenderedObject:
         """``count`` images of one object from p_psi, with replacement among each bin's poses."""
-        noise = self.scene.pose.draw_noise(count, generator)
-        bins = self.scene.pose.hard(psi.float(), noise).bins
-        return self._compose(label, bins, generator)
+        noise = self.scene.distribution.draw_noise(count, generator)
+        return self._compose(label, self.scene.distribution.hard(psi.float(), noise).bins, generator)
 
-    def every_bin(self, label: int, per_bin: int, generator: torch.Generator) -> RenderedObject:
-        """``per_bin`` images of every bin on purpose, in the order of the bins."""
-        return self._compose(label, torch.arange(self.scene.pose.bins).repeat_interleave(per_bin), generator)
+    def probes(
+        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
+    ) -> RenderedObject:
+        """``per_bin`` images of every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
+        distribution = self.scene.distribution
+        size = next(f.bins for f in distribution.factors if f.name == factor)
+        bins = torch.arange(size).repeat_interleave(per_bin)
+        if len(distribution.factors) == 1:
+            return self._compose(label, bins[:, None], generator)
+        noise = distribution.draw_noise(len(bins), generator)
+        return self._compose(label, distribution.stratum(factor, bins, psi.float(), noise).bins, generator)
 
-    def _compose(self, label: int, bins: Tensor, generator: torch.Generator) -> RenderedObject:
+    def _compose(
+        self, label: int, bins: Int[Tensor, "n factors"], generator: torch.Generator
+    ) -> RenderedObject:
         pool, scene = self.objects[label], self.scene
-        within = torch.randint(pool.per_bin, bins.shape, generator=generator)
-        index = bins * pool.per_bin + within
+        cell = torch.zeros(len(bins), dtype=torch.long)
+        for column, factor in zip(bins.unbind(1), scene.distribution.factors, strict=True):
+            cell = cell * factor.bins + column
+        within = torch.randint(pool.per_cell, cell.shape, generator=generator)
+        index = cell * pool.per_cell + within
         maps = pool.maps[index.to(pool.maps.device)].float() / 255
         rgb, opacity = maps[..., :3], maps[..., 3]
         nuisance = scene.synthesizer.draw_nuisance(len(bins), scene.camera, generator)
-        images = scene.synthesizer.compose(rgb, opacity, nuisance, label, bins)
+        images = scene.synthesizer.compose(rgb, opacity, nuisance, label, bins[:, 0])
         return RenderedObject(images, None, pool.draw.select(index), nuisance, rgb, opacity)

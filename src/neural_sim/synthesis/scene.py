@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.cameras import orbit
+from neural_sim.cameras import magnified, orbit
 from neural_sim.field.base import RadianceField
-from neural_sim.parameter.pose import Pose, PoseNoise, Relaxation
+from neural_sim.parameter.factor import Relaxation
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import moved_by, pose_rates
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer
@@ -22,8 +23,8 @@ from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
 class RelaxedDraws:
     """How images are drawn that the pathwise estimator will differentiate.
 
-    ``relaxation`` and ``conditional_draws`` (of ``gumbel_rao``): see :meth:`Pose.relaxed`. ``antithetic``: Gumbel
-    noise in pairs from u and 1 - u. ``common_backgrounds``: the images of a pair share background and shift.
+    ``relaxation`` and ``conditional_draws`` (of ``gumbel_rao``): see :meth:`BinnedFactor.relaxed`. ``antithetic``:
+    Gumbel noise in pairs from u and 1 - u. ``common_backgrounds``: the images of a pair share background and shift.
     ``tangents``: the maps' derivatives by the numbers that psi moves ride along with the render.
     """
 
@@ -38,7 +39,9 @@ class RelaxedDraws:
         """How many consecutive images share randomness."""
         return 2 if self.antithetic or self.common_backgrounds else 1
 
-    def noise(self, pose: Pose, count: int, generator: torch.Generator, dtype: torch.dtype) -> PoseNoise:
+    def noise(
+        self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
+    ) -> SceneNoise:
         """Raises ``ValueError`` for a count that does not divide into pairs where pairs are asked for."""
         if count % self.group:
             raise ValueError(
@@ -46,7 +49,7 @@ class RelaxedDraws:
                 f"outer.images_per_object, got {count}"
             )
         conditional = self.conditional_draws if self.relaxation == "gumbel_rao" else 0
-        return pose.draw_noise(count, generator, dtype, self.antithetic, conditional)
+        return distribution.draw_noise(count, generator, dtype, self.antithetic, conditional)
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class RenderedObject:
     """
 
     images: LabelledImages
-    noise: PoseNoise | None
+    noise: SceneNoise | None
     draw: SceneDraw
     nuisance: Nuisance
     rgb: Float[Tensor, "n h w 3"]
@@ -76,21 +79,28 @@ class Scene:
     renderer: NerfRenderer
     camera: PinholeCamera
     synthesizer: Synthesizer
-    pose: Pose
+    distribution: SceneDistribution
 
     def render(
-        self, label: int, draw: SceneDraw, noise: PoseNoise, generator: torch.Generator
+        self, label: int, draw: SceneDraw, noise: SceneNoise, generator: torch.Generator
     ) -> RenderedObject:
         """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
         poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
-        rgb, opacity = self.renderer.render(self.fields[label], self.camera, poses)
+        if draw.magnification is None:
+            maps = Maps(*self.renderer.render(self.fields[label], self.camera, poses))
+        else:  # every image has a camera of its own
+            each = [
+                self.renderer.render(self.fields[label], magnified(self.camera, float(m)), pose[None])
+                for m, pose in zip(draw.magnification, poses, strict=True)
+            ]
+            maps = Maps(*(torch.cat(parts) for parts in zip(*each, strict=True)))
         nuisance = self.synthesizer.draw_nuisance(len(draw), self.camera, generator)
-        return self._compose(label, draw, noise, Maps(rgb, opacity), nuisance)
+        return self._compose(label, draw, noise, maps, nuisance)
 
     def _compose(
-        self, label: int, draw: SceneDraw, noise: PoseNoise, maps: Maps, nuisance: Nuisance
+        self, label: int, draw: SceneDraw, noise: SceneNoise, maps: Maps, nuisance: Nuisance
     ) -> RenderedObject:
-        bins = self.pose.bin_of(draw)
+        bins = self.distribution.bins_of(draw)[:, 0]
         with torch.no_grad():
             images = self.synthesizer.compose(maps.rgb, maps.opacity, nuisance, label, bins)
         return RenderedObject(images, noise, draw, nuisance, maps.rgb, maps.opacity)
@@ -102,7 +112,7 @@ class Scene:
     def draw(
         self,
         label: int,
-        psi: Float[Tensor, "k"],
+        psi: Float[Tensor, "K"],
         count: int,
         generator: torch.Generator,
         relaxed: RelaxedDraws | None = None,
@@ -111,16 +121,16 @@ class Scene:
         logits = psi.detach().to(self.dtype(label))
         if relaxed is not None:
             return self._draw_relaxed(label, logits, count, generator, relaxed)
-        noise = self.pose.draw_noise(count, generator, self.dtype(label))
-        return self.render(label, self.pose.hard(logits, noise), noise, generator)
+        noise = self.distribution.draw_noise(count, generator, self.dtype(label))
+        return self.render(label, self.distribution.hard(logits, noise), noise, generator)
 
     def _draw_relaxed(
         self, label: int, logits: Tensor, count: int, generator: torch.Generator, relaxed: RelaxedDraws
     ) -> RenderedObject:
-        noise = relaxed.noise(self.pose, count, generator, self.dtype(label))
+        noise = relaxed.noise(self.distribution, count, generator, self.dtype(label))
 
         def replay(psi: Tensor) -> SceneDraw:
-            return self.pose.relaxed(psi, noise, relaxed.relaxation)
+            return self.distribution.relaxed(psi, noise, relaxed.relaxation)
 
         with torch.no_grad():
             draw = replay(logits)
@@ -140,7 +150,7 @@ class Scene:
 
     def training_set(
         self,
-        psi: Float[Tensor, "objects k"],
+        psi: Float[Tensor, "objects K"],
         count: int,
         generator: torch.Generator,
         relaxed: RelaxedDraws | None = None,
@@ -148,11 +158,15 @@ class Scene:
         """``count`` images of every object."""
         return [self.draw(label, psi[label], count, generator, relaxed) for label in range(len(self.names))]
 
-    def probes(self, label: int, per_bin: int, generator: torch.Generator) -> RenderedObject:
-        """``per_bin`` images from every bin on purpose, in the order of the bins."""
-        bins = torch.arange(self.pose.bins).repeat_interleave(per_bin)
-        noise = self.pose.draw_noise(len(bins), generator, self.dtype(label))
-        return self.render(label, self.pose.at_bins(bins, noise), noise, generator)
+    def probes(
+        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
+    ) -> RenderedObject:
+        """``per_bin`` images from every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
+        size = next(f.bins for f in self.distribution.factors if f.name == factor)
+        bins = torch.arange(size).repeat_interleave(per_bin)
+        noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
+        logits = psi.detach().to(self.dtype(label))
+        return self.render(label, self.distribution.stratum(factor, bins, logits, noise), noise, generator)
 
 
 def join(parts: Sequence[RenderedObject]) -> LabelledImages:

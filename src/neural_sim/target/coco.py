@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.letterbox import letterbox
@@ -83,7 +83,7 @@ class CocoTarget:
         self,
         meshes: Mapping[str, ObjectMesh],
         renderer: MeshRenderer,
-        pose: Pose,
+        distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.cameras import orbit
+from neural_sim.cameras import magnified, orbit
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
@@ -44,7 +44,7 @@ def render_target(
             here = draw.select(slice(start, start + CHUNK))
             rgb, opacity = _premultiplied(renderer, item, camera, here)
             nuisance = synthesizer.draw_nuisance(len(here), camera, generator)
-            parts.append(synthesizer.compose(rgb, opacity, nuisance, label, here.bins))
+            parts.append(synthesizer.compose(rgb, opacity, nuisance, label, here.bins[:, 0]))
     images = LabelledImages.concatenate(parts)
     missing = images_without_boxes(images)
     if missing:
@@ -56,5 +56,12 @@ def _premultiplied(
     renderer: MeshRenderer, item: ObjectMesh, camera: PinholeCamera, draw: SceneDraw
 ) -> tuple[Float[Tensor, "n h w 3"], Float[Tensor, "n h w"]]:
     with torch.no_grad():
-        rgba = renderer.render(item.mesh, camera, orbit(draw.phi, draw.rho, draw.distance))
+        poses = orbit(draw.phi, draw.rho, draw.distance)
+        if draw.magnification is None:
+            rgba = renderer.render(item.mesh, camera, poses)
+        else:  # every image has a camera of its own
+            pairs = zip(draw.magnification, poses, strict=True)
+            rgba = torch.cat(
+                [renderer.render(item.mesh, magnified(camera, float(m)), pose[None]) for m, pose in pairs]
+            )
     return rgba[..., :3] * rgba[..., 3:], rgba[..., 3]

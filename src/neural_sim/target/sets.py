@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
@@ -19,7 +19,7 @@ from neural_sim.types import LabelledImages, PinholeCamera
 class RenderedTarget:
     """Images per object in ``val``, which steers psi, and in ``test``, which is scored once.
 
-    ``test_per_biased_object`` is for objects named in ``parameter.pose.biased``, whose scores are compared.
+    ``test_per_biased_object`` is for objects named in some parameter's ``biased``, whose scores are compared.
     """
 
     val_per_object: int = 50
@@ -35,21 +35,20 @@ class RenderedTarget:
         self,
         meshes: Mapping[str, ObjectMesh],
         renderer: MeshRenderer,
-        pose: Pose,
+        distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
-        biased = set(pose.biased or {})
+        biased, target = set(distribution.biased), distribution.psi("target", list(meshes)).float()
         made = {}
         for part, name in enumerate(("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
             draws = []
-            for item in meshes.values():
+            for item, psi in zip(meshes.values(), target, strict=True):
                 test_count = self.test_per_biased_object if item.name in biased else self.test_per_object
                 count = test_count if name == "test" else self.val_per_object
-                psi = pose.logits(pose.probabilities("target", item.name))
-                draws.append(pose.hard(psi.float(), pose.draw_noise(count, generator)))
+                draws.append(distribution.hard(psi, distribution.draw_noise(count, generator)))
             made[name] = render_target(list(meshes.values()), renderer, draws, camera, synthesizer, generator)
         return made

@@ -1,4 +1,4 @@
-"""Which pose bins an object's symmetry makes the same, so that mass in any of them counts as mass in each."""
+"""Which bins of a factor an object's symmetry makes the same, so that mass in any of them counts as mass in each."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from torch import Tensor
 
 from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.pose import Pose, PoseNoise
+from neural_sim.parameter.factor import BinNoise
+from neural_sim.parameter.product import COORDINATES, SceneDistribution, SceneNoise
 from neural_sim.renderer.base import MeshRenderer
-from neural_sim.types import PinholeCamera
+from neural_sim.types import PinholeCamera, SceneDraw
 
 # Per offset within the bin and second angle: as they are, or mirrored about their middle.
 ALIGNMENTS = ((False, False), (True, False), (False, True), (True, True))
@@ -19,20 +20,22 @@ ALIGNMENTS = ((False, False), (True, False), (False, True), (True, True))
 def equivalent_bins(
     item: ObjectMesh,
     renderer: MeshRenderer,
-    pose: Pose,
+    distribution: SceneDistribution,
+    factor: str,
     camera: PinholeCamera,
     samples: int = 6,
     tolerance: float = 0.01,
 ) -> list[list[int]]:
-    """Groups of bins (from 0) whose views agree, as lists that cover all bins.
+    """Groups of a factor's bins (from 0) whose views agree, as lists that cover all bins.
 
     Two bins belong together when, under one of four alignments of the angles within them, the mean absolute difference
     of their premultiplied views over the pixels that either covers is below ``tolerance``. Views of every bin use the
-    same ``samples`` offsets and second angles at the middle distance.
+    same ``samples`` offsets and second angles; what the factor does not draw is at the middle of its range.
     """
-    views = [_views(item, renderer, pose, camera, b, samples) for b in range(pose.bins)]
+    count = next(f.bins for f in distribution.factors if f.name == factor)
+    views = [_views(item, renderer, distribution, factor, camera, b, samples) for b in range(count)]
     groups: list[list[int]] = []
-    for b in range(pose.bins):
+    for b in range(count):
         home = next((group for group in groups if _same(views[group[0]][0], views[b], tolerance)), None)
         if home is None:
             groups.append([b])
@@ -42,23 +45,50 @@ def equivalent_bins(
 
 
 def _views(
-    item: ObjectMesh, renderer: MeshRenderer, pose: Pose, camera: PinholeCamera, bin_index: int, samples: int
+    item: ObjectMesh,
+    renderer: MeshRenderer,
+    distribution: SceneDistribution,
+    factor: str,
+    camera: PinholeCamera,
+    bin_index: int,
+    samples: int,
 ) -> list[Float[Tensor, "samples h w 4"]]:
     """Views of one bin under every alignment."""
     offsets = (torch.arange(samples) + 0.5) / samples
     other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
     made = []
     for mirror_offset, mirror_other in ALIGNMENTS:
-        noise = PoseNoise(
-            gumbel=torch.zeros(samples, pose.bins),
-            within=1.0 - offsets if mirror_offset else offsets,
-            other=1.0 - other if mirror_other else other,
-            distance=torch.full((samples,), 0.5),
+        draw = _at(
+            distribution,
+            factor,
+            bin_index,
+            1.0 - offsets if mirror_offset else offsets,
+            1.0 - other if mirror_other else other,
         )
-        draw = pose.at_bins(torch.full((samples,), bin_index), noise)
         rgba = renderer.render(item.mesh, camera, orbit(draw.phi, draw.rho, draw.distance))
         made.append(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1))
     return made
+
+
+def _at(
+    distribution: SceneDistribution,
+    factor: str,
+    bin_index: int,
+    within: Float[Tensor, "n"],
+    other: Float[Tensor, "n"],
+) -> SceneDraw:
+    """Scenes in one bin of a factor, angles it does not draw at the fractions ``other`` of their ranges."""
+    middle = torch.full_like(within, 0.5)
+    uniform = {name: other if name in ("phi", "rho") else middle for name in COORDINATES}
+    bins, still = {}, {}
+    for f in distribution.factors:
+        if f.name == factor:
+            bins[f.name], uniform[f.coordinate] = torch.full((len(within),), bin_index), within
+        else:
+            at = uniform[f.coordinate] * f.bins
+            bins[f.name], uniform[f.coordinate] = at.long().clamp_max(f.bins - 1), at.frac()
+        still[f.name] = BinNoise(torch.zeros(len(within), f.bins))
+    return distribution.at_bins(bins, SceneNoise(still, uniform))
 
 
 def _same(reference: Tensor, candidates: list[Tensor], tolerance: float) -> bool:

@@ -1,0 +1,191 @@
+"""One factor of p_psi: log p over equal bins of one number of the scene, uniform within each bin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.parameter import bins as binned
+from neural_sim.parameter.distributions import Specification, distribution
+
+Coordinate = Literal["phi", "rho", "distance", "magnification"]
+"""The numbers of a :class:`SceneDraw` that images depend on smoothly."""
+Gap = Literal["disjoint", "uniform", "same"]
+Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
+"""How a draw depends on psi, see :meth:`BinnedFactor.relaxed`."""
+
+
+@dataclass(frozen=True)
+class BinNoise:
+    """What picks the bins of n draws. ``exponential``, for ``gumbel_rao`` only, makes other Gumbel noise that would
+    have picked the same ones."""
+
+    gumbel: Float[Tensor, "n k"]
+    exponential: Float[Tensor, "n draws k"] | None = None
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """The configured distributions of one factor, by object.
+
+    Args:
+        initial, target: of objects not named in ``biased``.
+        biased: object name -> {initial: ..., target: ...}, see :func:`distributions.distribution`.
+        gap: how far biased objects start from their target: ``disjoint`` as ``biased`` says, ``uniform``, or ``same``,
+            at the target itself.
+    """
+
+    initial: Specification = "uniform"
+    target: Specification = "uniform"
+    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    gap: Gap = "disjoint"
+
+    def of(self, which: str, object_name: str) -> Specification:
+        """The ``initial`` or ``target`` specification of one object."""
+        own = (self.biased or {}).get(object_name)
+        if own is None:
+            return self.initial if which == "initial" else self.target
+        if which == "initial" and self.gap != "disjoint":
+            return "uniform" if self.gap == "uniform" else own.get("target", self.target)
+        return own.get(which, self.initial if which == "initial" else self.target)
+
+
+@dataclass(frozen=True)
+class BinnedFactor:
+    """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
+
+    Args:
+        name: of the factor, and of the configuration node ``parameter.<name>``.
+        coordinate: the number of the scene that it draws; angles in radians.
+        geometric: bins of equal ratio instead of equal width (both ends positive).
+        periodic: the ends are the same place.
+        temperature: tau of the Gumbel-softmax (Eq. 4; the paper: 0.1).
+        bin_mean: ``linear`` is the paper's sum_i y_i B_i, ``circular`` its counterpart on the circle.
+        floor: smallest probability of a bin.
+        beliefs: initial and target distributions.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    name: str
+    coordinate: Coordinate
+    bins: int
+    low: float
+    high: float
+    geometric: bool = False
+    periodic: bool = False
+    temperature: float = 0.1
+    bin_mean: Literal["linear", "circular"] = "linear"
+    floor: float = 0.005
+    beliefs: Beliefs = Beliefs()
+
+    def __post_init__(self) -> None:
+        where = f"parameter.{self.name}"
+        if self.bins < 1:
+            raise ValueError(f"{where}.bins must be at least 1, got {self.bins}")
+        if self.bin_mean not in ("linear", "circular"):
+            raise ValueError(f"{where}.bin_mean must be linear or circular, got {self.bin_mean!r}")
+        if self.bin_mean == "circular" and not self.periodic:
+            raise ValueError(f"{where}.bin_mean: circular is for a full circle, want linear")
+        if not self.temperature > 0.0:
+            raise ValueError(f"{where}.temperature must be positive, got {self.temperature}")
+        if not 0.0 <= self.floor < 1.0 / self.bins:
+            raise ValueError(f"{where}.floor must lie in [0, 1/bins), got {self.floor}")
+        if self.beliefs.gap not in get_args(Gap):
+            raise ValueError(f"{where}.gap must be one of {get_args(Gap)}, got {self.beliefs.gap!r}")
+        if not self.low < self.high or (self.geometric and not self.low > 0.0):
+            raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
+        for name in self.beliefs.biased or {}:
+            for which in ("initial", "target"):
+                self.probabilities(which, name)
+
+    @property
+    def size(self) -> int:
+        """How many numbers of psi an object has here."""
+        return self.bins
+
+    def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
+        """The configured ``initial`` or ``target`` distribution of one object."""
+        where = f"parameter.{self.name}.{which} of {object_name}"
+        return distribution(self.beliefs.of(which, object_name), self.bins, where)
+
+    def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
+        """The logits that give :meth:`probabilities`."""
+        return self.logits(self.probabilities(which, object_name))
+
+    def logits(self, probabilities: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """psi that gives ``probabilities``."""
+        return binned.logits(probabilities, self.floor)
+
+    def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """log p over the bins, floored."""
+        return binned.log_probabilities(psi, self.floor)
+
+    def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
+        """Exact samples of the bins by the Gumbel-max trick; no derivative reaches psi."""
+        return (self.log_probabilities(psi.detach()) + noise.gumbel).argmax(-1)
+
+    def at(self, bins: Int[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """The coordinate in given bins, at the fraction ``within`` of each."""
+        return self._place(self._centres(within)[bins], within)
+
+    def relaxed(
+        self,
+        psi: Float[Tensor, "k"],
+        noise: BinNoise,
+        within: Float[Tensor, "n"],
+        relaxation: Relaxation = "gumbel_softmax",
+    ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+        """The coordinate, differentiable in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
+
+        ``gumbel_softmax`` is the paper's: at small tau most draws lie in one bin and carry next to no derivative; the
+        few near a tie carry it all. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and takes the
+        relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of no
+        expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is averaged
+        over noise that would have chosen the same bin (Paulus et al. 2021).
+
+        Raises:
+            ValueError: ``gumbel_rao`` without the noise for it.
+        """
+        log_p = self.log_probabilities(psi)
+        given = noise.gumbel
+        centres = self._centres(given)
+        mean = binned.circular_mean if self.bin_mean == "circular" else binned.linear_mean
+        chosen = (log_p.detach() + given).argmax(-1)
+        if relaxation == "gumbel_rao":
+            if noise.exponential is None:
+                raise ValueError(
+                    f"parameter.{self.name}: gumbel_rao wants noise drawn with conditional >= 1, got none"
+                )
+            given = binned.conditional_gumbel(log_p.detach(), chosen, noise.exponential)
+        centre = mean(binned.gumbel_softmax(log_p, given, self.temperature), centres)
+        if relaxation != "gumbel_softmax":
+            centre = centre.mean(-1) if relaxation == "gumbel_rao" else centre
+            centre = centres[chosen] + (centre - centre.detach())
+        return self._place(centre, within), chosen
+
+    def bin_of(self, values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
+        """The bin that each value lies in; without a wrap, values outside belong to the bin at that end."""
+        low, high = self._ends
+        at = values.log() if self.geometric else values
+        if self.periodic:
+            return binned.nearest_bin(at, self.bins, low, high)
+        return ((at.detach() - low) / (high - low) * self.bins).long().clamp(0, self.bins - 1)
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        return (math.log(self.low), math.log(self.high)) if self.geometric else (self.low, self.high)
+
+    def _centres(self, like: Tensor) -> Float[Tensor, "k"]:
+        return binned.centres(self.bins, *self._ends, like)
+
+    def _place(self, centre: Float[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        low, high = self._ends
+        placed = centre + (within - 0.5) * ((high - low) / self.bins)
+        return placed.exp() if self.geometric else placed

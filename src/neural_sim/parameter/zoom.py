@@ -1,0 +1,71 @@
+"""The zoom parameter: how large objects appear, by the camera's distance or by its focal length."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from neural_sim.parameter.distributions import Specification
+from neural_sim.parameter.factor import Beliefs, BinnedFactor, Coordinate, Gap
+
+By = Literal["distance", "focal_length"]
+NEAREST = 1.05
+"""Object radii: a camera any closer is inside the object."""
+
+
+@dataclass(frozen=True)
+class Zoom:
+    """``bins`` bins of equal ratio, which do not wrap: neighbours' middles differ in image size by (far / near)^(1/k).
+
+    Args:
+        bins: k.
+        by: ``distance`` moves the camera; ``focal_length`` magnifies its image from where it stands, without a change
+            of perspective.
+        range: nearest and farthest distance in object radii; or smallest and largest focal length in units of the
+            camera's own. Bin 1 is the nearest, or the smallest magnification.
+        temperature, floor: see :class:`BinnedFactor`.
+        initial, target, biased, gap: see :class:`Beliefs`.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    bins: int = 4
+    by: By = "distance"
+    range: tuple[float, float] = (2.2, 8.5)
+    temperature: float = 0.1
+    floor: float = 0.005
+    initial: Specification = "uniform"
+    target: Specification = "uniform"
+    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    gap: Gap = "disjoint"
+
+    def __post_init__(self) -> None:
+        if self.by not in get_args(By):
+            raise ValueError(f"parameter.zoom.by must be one of {get_args(By)}, got {self.by!r}")
+        near, far = self.range
+        smallest = NEAREST if self.by == "distance" else 0.0
+        if not smallest < near < far:
+            raise ValueError(
+                f"parameter.zoom.range must be ordered and above {smallest}, got {list(self.range)}"
+            )
+        _ = self.factors
+
+    @property
+    def factors(self) -> tuple[BinnedFactor, ...]:
+        """The learned number."""
+        near, far = self.range
+        coordinate: Coordinate = "distance" if self.by == "distance" else "magnification"
+        beliefs = Beliefs(self.initial, self.target, self.biased, self.gap)
+        return (
+            BinnedFactor(
+                "zoom", coordinate, self.bins, near, far, geometric=True, temperature=self.temperature,
+                floor=self.floor, beliefs=beliefs,
+            ),
+        )  # fmt: skip
+
+    @property
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Nothing else is drawn here."""
+        return {}
