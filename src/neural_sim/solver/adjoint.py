@@ -51,8 +51,7 @@ class AdjointSolver:
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
         max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never is).
-        sensitivity: also solve at 2 lambda, from v, to see how much hangs on the damping: up to ``max_steps`` more
-            products.
+        sensitivity: also solve at 2 lambda, to see how much hangs on the damping: up to ``max_steps`` more products.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -80,21 +79,27 @@ class AdjointSolver:
         began = time.perf_counter()
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
-        start = x0 if damped.start is None else damped.start
-        solution = self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
+        solution = self._solve(operator, damped, b, x0)
         raises = 0
         while solution.status is Status.NEGATIVE_CURVATURE and raises < self.max_raises:
             raised = self.damping.raised(damped, solution.curvature[0] - damped.value)
             if raised is None:
                 break
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
-            damped, start, raises = raised, solution.value, raises + 1
-            solution = self.linear.solve(Shifted(operator, damped.value), b, start, self.rtol, self.max_steps)
+            damped, raises = raised, raises + 1
+            solution = self._solve(operator, damped, b, solution.value)
         doubled = None
         if self.sensitivity:
-            twice = Shifted(operator, 2.0 * damped.value)
-            doubled = self.linear.solve(twice, b, solution.value, self.rtol, self.max_steps).value
+            doubled = self._solve(operator, damped, b, solution.value, 2.0).value
         return Adjoint(solution, damped, raises, doubled, time.perf_counter() - began)
+
+    def _solve(
+        self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
+    ) -> Solution:
+        """At ``times`` lambda, from where the damping's own products got to, else from ``x0``."""
+        searched = damped.search(times)
+        start = x0 if searched is None else searched
+        return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
         """The undamped curvature operator that the damping asks for."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -19,26 +19,47 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Iterate:
-    """Where an iteration stopped; CONVERGED here is a claim that ``LinearSolver.solve`` checks."""
+    """Where an iteration stopped; CONVERGED here is a claim that ``LinearSolver.solve`` checks.
+
+    ``residual`` is the norm of ``rhs - A value`` from a fresh product where the iteration ended on one, else None.
+    """
 
     value: Float[Tensor, "n"]
     status: Status
     steps: int
+    residual: float | None = None
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search by conjugate directions to be gone on with: where it stands, ``b - A value`` by the recurrence, and
+    the direction it would take next. Solvers other than conjugate gradients take the value alone.
+    """
+
+    value: Float[Tensor, "n"]
+    residual: Float[Tensor, "n"]
+    direction: Float[Tensor, "n"]
+
+    def divided(self, scale: float) -> Search:
+        """The same search for the right-hand side over ``scale``."""
+        return Search(self.value / scale, self.residual / scale, self.direction / scale)
 
 
 @dataclass(frozen=True)
 class System:
-    """``operator x = rhs`` as a solver's iteration gets it: ``rhs`` has a norm in [1, 2), ``tolerance`` is absolute."""
+    """``operator x = rhs`` as a solver's iteration gets it: ``rhs`` has a norm in [1, 2), ``tolerance`` is absolute.
+
+    ``residual`` is that at ``start``. It comes from a product wherever it meets the tolerance; above, it may be a
+    search's own, which then has its next ``direction`` beside it.
+    """
 
     operator: Watched
     rhs: Float[Tensor, "n"]
     start: Float[Tensor, "n"]
+    residual: Float[Tensor, "n"]
+    direction: Float[Tensor, "n"] | None
     tolerance: float
     max_steps: int
-
-    def first_residual(self) -> Float[Tensor, "n"]:
-        """The residual at ``start``, without a product where that is zero."""
-        return self.rhs - self.operator(self.start) if bool(self.start.any()) else self.rhs
 
 
 @dataclass(frozen=True)
@@ -53,17 +74,17 @@ class LinearSolver(abc.ABC):
         self,
         matvec: Matvec,
         b: Float[Tensor, "n"],
-        x0: Float[Tensor, "n"] | None = None,
+        x0: Float[Tensor, "n"] | Search | None = None,
         rtol: float = 1e-3,
         max_steps: int = 40,
     ) -> Solution:
         """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps, starting from ``x0`` (default
-        0).
+        0) or where a search has got to.
 
         Bad numbers give a status, never a NaN. Raises ``ValueError`` for shapes and settings that make no
         sense.
         """
-        _check(b, x0, rtol, max_steps)
+        _check(b, x0.value if isinstance(x0, Search) else x0, rtol, max_steps)
         operator = Watched(matvec)
         scale = float(b.abs().max())
         if scale == 0.0:
@@ -76,10 +97,11 @@ class LinearSolver(abc.ABC):
         unit = _power_of_two(norm(rhs))
         rhs = rhs / unit
         size = norm(rhs)
-        start = _warm_start(operator, rhs, None if x0 is None else x0 / scale / unit)
         try:
-            end = self.iterate(System(operator, rhs, start, rtol * size, max_steps))
-            residual = norm(rhs - operator(end.value)) / size
+            system = _started(operator, rhs, _scaled(x0, scale, unit), rtol * size, max_steps)
+            end = self.iterate(system)
+            reached = norm(rhs - operator(end.value)) if end.residual is None else end.residual
+            residual = reached / size
         except NonFiniteProduct as error:
             logger.warning("%s: %s", type(self).__name__, error)
             return Solution(
@@ -95,7 +117,7 @@ class LinearSolver(abc.ABC):
                 failed.value, Status.NON_FINITE, end.steps, 1.0, operator.curvature, operator.products, False
             )
         status = _verified(end.status, residual, rtol)
-        warm = bool(start.any())
+        warm = bool(system.start.any())
         return Solution(value, status, end.steps, residual, operator.curvature, operator.products, warm)
 
 
@@ -115,22 +137,37 @@ def _lost(claimed: Status) -> Status:
     return Status.STAGNATED if claimed in (Status.CONVERGED, Status.MAX_STEPS) else claimed
 
 
-def _warm_start(
-    operator: Watched, rhs: Float[Tensor, "n"], guess: Float[Tensor, "n"] | None
-) -> Float[Tensor, "n"]:
-    """The guess where its residual beats that of zero (which is 1), else zero."""
-    zero = torch.zeros_like(rhs)
-    if guess is None or not bool(torch.isfinite(guess).all()) or not bool(guess.any()):
-        return zero
+def _scaled(x0: Tensor | Search | None, scale: float, unit: float) -> Tensor | Search | None:
+    if isinstance(x0, Search):
+        return x0.divided(scale).divided(unit)
+    return None if x0 is None else x0 / scale / unit
+
+
+def _started(
+    operator: Watched,
+    rhs: Float[Tensor, "n"],
+    guess: Tensor | Search | None,
+    tolerance: float,
+    max_steps: int,
+) -> System:
+    """The system at the guess where its residual beats that of zero (which is 1), else at zero."""
+    cold = System(operator, rhs, torch.zeros_like(rhs), rhs, None, tolerance, max_steps)
+    value = guess.value if isinstance(guess, Search) else guess
+    if value is None or not bool(torch.isfinite(value).all()) or not bool(value.any()):
+        return cold
+    if isinstance(guess, Search) and tolerance < norm(guess.residual) < norm(rhs):
+        return replace(cold, start=value, residual=guess.residual, direction=guess.direction)
     try:
-        residual = norm(rhs - operator(guess)) / norm(rhs)
+        residual = rhs - operator(value)
     except NonFiniteProduct:
         logger.info("warm start dropped: its product is not finite")
-        return zero
-    if residual < 1.0:
-        return guess
-    logger.info("warm start dropped: its relative residual is %.3g, that of zero is 1", residual)
-    return zero
+        return cold
+    if norm(residual) < norm(rhs):
+        return replace(cold, start=value, residual=residual)
+    logger.info(
+        "warm start dropped: its relative residual is %.3g, that of zero is 1", norm(residual) / norm(rhs)
+    )
+    return cold
 
 
 def check_restart_gain(solver: str, restart_gain: float) -> None:

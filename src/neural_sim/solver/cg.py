@@ -26,18 +26,22 @@ class ConjugateGradient(LinearSolver):
         return conjugate_gradients(system, self.restart_gain)
 
 
-def conjugate_gradients(
-    system: System, restart_gain: float, precondition: Matvec = lambda residual: residual
-) -> Iterate:
-    """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse."""
+def conjugate_gradients(system: System, restart_gain: float, precondition: Matvec | None = None) -> Iterate:
+    """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse.
+
+    A system that comes with a search's direction is gone on with as that search would have gone on, which a
+    preconditioner, having other directions, cannot.
+    """
     operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
     value = best = system.start
-    residual = system.first_residual()
+    residual = system.residual
     confirmed = best_norm = norm(residual)
     if confirmed <= tolerance:
-        return Iterate(best, Status.CONVERGED, 0)
-    direction = precondition(residual)
-    energy = dot(residual, direction)
+        return Iterate(best, Status.CONVERGED, 0, confirmed)
+    conditioned = residual if precondition is None else precondition(residual)
+    begun = system.direction if precondition is None else None
+    direction = conditioned if begun is None else begun
+    energy = dot(residual, conditioned)
     for step in range(1, system.max_steps + 1):
         product = operator(direction)
         curvature = dot(direction, product)
@@ -56,12 +60,12 @@ def conjugate_gradients(
             residual = rhs - operator(value)
             true = norm(residual)
             if true <= tolerance:
-                return Iterate(value, Status.CONVERGED, step)
+                return Iterate(value, Status.CONVERGED, step, true)
             if true > restart_gain * confirmed:
-                return Iterate(value, Status.STAGNATED, step)
+                return Iterate(value, Status.STAGNATED, step, true)
             confirmed = best_norm = true
             best = value
-        conditioned = precondition(residual)
+        conditioned = residual if precondition is None else precondition(residual)
         before, energy = energy, dot(residual, conditioned)
         direction = conditioned if restart else conditioned + (energy / before) * direction
     return Iterate(best, Status.MAX_STEPS, system.max_steps)

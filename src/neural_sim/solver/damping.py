@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.lanczos import Spectrum, lanczos, random_start
+from neural_sim.solver.base import Search
+from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
 from neural_sim.solver.operator import Matvec
 
 logger = logging.getLogger(__name__)
@@ -24,18 +25,21 @@ Start = Literal["rhs", "random"]
 class Damped:
     """``value`` is lambda >= 0; ``spectrum`` is that of the undamped operator, None where it was not estimated.
 
-    ``start`` solves the damped system on the Krylov space that the estimate searched, where that is the right-hand
-    side's: the products that chose lambda need not be made again.
+    ``krylov`` is the space that the estimate searched, where that is the right-hand side's.
     """
 
     value: float
     spectrum: Spectrum | None
-    start: Float[Tensor, "n"] | None = None
+    krylov: Krylov | None = None
 
     @property
     def condition(self) -> float:
         """Estimated condition number of the damped operator; nan where no spectrum was estimated."""
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
+
+    def search(self, times: float = 1.0) -> Search | None:
+        """The solve at ``times`` lambda as far as the estimate's products have brought it, where they have."""
+        return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
 class Damping(abc.ABC):
@@ -78,8 +82,8 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    ``start``: from ``rhs``, the Krylov space is the one that conjugate gradients search, and lambda past its
-    smallest Ritz value is what keeps their first ``lanczos_steps`` steps from breaking down; ``random`` looks
+    ``start``: from ``rhs``, the Krylov space is the one that conjugate gradients search, which go on from it, and
+    lambda past its smallest Ritz value is what keeps these first steps of theirs from breaking down; ``random`` looks
     for the spectrum's own ends, but a detector's few negative eigenvalues hide among many near zero: on a
     tiny RetinaNet 12 steps saw -0.01 where lambda_min was -2.4. Where a longer solve still meets negative
     curvature, lambda is raised past it.
@@ -118,11 +122,11 @@ class LanczosDamping(Damping):
         value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
         if self.start == "random" or not usable or spectrum.krylov is None:
             return Damped(value, spectrum)
-        return Damped(value, spectrum, spectrum.krylov.solve(value))
+        return Damped(value, spectrum, spectrum.krylov)
 
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0
-        return Damped(max(2.0 * damped.value, self._past(lowest, largest)), damped.spectrum)
+        return Damped(max(2.0 * damped.value, self._past(lowest, largest)), damped.spectrum, damped.krylov)
 
     def _past(self, low: float, largest: float) -> float:
         bounded = (largest - self.max_condition * low) / (self.max_condition - 1.0)

@@ -9,30 +9,45 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.solver.base import Search
 from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
 
 
 @dataclass(frozen=True)
 class Krylov:
-    """The Krylov space of a start vector b of norm ``size``: orthonormal rows of ``basis``, and A in that basis."""
+    """The Krylov space of a start vector b of norm ``size``: orthonormal rows of ``basis``, and A in that basis.
+
+    ``beyond`` is what the last product has outside the space: its norm is the recurrence's next off-diagonal entry.
+    """
 
     basis: Float[Tensor, "m n"]
     tridiagonal: Float[Tensor, "m m"]
     size: float
+    beyond: Float[Tensor, "n"]
 
-    def solve(self, shift: float) -> Float[Tensor, "n"] | None:
-        """The Galerkin solution of ``(A + shift I) x = b``, which is what m steps of conjugate gradients from zero
-        reach; no products, whatever the shift (Krylov spaces do not depend on it). None where the shifted
-        matrix is not positive definite on this space.
+    def search(self, shift: float) -> Search | None:
+        """Where m steps of conjugate gradients from zero on ``(A + shift I) x = b`` end; no products, whatever the
+        shift (Krylov spaces do not depend on it). None where the shifted matrix is not positive definite on this
+        space.
+
+        With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m: the value is Q y, its residual r = -y_m
+        times ``beyond``, and Q z the only direction in the space that is conjugate to all others before it, which
+        makes r + |beyond|^2 y_m Q z conjugate to the whole space.
         """
         shifted = self.tridiagonal + shift * torch.eye(len(self.tridiagonal), dtype=torch.float64)
         factor, info = torch.linalg.cholesky_ex(shifted)
         if int(info) != 0:
             return None
-        first = torch.zeros(len(shifted), 1, dtype=torch.float64)
-        first[0] = self.size
-        weights = torch.cholesky_solve(first, factor)[:, 0].to(self.basis)
-        return self.basis.T @ weights if bool(torch.isfinite(weights).all()) else None
+        ends = torch.zeros(len(shifted), 2, dtype=torch.float64)
+        ends[0, 0], ends[-1, 1] = self.size, 1.0
+        weights = torch.cholesky_solve(ends, factor)
+        value, last = weights.T.to(self.basis) @ self.basis
+        residual = -float(weights[-1, 0]) * self.beyond
+        direction = residual + norm(self.beyond) ** 2 * float(weights[-1, 0]) * last
+        found = Search(value, residual, direction)
+        return (
+            found if all(bool(torch.isfinite(part).all()) for part in (value, residual, direction)) else None
+        )
 
 
 @dataclass(frozen=True)
@@ -75,32 +90,36 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
         )
     operator = Watched(matvec)
     vector = start / biggest
-    basis = [vector / norm(vector)]
+    steps = min(steps, start.numel())
+    basis = start.new_empty(steps, start.numel())
+    basis[0] = vector / norm(vector)
     alphas: list[float] = []
     betas: list[float] = []
+    beyond = torch.zeros_like(start)
     finite = True
-    for _ in range(min(steps, start.numel())):
+    for step in range(steps):
         try:
-            product = operator(basis[-1])
+            product = operator(basis[step])
         except NonFiniteProduct:
             finite = False
             break
         reach = norm(product)
-        columns = torch.stack(basis)
+        columns = basis[: step + 1]
         overlaps = columns @ product
         product = product - columns.T @ overlaps
         correction = columns @ product  # twice is enough (Parlett and Kahan)
         product = product - columns.T @ correction
         alphas.append(float(overlaps[-1] + correction[-1]))
         betas.append(norm(product))
+        beyond = product
         if betas[-1] <= 10.0 * torch.finfo(start.dtype).eps * reach:
             betas[-1] = 0.0  # an invariant subspace: its Ritz values are eigenvalues
+            beyond = torch.zeros_like(product)
             break
-        basis.append(product / betas[-1])
-    size = biggest * norm(vector)
-    return _extremes(
-        alphas, betas, operator.products, finite, torch.stack(basis[: max(len(alphas), 1)]), size
-    )
+        if step + 1 < steps:
+            basis[step + 1] = product / betas[-1]
+    space = basis[: max(len(alphas), 1)]
+    return _extremes(alphas, betas, operator.products, finite, space, beyond, biggest * norm(vector))
 
 
 def random_start(
@@ -111,7 +130,13 @@ def random_start(
 
 
 def _extremes(
-    alphas: list[float], betas: list[float], products: int, finite: bool, basis: Tensor, size: float
+    alphas: list[float],
+    betas: list[float],
+    products: int,
+    finite: bool,
+    basis: Tensor,
+    beyond: Tensor,
+    size: float,
 ) -> Spectrum:
     if not alphas:
         return Spectrum(0.0, 0.0, 0.0, 0.0, products, finite)
@@ -122,6 +147,5 @@ def _extremes(
     values, vectors = torch.linalg.eigh(tridiagonal)
     errors = betas[len(alphas) - 1] * vectors[-1].abs()  # residual of a Ritz pair: beta_m |e_m^T y|
     low, high = float(values[0]), float(values[-1])
-    return Spectrum(
-        low, high, float(errors[0]), float(errors[-1]), products, finite, Krylov(basis, tridiagonal, size)
-    )
+    krylov = Krylov(basis, tridiagonal, size, beyond)
+    return Spectrum(low, high, float(errors[0]), float(errors[-1]), products, finite, krylov)

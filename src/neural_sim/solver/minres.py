@@ -28,7 +28,7 @@ class MinimumResidual(LinearSolver):
     def iterate(self, system: System) -> Iterate:
         operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
         value, steps = system.start, 0
-        residual = system.first_residual()
+        residual = system.residual
         size = norm(residual)
         while size > tolerance:
             if steps >= system.max_steps:

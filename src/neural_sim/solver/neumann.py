@@ -30,7 +30,7 @@ class Neumann(LinearSolver):
     def iterate(self, system: System) -> Iterate:
         operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
         value = best = system.start
-        residual = system.first_residual()
+        residual = system.residual
         smallest = size = norm(residual)
         if size <= tolerance:
             return Iterate(system.start, Status.CONVERGED, 0)
