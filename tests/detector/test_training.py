@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.cached import CachedSet, cached_features
 from neural_sim.detector.module import DetectorModule
-from neural_sim.detector.training import cached_features, mean_loss, train_detector
+from neural_sim.detector.training import mean_loss, train_detector
 from neural_sim.types import LabelledImages
 
 
@@ -46,7 +46,8 @@ def test_all_parameters_are_trained_and_the_given_ones_kept(tools, generator, im
 def test_frozen_backbone_is_frozen_and_gives_the_same_loss(tools, generator, images):
     detector = tools.detector()
     start = detector.init(generator)
-    trained, history = train(detector, start, images, trainable_only=True)
+    features = CachedSet.of(detector, detector.split(start)[0], images)
+    trained, history = train(detector, start, features)
     backbone, trainable = detector.split(trained)
     assert all(torch.equal(value, start[name]) for name, value in backbone.items())
     assert all(not torch.equal(value, start[name]) for name, value in trainable.items())
@@ -121,18 +122,11 @@ def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, gen
 def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
     detector = tools.detector()
     start = detector.init(generator)
+    features = CachedSet.of(detector, detector.split(start)[0], images)
 
     def distance(proximal):
-        trained, _ = train(
-            detector,
-            start,
-            images,
-            epochs=40,
-            trainable_only=True,
-            proximal=proximal,
-            anchor=start,
-            weight_decay=0.0,
-        )
+        settings = {"epochs": 40, "proximal": proximal, "anchor": start, "weight_decay": 0.0}
+        trained, _ = train(detector, start, features, **settings)
         return math.sqrt(sum(float((trained[n] - start[n]).square().sum()) for n in start))
 
     assert distance(100.0) < 0.1 * distance(1.0) < 0.1 * distance(0.0)

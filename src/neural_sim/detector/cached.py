@@ -11,8 +11,22 @@ from torch import Tensor
 
 from neural_sim.detector.retinanet import Detector, Outputs, Parameters
 from neural_sim.detector.targets import Targets
-from neural_sim.detector.training import cached_features
 from neural_sim.types import LabelledImages
+
+
+@torch.no_grad()
+def cached_features(
+    detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
+) -> tuple[Tensor, ...]:
+    """Feature maps of all images, computed batch by batch, without a graph.
+
+    Raises:
+        ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
+    """
+    if len(images) == 0:
+        raise ValueError("cached_features: got no images, want at least one")
+    parts = [detector.features(backbone, chunk) for chunk in images.split(batch_size)]
+    return tuple(torch.cat(level) for level in zip(*parts, strict=True))
 
 
 @dataclass(frozen=True)
@@ -22,6 +36,9 @@ class CachedSet:
     detector: Detector
     features: tuple[Tensor, ...]
     targets: Targets
+
+    def __len__(self) -> int:
+        return len(self.targets)
 
     @staticmethod
     def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:

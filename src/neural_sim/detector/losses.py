@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -36,3 +38,11 @@ def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Floa
     square = (residual / delta) ** 2
     # sqrt(1 + square) - 1, without the difference that cancels every digit of a small residual.
     return delta * square / (torch.sqrt(1 + square) + 1)
+
+
+def proximal_loss(
+    params: Mapping[str, Tensor], anchor: Mapping[str, Tensor], proximal: float
+) -> Float[Tensor, ""]:
+    """``proximal / 2 |params - anchor|^2`` over the names of ``params``; the anchor is held fixed."""
+    squares = [(value - anchor[name].detach()).square().sum() for name, value in params.items()]
+    return 0.5 * proximal * torch.stack(squares).sum()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from neural_sim.detector.losses import proximal_loss
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
 
@@ -48,7 +49,7 @@ class DetectorModule(pl.LightningModule):
         self._names = list(learned)
         self._values = nn.ParameterList([nn.Parameter(value.detach().clone()) for value in learned.values()])
         self._proximal = proximal
-        self._anchor = None if anchor is None else [anchor[name].detach() for name in self._names]
+        self._anchor = anchor
         self._fixed = {name: value.detach() for name, value in fixed.items()}
         self._on_features = not any(name.startswith("backbone.") for name in learned)
         self.total_steps, self.warmup_steps = total_steps, math.ceil(warmup_fraction * total_steps)
@@ -64,21 +65,15 @@ class DetectorModule(pl.LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         inputs, targets = batch
-        params = {**self._fixed, **dict(zip(self._names, self._values, strict=True))}
-        backbone, trainable = self.detector.split(params)
+        learned = dict(zip(self._names, self._values, strict=True))
+        backbone, trainable = self.detector.split({**self._fixed, **learned})
         features = inputs if self._on_features else self.detector.features(backbone, inputs[0])
         loss = self.detector.loss(trainable, features, targets)
         self._losses.append(loss.detach())
         self._sizes.append(len(targets))
-        return loss + self._proximal_term()
-
-    def _proximal_term(self) -> Tensor | float:
         if self._proximal == 0.0 or self._anchor is None:
-            return 0.0
-        pairs = zip(self._values, self._anchor, strict=True)
-        return (
-            0.5 * self._proximal * torch.stack([(value - held).square().sum() for value, held in pairs]).sum()
-        )
+            return loss
+        return loss + proximal_loss(learned, self._anchor, self._proximal)
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning's own version refuses frozen dataclasses.

@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
@@ -42,32 +43,16 @@ class Batches:
             yield tuple(x[index] for x in self.inputs), self.targets.select(index)
 
 
-@torch.no_grad()
-def cached_features(
-    detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
-) -> tuple[Tensor, ...]:
-    """Feature maps of all images, computed batch by batch, without a graph.
-
-    Raises:
-        ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
-    """
-    if len(images) == 0:
-        raise ValueError("cached_features: got no images, want at least one")
-    parts = [detector.features(backbone, chunk) for chunk in images.split(batch_size)]
-    return tuple(torch.cat(level) for level in zip(*parts, strict=True))
-
-
 def train_detector(
     detector: Detector,
     params: Parameters,
-    images: LabelledImages,
+    images: LabelledImages | CachedSet,
     generator: torch.Generator,
     epochs: int = 30,
     batch_size: int = 32,
     learning_rate: float = 3e-3,
     weight_decay: float = 1e-2,
     warmup_fraction: float = 0.1,
-    trainable_only: bool = False,
     progress: bool = False,
     proximal: float = 0.0,
     anchor: Parameters | None = None,
@@ -75,7 +60,7 @@ def train_detector(
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
     Args:
-        trainable_only: train the pyramid and the head on the frozen backbone's features, computed once.
+        images: where they come as features, the backbone stays frozen: the pyramid and the head are trained.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
         proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
 
@@ -92,16 +77,14 @@ def train_detector(
         )
     if proximal > 0.0 and anchor is None:
         raise ValueError(f"train_detector: proximal {proximal} wants its anchor theta_0, got None")
-    backbone, trainable = detector.split(params)
-    targets = detector.assign(images.boxes, images.labels)
-    if trainable_only:
-        learned, fixed = trainable, backbone
-        inputs = cached_features(detector, backbone, images.images)
+    if isinstance(images, CachedSet):
+        fixed, learned = detector.split(params)
+        inputs, targets = images.features, images.targets
     else:
         names = set(detector.learnable(params))
         learned = {name: value for name, value in params.items() if name in names}
         fixed = {name: value for name, value in params.items() if name not in names}
-        inputs = (images.images,)
+        inputs, targets = (images.images,), detector.assign(images.boxes, images.labels)
     batches = Batches(inputs, targets, batch_size, generator)
     module = DetectorModule(
         detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction,

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.detector.losses import proximal_loss
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
 from neural_sim.solver.damping import Damped
@@ -177,8 +178,4 @@ def _relative_change(before: Mapping[str, MixedDerivative], after: Mapping[str, 
 def proximal_term(proximal: float, anchor: Params) -> Term:
     """``proximal / 2 |theta - anchor|^2``: with it, ``(H + proximal I)^-1`` is the inner problem's exact derivative."""
 
-    def term(params: Params) -> Tensor:
-        squares = [(params[name] - anchor[name].detach()).square().sum() for name in params]
-        return 0.5 * proximal * torch.stack(squares).sum()
-
-    return CompositeTerm(lambda params: params, term)
+    return CompositeTerm(lambda params: params, lambda params: proximal_loss(params, anchor, proximal))

@@ -99,10 +99,10 @@ class SimulatorModule(pl.LightningModule):
             images = join(rendered)
         with _timed(seconds, "probes"):
             self._draw_probes()
-        with _timed(seconds, "train"):
-            training_loss = self._train(images)
         with _timed(seconds, "features"):
             cached = CachedSet.of(self.detector, self._backbone, images)
+        with _timed(seconds, "train"):
+            training_loss = self._train(cached)
         with _timed(seconds, "hypergradient"):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
@@ -141,7 +141,7 @@ class SimulatorModule(pl.LightningModule):
             part *= self.settings.trust.shrink
         self.psi.data = self.psi + part * (distribution.join(moved) - self.psi)
 
-    def _train(self, images: LabelledImages) -> float:
+    def _train(self, images: CachedSet) -> float:
         if self.settings.epochs == 0:
             return math.nan
         self.theta, history = train_detector(
@@ -154,7 +154,6 @@ class SimulatorModule(pl.LightningModule):
             learning_rate=self.settings.learning_rate,
             # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
             weight_decay=0.0 if self.detector.proximal > 0.0 else self.weight_decay,
-            trainable_only=True,
             proximal=self.detector.proximal,
             anchor=self._warm_start,
         )
