@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neural_sim import codec
+from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
 from neural_sim.cameras import orbit
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
@@ -19,7 +20,10 @@ from neural_sim.experiment import Account, Experiment
 from neural_sim.field.base import RadianceField
 from neural_sim.field.training import field_from_state, field_state
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.outer.module import SimulatorModule, learn_psi
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import OuterLoop, learn_psi
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.renderer.views import choose_mesh_renderer, render_views
 from neural_sim.store import Store, code_version, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
@@ -214,26 +218,33 @@ class Artifacts:
         return self._fetch(stage, "detector", what, key, lambda: self._train_cold(psi, epochs))
 
     def learned(self) -> dict[str, Any]:
-        """psi after the loop (``last``, ``best``) and its records; the initial psi where nothing is optimised."""
-        initial = self.psi("initial")
-        if not self.x.optimise:
-            return {"last": initial, "best": initial, "records": []}
+        """psi before and after every iteration of the method (``trajectory``), and the iterations' records."""
+        method = self.x.baseline
+        if isinstance(method, Fixed):
+            return {"trajectory": self.psi(method.which)[None], "records": []}
 
         def make() -> Any:
-            module = SimulatorModule(
-                self.scene, self.detector, self.warm_start(), initial, self.targets["val"], self.x.outer,
-                self.x.gradient, self.x.solver, self.x.training.batch_size, self.x.training.weight_decay,
-                self._generator(2),
-            )  # fmt: skip
-            found = learn_psi(module, self.x.progress)
+            found = learn_psi(self._loop(method), self.x.progress)
             records = [dataclasses.asdict(record) for record in found.records]
-            return {"last": found.last, "best": found.best, "records": records}
+            return {"trajectory": found.trajectory, "records": records}
 
+        groups = ["target", "outer"]
+        groups += ["gradient", "solver"] if isinstance(method, HypergradientLoop) else ["baseline"]
         key = {
-            "warm_start": self._trained_key(initial), **self._config("target", "outer", "gradient", "solver"),
-            "code": code_version("outer", "gradient", "solver", "parameter/update"),
+            "warm_start": self._trained_key(self.psi("initial")), **self._config(*groups),
+            "code": code_version("outer", "gradient", "solver", "baseline", "parameter/update"),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
+
+    def _loop(self, method: HypergradientLoop | RewardMethod) -> OuterLoop:
+        training, searched = self.x.training, not isinstance(method, HypergradientLoop)
+        inner = InnerLoop(
+            self.scene, self.detector, self.warm_start(), self.targets["val"], self.x.outer, training.batch_size,
+            training.weight_decay, self._generator(2), None if searched else self.x.gradient.relaxed,
+        )  # fmt: skip
+        if isinstance(method, HypergradientLoop):
+            return SimulatorModule(inner, self.psi("initial"), self.x.gradient, self.x.solver)
+        return RewardLoop(inner, self.psi("initial"), method)
 
     def training_images(self, psi: Tensor) -> list[RenderedObject]:
         """The images that the scored detector trained on, drawn again from the same seed."""
@@ -254,4 +265,19 @@ class Artifacts:
 
     def compared(self) -> dict[str, Tensor]:
         """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
-        return {"ns": self.psi("initial"), "learned": self.learned()["last"], "matched": self.psi("target")}
+        return {
+            "ns": self.psi("initial"),
+            "learned": self.learned()["trajectory"][-1],
+            "matched": self.psi("target"),
+        }
+
+    def scored_iterations(self) -> dict[int, Tensor]:
+        """psi at the method's start, after the iterations of ``score_at``, and at its end, by iterations done."""
+        trajectory = self.learned()["trajectory"]
+        last = len(trajectory) - 1
+        asked = sorted({0, last, *(i for i in self.x.score_at if i <= last)})
+        return {i: trajectory[i] for i in asked}
+
+    def on_the_way(self) -> dict[str, Tensor]:
+        """What :meth:`scored_iterations` adds to :meth:`compared`, by a name for the log."""
+        return {f"psi after {i} iterations": psi for i, psi in self.scored_iterations().items()}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
 from neural_sim.detector.retinanet import Detector
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
@@ -23,9 +24,8 @@ class Experiment:
     """All parts of a run, built and validated; ``config`` is what they were built from, for keys and reports."""
 
     name: str
-    method: str
-    optimise: bool
     seed: int
+    score_at: tuple[int, ...]
     stages: tuple[str, ...]
     store: Path
     mlflow: str
@@ -43,6 +43,7 @@ class Experiment:
     outer: Outer
     solver: AdjointSolver
     gradient: Estimator
+    baseline: Fixed | HypergradientLoop | RewardMethod
     config: dict[str, Any]
 
 

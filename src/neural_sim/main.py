@@ -33,7 +33,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _log = logging.getLogger(__name__)
 
 # Groups whose mapping names a class or function (``_target_``); the rest are plain settings.
-_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver")
+_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "baseline")
 _SETTINGS = ("gradient", "outer", "training")
 
 
@@ -69,9 +69,8 @@ def build(config: DictConfig) -> Experiment:
         raise UserError("parameter: want at least one of pose, zoom, got none")
     return Experiment(
         name=plain["name"],
-        method=plain["baseline"]["name"],
-        optimise=plain["baseline"]["optimise"],
         seed=plain["seed"],
+        score_at=tuple(plain["score_at"]),
         stages=tuple(plain["stages"]),
         store=Path(plain["paths"]["store"]),
         mlflow=plain["paths"]["mlflow"],
@@ -128,6 +127,11 @@ def _check_top(plain: Mapping[str, Any]) -> None:
     for stage in plain["stages"]:
         if stage not in STAGES:
             raise UserError(f"stages: unknown stage {stage!r}, want some of {', '.join(STAGES)}")
+    whole = isinstance(plain["score_at"], list) and all(
+        type(at) is int and at >= 0 for at in plain["score_at"]
+    )
+    if not whole:
+        raise UserError(f"score_at must be a list of iterations from 0, got {plain['score_at']!r}")
     if not isinstance(plain["progress"], bool):
         raise UserError(f"progress must be true or false, got {plain['progress']!r}")
     if plain["trainer"]["accelerator"] not in ("cpu", "gpu"):

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -15,12 +16,12 @@ from neural_sim.artifacts import Artifacts
 from neural_sim.experiment import Experiment
 from neural_sim.report.run import (
     RunResults,
-    track,
     write_detections,
     write_figures,
     write_results,
     write_training_set,
 )
+from neural_sim.report.run_tracking import track
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.synthesis.scene import join
 
@@ -54,9 +55,8 @@ class Pipeline:
         elif name == "psi":
             self.made.learned()
         elif name == "evaluate":
-            for what, psi in tqdm(
-                self.made.compared().items(), desc=name, disable=not self.x.progress, leave=False
-            ):
+            scored = {**self.made.compared(), **self.made.on_the_way()}
+            for what, psi in tqdm(scored.items(), desc=name, disable=not self.x.progress, leave=False):
                 self.made.scores(psi, what)
 
     def results(self) -> RunResults:
@@ -64,7 +64,7 @@ class Pipeline:
         learned = self.made.learned()
         psi = {
             "initial": self.made.psi("initial"),
-            "learned": learned["last"],
+            "learned": learned["trajectory"][-1],
             "target": self.made.psi("target"),
         }
         evaluated = "evaluate" in self.x.stages
@@ -75,7 +75,7 @@ class Pipeline:
         )
         return RunResults(
             experiment=self.x.name,
-            method=self.x.method,
+            method=self.x.baseline.name,
             seed=self.x.seed,
             names=self.made.names,
             biased=self.x.distribution.biased,
@@ -87,16 +87,34 @@ class Pipeline:
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             left_out=self.made.account.left_out,
             config=self.x.config,
+            curve=self.curve() if evaluated else (),
             symmetric_bins=self.made.symmetric_bins,
         )
+
+    def curve(self) -> list[dict[str, Any]]:
+        """What the method had spent, and what its psi was worth, at its start, on the way as asked, and at its end."""
+        learned = self.made.learned()
+        records = learned["records"]
+        points = []
+        for iteration, psi in self.made.scored_iterations().items():
+            spent = {
+                key: sum(record[key] for record in records[:iteration])
+                for key in ("images", "detector_steps", "products")
+            }
+            seconds = sum(_iteration_seconds(record) for record in records[:iteration])
+            ap = self.made.scores(psi, f"psi after {iteration} iterations")["ap"]
+            points.append({"iteration": iteration, **spent, "seconds": seconds, "ap": ap})
+        return points
 
     def report(self, folder: Path) -> None:
         """Figures, the final training set, results.json, MLflow."""
         results = self.results()
-        drawn = self.made.training_images(self.made.learned()["last"])
+        drawn = self.made.training_images(self.made.learned()["trajectory"][-1])
         test = self.made.targets["test"]
         detections = (
-            self.made.scores(self.made.learned()["last"], "learned")["detections"] if results.ap else []
+            self.made.scores(self.made.learned()["trajectory"][-1], "learned")["detections"]
+            if results.ap
+            else []
         )
         write_figures(results, join(drawn), test, detections, folder / "figures")
         write_training_set(drawn, self.made.names, folder / "training_set")
@@ -108,6 +126,11 @@ class Pipeline:
         track(results, uri, folder)
         print(results.summary())
         print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
+
+
+def _iteration_seconds(record: dict[str, Any]) -> float:
+    """A record's seconds; parts of the hypergradient are parts of a phase that is counted already."""
+    return sum(spent for phase, spent in record["seconds"].items() if not phase.startswith("hypergradient_"))
 
 
 def run(experiment: Experiment, folder: Path) -> float | None:

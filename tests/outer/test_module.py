@@ -9,23 +9,21 @@ import torch
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector
-from neural_sim.field.grid import GridField
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.outer.binding import bound_losses, object_images
-from neural_sim.outer.module import SimulatorModule, learn_psi
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import Outer, Trust
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
-from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import RelaxedDraws, Scene, join
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.scene import RelaxedDraws, join
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
@@ -40,38 +38,18 @@ PROXIMAL = 20.0  # past the negative curvature of an untrained detector
 NOTHING_WILL_DO = Trust(min_signal_to_noise=math.inf)
 
 
-def _block(seed):
-    field = GridField().eval()
-    field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
-    noise = torch.randn(field.table.shape, generator=torch.Generator().manual_seed(seed))
-    with torch.no_grad():
-        field.table.copy_(noise + 1.0)
-    return field.requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def scene():
-    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-    return Scene(
-        ("a", "b"),
-        (_block(1), _block(2)),
-        NerfRenderer(),
-        CAMERA,
-        synthesizer,
-        SceneDistribution.of([Pose(bins=4)]),
-    )
-
-
 def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
     generator = torch.Generator().manual_seed(0)
     detector = Detector(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
     validation = join(scene.training_set(psi, 3, generator))
-    return SimulatorModule(
-        scene, detector, detector.init(generator), psi, validation,
-        Outer(Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer),
-        estimator, solver, batch_size=4, weight_decay=0.0, generator=generator,
-    )  # fmt: skip
+    settings = Outer(
+        Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer
+    )
+    inner = InnerLoop(
+        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.relaxed
+    )
+    return SimulatorModule(inner, psi, estimator, solver)
 
 
 ESTIMATORS = [
@@ -103,9 +81,11 @@ def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
 
 def test_the_backbone_stays_frozen(scene):
     module = _module(scene, ReinforceEstimator())
-    before = {name: value.clone() for name, value in module.detector.split(module.theta)[0].items()}
+    before = {
+        name: value.clone() for name, value in module.inner.detector.split(module.inner.theta)[0].items()
+    }
     learn_psi(module, False)
-    after = module.detector.split(module.theta)[0]
+    after = module.inner.detector.split(module.inner.theta)[0]
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
@@ -192,7 +172,7 @@ def test_straight_through_images_are_those_of_hard_draws(scene):
 
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
     for mode, carried in (("forward", True), ("reverse", False)):
-        drawn = _module(scene, PathwiseEstimator(mode=mode))._draw_images()
+        drawn = _module(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))
         assert all((part.tangents is not None) is carried for part in drawn)
 
 

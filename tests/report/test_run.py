@@ -7,7 +7,8 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.report import tracking
-from neural_sim.report.run import RunResults, track, write_figures, write_results
+from neural_sim.report.run import RunResults, write_figures, write_results
+from neural_sim.report.run_tracking import track
 from neural_sim.types import LabelledImages
 
 
@@ -18,7 +19,7 @@ def results():
     record = {
         "probabilities": {"pose": uniform.tolist()}, "entropies": {"pose": [1.0, 1.0]}, "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
-        "images_without_box": 3,
+        "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
             "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "action": "shrunk",

@@ -116,7 +116,7 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """How many of the recorded steps were not trusted, why, what was done, and every cosine that was measured."""
-    held = [record["certificate"] for record in records]
+    held = [record["certificate"] for record in records if record["certificate"]]
     doubted = [certificate for certificate in held if certificate["doubts"]]
     return {
         "steps": len(held),

@@ -1,8 +1,8 @@
-"""What the psi loop leaves: one record an iteration, and the distributions it found."""
+"""What an outer loop leaves: one record an iteration, and the distributions it went through."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
@@ -13,22 +13,40 @@ from neural_sim.outer.certificate import Certificate
 @dataclass(frozen=True)
 class IterationRecord:
     """What one outer iteration did; probabilities, by factor and object, are those the images were drawn from, before
-    the step."""
+    the step.
+
+    ``images`` are the labelled images made in it, probes included, ``detector_steps`` the optimiser steps and
+    ``products`` the Hessian products spent. ``certificate`` is None for methods without a hypergradient.
+    """
 
     probabilities: dict[str, list[list[float]]]
     entropies: dict[str, list[float]]
     gradient_norms: list[float]
     validation_loss: float
     training_loss: float
-    certificate: Certificate
+    certificate: Certificate | None
+    images: int
+    detector_steps: int
+    products: int
     images_without_box: int
     seconds: dict[str, float]
 
 
 @dataclass(frozen=True)
 class LearnedPsi:
-    """The loop's outcome. ``last`` is what the method reports; ``best`` had the lowest validation loss."""
+    """The loop's outcome. ``trajectory`` is psi before the first iteration and after each: its last is what the
+    method reports."""
 
-    last: Float[Tensor, "objects K"]
-    best: Float[Tensor, "objects K"]
-    records: list[IterationRecord] = field(default_factory=list)
+    trajectory: Float[Tensor, "iterations+1 objects K"]
+    records: list[IterationRecord]
+
+    @property
+    def last(self) -> Float[Tensor, "objects K"]:
+        """What the method reports."""
+        return self.trajectory[-1]
+
+    @property
+    def best(self) -> Float[Tensor, "objects K"]:
+        """The psi whose images trained the detector of lowest validation loss."""
+        losses = [record.validation_loss for record in self.records]
+        return self.trajectory[losses.index(min(losses))] if losses else self.trajectory[0]

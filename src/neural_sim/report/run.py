@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: results.json, figures, the final training set in COCO form; and in MLflow."""
+"""What a run leaves in its folder: results.json, figures, the final training set in COCO form."""
 
 from __future__ import annotations
 
@@ -16,22 +16,19 @@ from torch import Tensor
 from neural_sim.cameras import orbit
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import total_variation
-from neural_sim.report import figures, tracking
+from neural_sim.report import figures
 from neural_sim.synthesis.export import write_coco
 from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
-_CERTIFIED = (
-    "stationarity", "solver_steps", "solver_residual", "damping", "curvature_min", "curvature_max", "condition",
-    "sensitivity", "cosine",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class RunResults:
     """Everything the report shows. ``probabilities`` are those of initial, learned and target, by factor, [objects, k];
-    ``ap`` maps ns, learned, matched to scores.
+    ``ap`` maps ns, learned, matched to scores. ``curve`` has what the method had spent (images, detector_steps,
+    products, seconds) and what its psi was worth (``ap``) at every iteration that was scored.
 
     ``symmetric_bins`` groups bins (from 1), by object and angle, whose views an object's symmetry makes the same.
     """
@@ -49,6 +46,7 @@ class RunResults:
     peak_memory_mb: float
     left_out: Sequence[Mapping[str, str]]
     config: Mapping[str, Any]
+    curve: Sequence[Mapping[str, Any]] = ()
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
@@ -70,6 +68,7 @@ class RunResults:
                 "total_variation": self.total_variations(),
                 "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
+                "curve": list(self.curve),
                 "certificates": untrusted(self.records),
                 "images_without_box": self.images_without_box(),
                 "iterations": list(self.records),
@@ -211,56 +210,6 @@ def _rows(images: Sequence[Mapping[str, Tensor]]) -> list[dict[str, Any]]:
             row = {"image_id": index, "category_id": label + 1, "bbox": [x0, y0, x1 - x0, y1 - y0]}
             rows.append({**row, "score": round(score, 5)})
     return rows
-
-
-def track(results: RunResults, uri: str, folder: Path) -> str:
-    """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
-    metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}
-    metrics["peak_memory_mb"] = results.peak_memory_mb
-    for which, scores in results.ap.items():
-        metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
-        metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
-    for name, factors in results.total_variations().items():
-        for factor, distances in factors.items():
-            metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
-    return tracking.log_run(
-        uri,
-        results.experiment,
-        f"{results.method} seed {results.seed}",
-        {
-            "method": results.method,
-            "seed": str(results.seed),
-            "parameter": ",".join(results.config["parameter"]),
-            "biased": ",".join(results.biased),
-        },
-        tracking.flatten(results.config),
-        metrics,
-        _series(results),
-        folder,
-    )
-
-
-def _series(results: RunResults) -> dict[str, list[float]]:
-    series: dict[str, list[float]] = {}
-    for record in results.records:
-        for i, name in enumerate(results.names):
-            for factor, probabilities in record["probabilities"].items():
-                for b, p in enumerate(probabilities[i]):
-                    series.setdefault(f"psi/{name}/{factor}/bin_{b + 1}", []).append(p)
-                series.setdefault(f"psi/{name}/{factor}/entropy", []).append(record["entropies"][factor][i])
-            series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
-            for b, ratio in enumerate(record["certificate"]["signal_to_noise"][i]):
-                series.setdefault(f"psi/{name}/signal_to_noise_{b + 1}", []).append(ratio)
-        for key in ("validation_loss", "training_loss"):
-            series.setdefault(f"psi/{key}", []).append(record[key])
-        for key in _CERTIFIED:
-            series.setdefault(f"psi/{key}", []).append(record["certificate"][key])
-        for phase, spent in record["seconds"].items():
-            series.setdefault(f"psi/seconds_{phase}", []).append(spent)
-    for name, history in results.fields.items():
-        for key in ("psnr", "ssim"):
-            series[f"field/{name}/{key}"] = [row[key] for row in history if key in row]
-    return series
 
 
 def _spread(images: LabelledImages, count: int) -> Tensor:

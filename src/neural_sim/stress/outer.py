@@ -12,7 +12,9 @@ from torch import Tensor
 
 from neural_sim.detector.retinanet import Detector
 from neural_sim.gradient.base import MixedDerivative
-from neural_sim.outer.module import SimulatorModule, learn_psi
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
@@ -201,7 +203,8 @@ def loop(scope: Scope) -> Checks:
     for value, choice in trials if scope.full else trials[:2]:
         learned = learn_psi(_module(Constant(value), choice, iterations, scope), progress=False)
         moved = float(learned.last.abs().max())
-        status = learned.records[0].certificate.action
+        certificate = learned.records[0].certificate
+        status = certificate.action if certificate else ""
         wanted = (actions[choice],) if not math.isfinite(value) else ()
         bound = iterations * MAX_STEP * (1 + 4 * eps(DOUBLE)) if value == 1e30 else 0.0
         yield Check(f"psi moved: estimate {value:g}, {choice}", moved, bound, status, wanted)
@@ -226,8 +229,10 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
         Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
         on_untrusted=choice,
     )  # fmt: skip
+    inner = InnerLoop(scene, network, network.init(generator), validation, settings, 3, 0.0, generator)
     return SimulatorModule(
-        scene, network, network.init(generator), psi, validation, settings,
+        inner,
+        psi,
         estimator,  # pyright: ignore[reportArgumentType]  (stands in for the estimators of conf/gradient)
-        AdjointSolver(max_steps=4), batch_size=3, weight_decay=0.0, generator=generator,
-    )  # fmt: skip
+        AdjointSolver(max_steps=4),
+    )

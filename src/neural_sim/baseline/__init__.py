@@ -1,0 +1,1 @@
+"""Methods to compare with: each chooses distributions of training images without the hypergradient."""

@@ -1,0 +1,72 @@
+"""What the outer loop asks of a method that sees rewards only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.parameter.product import SceneDistribution
+
+Draws = Sequence[Int[Tensor, "n factors"]]
+"""The bins of the images drawn from an asked psi, object by object."""
+
+
+class Search(Protocol):
+    """A run of such a method: psi is asked for, a detector trained on its images, and its reward told."""
+
+    @property
+    def psi(self) -> Float[Tensor, "objects K"]:
+        """What the method would report now."""
+        ...
+
+    def ask(self) -> Float[Tensor, "objects K"]:
+        """The psi whose images come next."""
+        ...
+
+    def tell(self, reward: float, draws: Draws) -> None:
+        """The reward of a detector trained on images of the psi last asked for; larger is better."""
+        ...
+
+
+class RewardMethod(Protocol):
+    """A configured method. ``rounds`` of draw, train and reward are made for each outer iteration of the budget."""
+
+    name: str
+    rounds: int
+
+    def begin(
+        self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
+    ) -> Search:
+        """Start at ``psi``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """No optimisation: images from the initial distribution (``ns``, the paper's NS) or the target's (``oracle``)."""
+
+    name: str
+    which: Literal["initial", "target"]
+
+    def __post_init__(self) -> None:
+        if self.which not in ("initial", "target"):
+            raise ValueError(f"baseline.which must be initial or target, got {self.which!r}")
+
+
+@dataclass(frozen=True)
+class HypergradientLoop:
+    """psi moves by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
+
+    name: str
+
+
+def positive(**values: float) -> None:
+    """Raises ``ValueError`` for a value that is not positive, by its key."""
+    for key, value in values.items():
+        if not value > 0:
+            raise ValueError(f"baseline.{key} must be positive, got {value}")

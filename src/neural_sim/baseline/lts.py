@@ -1,0 +1,100 @@
+"""Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the validation reward.
+
+The policy is p_psi, an action is a whole training set, its reward what a detector trained on it scores on the target
+set. One number tells all objects and bins how they did, so that thousands of rounds stand where one hypergradient does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.base import Draws, positive
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.update import bound
+
+
+@dataclass(frozen=True)
+class LearningToSimulate:
+    """Ascent along ``(R - b) d log p(training set) / d psi`` with a moving average b of past rewards.
+
+    Args:
+        name: in reports.
+        learning_rate: logits a step at an advantage of one standard deviation of past rewards.
+        decay: of the moving averages of the reward and of its square.
+        max_step: largest change of a logit a step.
+        rounds: training sets for each outer iteration of the budget; two take about the seconds of one hypergradient.
+
+    Raises:
+        ValueError: any of these out of its range.
+    """
+
+    name: str = "lts"
+    learning_rate: float = 0.5
+    decay: float = 0.8
+    max_step: float = 1.0
+    rounds: int = 2
+
+    def __post_init__(self) -> None:
+        positive(learning_rate=self.learning_rate, max_step=self.max_step, rounds=self.rounds)
+        if not 0.0 <= self.decay < 1.0:
+            raise ValueError(f"baseline.decay must lie in [0, 1), got {self.decay}")
+
+    def begin(
+        self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
+    ) -> Policy:
+        """A policy that starts at ``psi``."""
+        return Policy(self, distribution, psi.detach().clone())
+
+
+class Policy:
+    """See :class:`LearningToSimulate`; the first reward only sets the moving average."""
+
+    def __init__(
+        self, settings: LearningToSimulate, distribution: SceneDistribution, psi: Float[Tensor, "objects K"]
+    ) -> None:
+        self._settings, self._distribution, self._psi = settings, distribution, psi
+        self._mean, self._variance, self._told = 0.0, 0.0, 0
+
+    @property
+    def psi(self) -> Float[Tensor, "objects K"]:
+        return self._psi
+
+    def ask(self) -> Float[Tensor, "objects K"]:
+        return self._psi
+
+    def tell(self, reward: float, draws: Draws) -> None:
+        advantage = self._advantage(reward)
+        if advantage == 0.0:
+            return
+        slope = torch.stack(
+            [score(self._distribution, psi, bins) for psi, bins in zip(self._psi, draws, strict=True)]
+        )
+        # A sum of n scores has a spread of sqrt(n): taken out, so that the rate is in logits.
+        size = max(len(draws[0]), 1) ** 0.5
+        step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)
+        moved = {name: bound(part, self._settings.max_step) for name, part in step.items()}
+        self._psi = self._psi + self._distribution.join(moved)
+
+    def _advantage(self, reward: float) -> float:
+        """``R - b`` by the running standard deviation of rewards; then b moves on."""
+        above, rest = reward - self._mean, 1.0 - self._settings.decay
+        self._told += 1
+        if self._told == 1:
+            self._mean = reward
+            return 0.0
+        # The first difference is the only measure of spread that there is.
+        self._variance = above**2 if self._told == 2 else (1.0 - rest) * (self._variance + rest * above**2)
+        self._mean += rest * above
+        return above / self._variance**0.5 if self._variance > 0.0 else 0.0
+
+
+def score(distribution: SceneDistribution, psi: Float[Tensor, "K"], bins: Tensor) -> Float[Tensor, "K"]:
+    """``d log p(bins) / d psi`` of independent draws together."""
+    leaf = psi.detach().requires_grad_()
+    with torch.enable_grad():
+        total = distribution.log_prob(leaf, bins).sum()
+    return torch.autograd.grad(total, leaf)[0]

@@ -1,0 +1,128 @@
+"""Search over distributions by the validation reward alone: at random, or by Bayesian optimisation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.base import Draws, positive
+from neural_sim.parameter.product import SceneDistribution
+
+
+class Incumbent:
+    """The best psi told of so far; psi asked for is the initial one first, then what :meth:`propose` makes."""
+
+    def __init__(self, psi: Float[Tensor, "objects K"]) -> None:
+        self._best, self._asked, self._reward, self._told = psi, psi, -math.inf, 0
+
+    @property
+    def psi(self) -> Float[Tensor, "objects K"]:
+        return self._best
+
+    def ask(self) -> Float[Tensor, "objects K"]:
+        self._asked = self._best if self._told == 0 else self.propose()
+        return self._asked
+
+    def tell(self, reward: float, draws: Draws) -> None:
+        self._told += 1
+        if reward > self._reward:
+            self._best, self._reward = self._asked, reward
+
+    def propose(self) -> Float[Tensor, "objects K"]:
+        """The next psi to try."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class RandomSearch:
+    """p of every object and factor uniform over the simplex; the best reward is reported.
+
+    Raises:
+        ValueError: a number of rounds that is not positive.
+    """
+
+    name: str = "random_search"
+    rounds: int = 2
+
+    def __post_init__(self) -> None:
+        positive(rounds=self.rounds)
+
+    def begin(
+        self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
+    ) -> Incumbent:
+        """A search whose first trial is ``psi``."""
+        return _Random(distribution, psi.detach().clone(), generator)
+
+
+class _Random(Incumbent):
+    def __init__(
+        self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
+    ) -> None:
+        super().__init__(psi)
+        self._distribution, self._generator = distribution, generator
+
+    def propose(self) -> Float[Tensor, "objects K"]:
+        parts = {}
+        for factor in self._distribution.factors:
+            empty = torch.empty(len(self.psi), factor.bins, dtype=torch.float64)
+            spacings = empty.exponential_(generator=self._generator)
+            parts[factor.name] = factor.logits(spacings / spacings.sum(-1, keepdim=True))
+        return self._distribution.join(parts).to(self.psi)
+
+
+@dataclass(frozen=True)
+class BayesOpt:
+    """Tree-structured Parzen estimators (Bergstra et al. 2011) over the logits, by Optuna's ask and tell.
+
+    ``reach`` is the range of every logit about 0. Optuna is imported only when a run begins.
+
+    Raises:
+        ValueError: a reach or number of rounds that is not positive.
+    """
+
+    name: str = "bayes_opt"
+    reach: float = 3.0
+    rounds: int = 2
+
+    def __post_init__(self) -> None:
+        positive(reach=self.reach, rounds=self.rounds)
+
+    def begin(
+        self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
+    ) -> Incumbent:
+        """A search whose first trial is ``psi``."""
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        sampler = optuna.samplers.TPESampler(seed=generator.initial_seed() % 2**32)
+        study = optuna.create_study(direction="maximize", sampler=sampler)
+        return _Bayes(self.reach, study, psi.detach().clone())
+
+
+class _Bayes(Incumbent):
+    def __init__(self, reach: float, study: Any, psi: Float[Tensor, "objects K"]) -> None:
+        super().__init__(psi)
+        self._reach, self._study = reach, study
+        start = psi.clamp(-reach, reach).flatten().tolist()
+        study.enqueue_trial({f"psi_{i}": value for i, value in enumerate(start)})
+        self._trial: Any = None
+
+    def ask(self) -> Float[Tensor, "objects K"]:
+        self._asked = self.propose()
+        return self._asked
+
+    def propose(self) -> Float[Tensor, "objects K"]:
+        self._trial = self._study.ask()
+        values = [
+            self._trial.suggest_float(f"psi_{i}", -self._reach, self._reach) for i in range(self.psi.numel())
+        ]
+        return torch.tensor(values, dtype=self.psi.dtype).view_as(self.psi)
+
+    def tell(self, reward: float, draws: Draws) -> None:
+        super().tell(reward, draws)
+        self._study.tell(self._trial, reward)

@@ -1,0 +1,101 @@
+"""What all methods share: images drawn from p_psi, a detector trained on them, its loss on the target set."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.training import train_detector
+from neural_sim.settings import Outer
+from neural_sim.synthesis.pool import ImagePool
+from neural_sim.synthesis.scene import RelaxedDraws, RenderedObject, Scene
+from neural_sim.types import LabelledImages
+
+
+@contextmanager
+def timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
+    """Add the seconds spent inside to those of a phase."""
+    begin = time.perf_counter()
+    yield
+    seconds[phase] = seconds.get(phase, 0.0) + time.perf_counter() - begin
+
+
+class InnerLoop:
+    """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
+
+    The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each
+    time. ``validation`` is the labelled target set; no step sees any other real image. ``relaxed`` says how the
+    pathwise estimator wants images drawn; those are always rendered anew, all others from a pool of every bin.
+    ``images`` and ``steps`` count the labelled images made and the detector's optimiser steps.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        detector: Detector,
+        params: Parameters,
+        validation: LabelledImages,
+        settings: Outer,
+        batch_size: int,
+        weight_decay: float,
+        generator: torch.Generator,
+        relaxed: RelaxedDraws | None = None,
+    ) -> None:
+        self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
+        self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
+        self.backbone, self.warm_start = detector.split(params)
+        self.validation = CachedSet.of(detector, self.backbone, validation)
+        self.relaxed = relaxed
+        self.pool: ImagePool | None = None
+        begun = time.perf_counter()
+        if settings.pool_per_bin and not relaxed:
+            self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
+        self.pool_seconds = time.perf_counter() - begun
+        self._start = params if settings.start == "warm" else {**detector.init(generator), **self.backbone}
+        self.images = self.steps = 0
+
+    @property
+    def trainable(self) -> Parameters:
+        """The trained part of theta."""
+        return self.detector.split(self.theta)[1]
+
+    def draw(self, psi: Float[Tensor, "objects K"]) -> list[RenderedObject]:
+        """An iteration's training images of every object."""
+        count, labels = self.settings.images_per_object, range(len(self.scene.names))
+        self.images += count * len(labels)
+        if self.pool is None:
+            return self.scene.training_set(psi, count, self.generator, self.relaxed)
+        return [self.pool.draw(label, psi[label], count, self.generator) for label in labels]
+
+    def train(self, images: CachedSet) -> float:
+        """Train theta on the images; returns the last epoch's loss, nan where there are no epochs."""
+        if self.settings.epochs == 0:
+            return math.nan
+        self.theta, history = train_detector(
+            self.detector,
+            self.theta if self.settings.start == "previous" else self._start,
+            images,
+            self.generator,
+            epochs=self.settings.epochs,
+            batch_size=self.batch_size,
+            learning_rate=self.settings.learning_rate,
+            # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
+            weight_decay=0.0 if self.detector.proximal > 0.0 else self.weight_decay,
+            proximal=self.detector.proximal,
+            anchor=self.warm_start,
+        )
+        self.steps += history.steps
+        return history.losses[-1]
+
+    @torch.no_grad()
+    def validation_loss(self) -> float:
+        """L_val at theta."""
+        return float(sum(term(self.trainable) for term in self.validation.mean_terms()))

@@ -1,0 +1,98 @@
+"""The frame of every outer loop: psi, what is recorded of an iteration, and the Trainer that runs it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+
+import lightning.pytorch as pl
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neural_sim.outer.certificate import Certificate, line
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.types import LabelledImages
+
+logger = logging.getLogger(__name__)
+
+
+class OuterLoop(pl.LightningModule):
+    """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
+
+    ``inner`` draws the images of an iteration and trains the detector on them. A subclass's ``training_step`` ends with
+    :meth:`record` and, after psi has moved, ``trajectory.append``.
+    """
+
+    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], rounds: int) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.inner, self.scene, self.settings, self.rounds = inner, inner.scene, inner.settings, rounds
+        self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
+        self.records: list[IterationRecord] = []
+        self.trajectory = [self.psi.detach().clone()]
+        self._counted = (0, 0)
+
+    def configure_optimizers(self) -> None:
+        return None
+
+    def train_dataloader(self) -> range:
+        return range(self.rounds)
+
+    def record(
+        self,
+        psi: Float[Tensor, "objects K"],
+        images: LabelledImages,
+        training_loss: float,
+        seconds: dict[str, float],
+        certificate: Certificate | None = None,
+        gradient_norms: list[float] | None = None,
+        products: int = 0,
+    ) -> IterationRecord:
+        """Keep what an iteration did with images drawn from ``psi``, before any step."""
+        p_by_factor = self.scene.distribution.probabilities(psi.detach())
+        done = (self.inner.images, self.inner.steps)
+        if not self.records:
+            seconds = {"pool": self.inner.pool_seconds, **seconds}
+        self.records.append(
+            IterationRecord(
+                probabilities={name: p.tolist() for name, p in p_by_factor.items()},
+                entropies={
+                    name: (-torch.special.xlogy(p, p).sum(-1)).tolist() for name, p in p_by_factor.items()
+                },
+                gradient_norms=gradient_norms or [],
+                validation_loss=self.inner.validation_loss(),
+                training_loss=training_loss,
+                certificate=certificate,
+                images=done[0] - self._counted[0],
+                detector_steps=done[1] - self._counted[1],
+                products=products,
+                images_without_box=int((~images.present.any(-1)).sum()),
+                seconds=seconds,
+            )
+        )
+        self._counted = done
+        number, last = len(self.records), self.records[-1]
+        if certificate is None:
+            logger.info("round %d/%d val %.4f", number, self.rounds, last.validation_loss)
+        else:
+            logger.info(line(certificate, number, self.rounds, last.validation_loss))
+        return last
+
+
+def learn_psi(module: OuterLoop, progress: bool) -> LearnedPsi:
+    """Run the loop to its budget through a Lightning Trainer that writes nothing."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="lightning")
+        trainer = pl.Trainer(
+            max_epochs=1,
+            accelerator="cpu" if module.psi.device.type == "cpu" else "gpu",
+            devices=1,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=progress,
+            enable_model_summary=False,
+        )
+        trainer.fit(module)
+    return LearnedPsi(torch.stack(module.trajectory), module.records)

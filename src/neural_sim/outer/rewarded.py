@@ -1,0 +1,36 @@
+"""The outer loop of methods that see nothing but a reward: draw, train, reward, tell."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.base import RewardMethod
+from neural_sim.detector.cached import CachedSet
+from neural_sim.outer.inner import InnerLoop, timed
+from neural_sim.outer.loop import OuterLoop
+from neural_sim.synthesis.scene import join
+
+
+class RewardLoop(OuterLoop):
+    """One training step is one round. The reward is minus the validation loss, which tells more than AP early on."""
+
+    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], method: RewardMethod) -> None:
+        super().__init__(inner, psi, method.rounds * inner.settings.iterations)
+        self.search = method.begin(inner.scene.distribution, self.psi.detach(), inner.generator)
+
+    def training_step(self, batch: int, batch_idx: int) -> None:
+        seconds: dict[str, float] = {}
+        asked = self.search.ask()
+        with timed(seconds, "render"):
+            rendered = self.inner.draw(asked)
+            images = join(rendered)
+        with timed(seconds, "features"):
+            cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+        with timed(seconds, "train"):
+            training_loss = self.inner.train(cached)
+        with timed(seconds, "reward"):
+            record = self.record(asked, images, training_loss, seconds)
+        self.search.tell(-record.validation_loss, [part.draw.bins for part in rendered])
+        self.psi.data = self.search.psi.clone()
+        self.trajectory.append(self.psi.detach().clone())

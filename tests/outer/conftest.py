@@ -1,0 +1,32 @@
+"""A scene of two small textured blocks, seen in four pose bins."""
+
+import math
+
+import pytest
+import torch
+
+from neural_sim.field.grid import GridField
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+
+def _block(seed):
+    field = GridField().eval()
+    field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
+    noise = torch.randn(field.table.shape, generator=torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        field.table.copy_(noise + 1.0)
+    return field.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+    distribution = SceneDistribution.of([Pose(bins=4)])
+    camera = PinholeCamera(32, 32, math.radians(40.0))
+    return Scene(("a", "b"), (_block(1), _block(2)), NerfRenderer(), camera, synthesizer, distribution)

@@ -1,0 +1,58 @@
+"""The loop of reward methods: rounds, what is counted, and that psi is the method's."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from neural_sim.baseline.lts import LearningToSimulate
+from neural_sim.baseline.search import RandomSearch
+from neural_sim.detector.retinanet import Detector
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.rewarded import RewardLoop
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.update import Mirror
+from neural_sim.settings import Outer
+from neural_sim.synthesis.scene import join
+
+
+@pytest.fixture
+def inner(scene):
+    generator = torch.Generator().manual_seed(0)
+    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    validation = join(scene.training_set(torch.zeros(2, 4), 3, generator))
+    settings = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
+    return lambda: InnerLoop(
+        scene, detector, detector.init(torch.Generator().manual_seed(1)), validation, settings, 4, 0.0,
+        torch.Generator().manual_seed(2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "method", [LearningToSimulate(rounds=3), RandomSearch(rounds=2)], ids=lambda m: m.name
+)
+def test_rounds_are_counted_and_the_trajectory_is_the_methods(inner, method):
+    loop = RewardLoop(inner(), torch.zeros(2, 4), method)
+    learned = learn_psi(loop, progress=False)
+    assert len(learned.records) == 2 * method.rounds and len(learned.trajectory) == len(learned.records) + 1
+    for record in learned.records:
+        assert (record.images, record.detector_steps, record.products) == (12, 3, 0)
+        assert record.certificate is None and record.seconds["train"] > 0.0
+    assert torch.equal(learned.last, loop.search.psi) and (learned.last != 0).any()
+
+
+def test_the_best_psi_is_that_of_the_lowest_validation_loss(inner):
+    learned = learn_psi(RewardLoop(inner(), torch.zeros(2, 4), RandomSearch(rounds=2)), progress=False)
+    losses = [record.validation_loss for record in learned.records]
+    p = learned.records[losses.index(min(losses))].probabilities["pose"]
+    factor = SceneDistribution.of([Pose(bins=4)]).factors[0]
+    torch.testing.assert_close(factor.log_probabilities(learned.last).exp(), torch.tensor(p).double())
+
+
+def test_psi_steps_do_not_touch_another_runs_settings(inner):
+    method = LearningToSimulate()
+    before = dataclasses.replace(method)
+    learn_psi(RewardLoop(inner(), torch.zeros(2, 4), method), progress=False)
+    assert method == before

@@ -1,0 +1,66 @@
+"""Every choice of every group makes an experiment: what the command line offers can be built."""
+
+import itertools
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.main import UserError, build, conf_directory
+
+CONF = conf_directory()
+BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
+PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]")
+EXPERIMENTS = sorted(
+    path.stem for path in (CONF / "experiment").glob("*.yaml") if path.stem != "stress" and "_ycb" not in path.stem
+)  # fmt: skip
+
+
+def experiment(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return build(compose("config", list(overrides)))
+
+
+@pytest.mark.parametrize(("baseline", "parameter"), itertools.product(BASELINES, PARAMETERS))
+def test_every_baseline_takes_every_parameter(baseline, parameter):
+    made = experiment(f"baseline={baseline}", f"parameter={parameter}")
+    assert made.baseline.name == ("neural_sim" if baseline == "none" else baseline)
+    assert ",".join(made.distribution.names) == parameter.strip("[]")
+
+
+@pytest.mark.parametrize(("name", "gap"), itertools.product(EXPERIMENTS, ("disjoint", "uniform", "same")))
+def test_every_experiment_has_biased_objects_at_every_gap(name, gap):
+    made = experiment(f"+experiment={name}", f"gap={gap}")
+    assert made.name == name and made.distribution.biased
+    names = list(made.distribution.biased)
+    initial, target = (made.distribution.psi(which, names) for which in ("initial", "target"))
+    equal = [bool((a - b).abs().max() < 1e-9) for a, b in zip(initial, target, strict=True)]
+    assert all(equal) if gap == "same" else not any(equal)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*_ycb.yaml")))
+def test_experiments_on_ycb_name_objects_that_exist(name, shared_data):
+    made = experiment(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}")
+    assert set(made.distribution.biased) <= set(made.objects.names())
+
+
+def test_auto_sim_differs_from_neural_sim_by_its_estimator_alone():
+    plain, auto_sim = experiment(), experiment("baseline=auto_sim")
+    assert isinstance(auto_sim.baseline, HypergradientLoop)
+    assert isinstance(plain.gradient, StratifiedEstimator) and isinstance(
+        auto_sim.gradient, ReinforceEstimator
+    )
+    for group in ("outer", "solver", "detector", "training", "parameter", "synthesis"):
+        assert plain.config[group] == auto_sim.config[group]
+
+
+def test_what_is_fixed_says_which_distribution():
+    kinds = {name: experiment(f"baseline={name}").baseline for name in ("ns", "oracle")}
+    assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}
+
+
+@pytest.mark.parametrize("override", ["score_at=3", "score_at=[-1]", "baseline.rounds=0", "gap=wide"])
+def test_bad_choices_are_refused_by_name(override):
+    with pytest.raises(UserError, match=override.split("=")[0].split(".")[-1]):
+        experiment("baseline=lts", "+experiment=zoom_gap", override)
