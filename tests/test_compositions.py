@@ -13,8 +13,9 @@ CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
 PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]")
 EXPERIMENTS = sorted(
-    path.stem for path in (CONF / "experiment").glob("*.yaml") if path.stem != "stress" and "_ycb" not in path.stem
-)  # fmt: skip
+    {path.stem for path in (CONF / "experiment").glob("*.yaml") if not path.stem.endswith("_ycb")}
+    - {"stress", "compare"}
+)
 
 
 def experiment(*overrides):

@@ -25,7 +25,7 @@ from neural_sim.outer.loop import OuterLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.renderer.views import choose_mesh_renderer, render_views
-from neural_sim.store import Store, code_version, tensor_digest
+from neural_sim.store import Store, code_version, digest, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
@@ -43,6 +43,7 @@ class Artifacts:
         self.x = experiment
         self.store = Store(experiment.store)
         self.account = Account()
+        self._held: dict[str, Any] = {}  # by kind and key, so that a result is read once
         self.names: list[str] = experiment.objects.names()
         self.device = torch.device("cuda" if experiment.accelerator == "gpu" else "cpu")
         unknown = set(experiment.distribution.biased) - set(self.names)
@@ -77,9 +78,12 @@ class Artifacts:
                 )
             return make()
 
-        entry = self.store.fetch(kind, key, make_if_asked)
-        self.account.note(stage, entry, what)
-        return entry.value
+        name = f"{kind} {digest(key)}"
+        if name not in self._held:
+            entry = self.store.fetch(kind, key, make_if_asked)
+            self.account.note(stage, entry, what)
+            self._held[name] = entry.value
+        return self._held[name]
 
     # --- views and fields: per object, shared by all runs ---
 

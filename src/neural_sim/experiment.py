@@ -47,13 +47,26 @@ class Experiment:
     config: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Omission:
+    """Work that a run does not do, and why. ``share`` is the part of that kind of work, ``seconds`` what it would
+    take, where they are known."""
+
+    stage: str
+    what: str
+    why: str
+    share: float | None = None
+    seconds: float | None = None
+
+
 @dataclass
 class Account:
     """What a run cost and what it did not have to do."""
 
     seconds: dict[str, float] = field(default_factory=dict)
-    left_out: list[dict[str, str]] = field(default_factory=list)
+    left_out: list[Omission] = field(default_factory=list)
 
     def note(self, stage: str, entry: Entry, what: str) -> None:
+        """Count a result that the store had."""
         if entry.found:
-            self.left_out.append({"stage": stage, "what": what, "why": "found in the store"})
+            self.left_out.append(Omission(stage, what, "found in the store", 1.0, entry.seconds))

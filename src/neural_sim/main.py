@@ -203,6 +203,8 @@ def _task(config: DictConfig) -> float | None:
     try:
         if "stress" in config:
             return _finish_stress(stress(config, folder), runtime.mode)
+        if "compare" in config:
+            return _compare(config, folder)
         experiment = build(config)
         from neural_sim.pipeline import run
 
@@ -213,6 +215,15 @@ def _task(config: DictConfig) -> float | None:
         _log.debug("details", exc_info=True)
         print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _compare(config: DictConfig, folder: Path) -> None:
+    """Compare finished runs, as conf/experiment/compare.yaml says."""
+    plain = _plain(config)
+    comparison = _instantiate(plain["compare"], "compare")
+    from neural_sim.report.tracking import tracking_uri
+
+    comparison.run(tracking_uri(plain["paths"]["mlflow"]), plain["seed"], plain, folder)
 
 
 def _finish_stress(failed: int, mode: RunMode | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import resource
 import time
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from neural_sim.artifacts import Artifacts
 from neural_sim.experiment import Experiment
+from neural_sim.plan import plan
 from neural_sim.report.run import (
     RunResults,
     write_detections,
@@ -85,7 +87,7 @@ class Pipeline:
             fields={name: self.made.field(name)["history"] for name in self.made.names},
             seconds=dict(self.made.account.seconds),
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            left_out=self.made.account.left_out,
+            left_out=[dataclasses.asdict(omission) for omission in self.made.account.left_out],
             config=self.x.config,
             curve=self.curve() if evaluated else (),
             symmetric_bins=self.made.symmetric_bins,
@@ -139,6 +141,10 @@ def run(experiment: Experiment, folder: Path) -> float | None:
     Returns the AP of the detector trained on the learned distribution, which a sweep may optimise; None without one.
     """
     pipeline = Pipeline(experiment)
+    pipeline.made.account.left_out += plan(experiment, len(pipeline.made.names))
+    for omission in pipeline.made.account.left_out:
+        share = "" if omission.share in (None, 1.0) else f" ({omission.share:.0%})"
+        _log.info("left out: %s%s: %s", omission.what, share, omission.why)
     for name in STAGES[:-1]:
         if name in experiment.stages:
             with pipeline.stage(name):
@@ -148,4 +154,4 @@ def run(experiment: Experiment, folder: Path) -> float | None:
             pipeline.report(folder)
     if "evaluate" not in experiment.stages:
         return None
-    return pipeline.made.scores(pipeline.made.learned()["last"], "learned")["ap"]["ap"]
+    return pipeline.made.scores(pipeline.made.learned()["trajectory"][-1], "learned")["ap"]["ap"]

@@ -21,7 +21,8 @@ METHOD_COLOURS = {"ns": "#c2c8cf", "learned": "#2f6db5", "matched": "#4c9f70"}
 CLASS_COLOURS = ("#2f6db5", "#e08a1e", "#4c9f70", "#b5417a", "#7b5cc4", "#b08d3c", "#3aa6b9", "#8c564b")
 
 
-def _style(axes: Any) -> None:
+def style(axes: Any) -> None:
+    """The quiet frame that all figures share."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -73,7 +74,7 @@ def psi_figure(
         axes.title.set_fontsize(9)
         ticks = np.unique(np.linspace(0, len(p) - 1, min(6, len(p))).astype(int))
         axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
-        _style(axes)
+        style(axes)
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
     figure.legend(
         handles, [str(b + 1) for b in range(bins)], loc="outside lower center", ncols=min(bins, 16),
@@ -102,7 +103,7 @@ def ap_figure(ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised:
     axes.set(ylabel="AP on the test set (%)", ylim=(0, 105))
     axes.yaxis.grid(color=GRID)
     axes.set_axisbelow(True)
-    _style(axes)
+    style(axes)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="trained on")
     return figure
 

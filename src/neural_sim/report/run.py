@@ -44,7 +44,7 @@ class RunResults:
     fields: Mapping[str, Sequence[Mapping[str, float]]]
     seconds: Mapping[str, float]
     peak_memory_mb: float
-    left_out: Sequence[Mapping[str, str]]
+    left_out: Sequence[Mapping[str, Any]]
     config: Mapping[str, Any]
     curve: Sequence[Mapping[str, Any]] = ()
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
@@ -63,6 +63,7 @@ class RunResults:
                 "experiment": self.experiment,
                 "method": self.method,
                 "seed": self.seed,
+                "gap": self.config.get("gap", "disjoint"),
                 "biased": list(self.biased),
                 "psi": psi,
                 "total_variation": self.total_variations(),
@@ -112,15 +113,26 @@ class RunResults:
             for which in ("initial", "learned"):
                 row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
                 lines.append(f"  {which:<18}{row}")
-        if self.records:
-            lines.append(_trust_line(untrusted(self.records)))
+        held = untrusted(self.records)
+        if held["steps"]:
+            lines.append(_trust_line(held))
         if self.images_without_box():
             lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
         lines.append(f"seconds: {spent}; peak memory {self.peak_memory_mb:.0f} MB")
         if self.left_out:
-            lines.append(f"left out: {len(self.left_out)} stage results found in the store")
+            lines.append(_left_out_line(self.left_out))
         return "\n".join(lines)
+
+
+def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
+    """Shares of the work that was spared, and what the store had."""
+    found = [o for o in left_out if o["why"] == "found in the store"]
+    parts = [f"{o['what']} {o['share']:.0%}" for o in left_out if o not in found and o["share"] is not None]
+    if found:
+        spared = sum(o["seconds"] for o in found)
+        parts.append(f"{len(found)} results found in the store ({spared:.0f} s)")
+    return "left out: " + ", ".join(parts)
 
 
 def _trust_line(held: Mapping[str, Any]) -> str:

@@ -28,18 +28,24 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
     return tracking.log_run(
         uri,
         results.experiment,
-        f"{results.method} seed {results.seed}",
+        _name(results),
         {
             "method": results.method,
             "seed": str(results.seed),
             "parameter": ",".join(results.config["parameter"]),
             "biased": ",".join(results.biased),
+            "gap": results.config.get("gap", "disjoint"),
         },
         tracking.flatten(results.config),
         metrics,
         _series(results),
         folder,
     )
+
+
+def _name(results: RunResults) -> str:
+    gap = results.config.get("gap", "disjoint")
+    return f"{results.method} seed {results.seed}" + ("" if gap == "disjoint" else f" gap {gap}")
 
 
 def _series(results: RunResults) -> dict[str, list[float]]:

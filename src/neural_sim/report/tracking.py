@@ -69,6 +69,27 @@ def log_run(
     return run_id
 
 
+def finished_folders(uri: str, experiment: str) -> list[Path]:
+    """Folders with the artifacts of an experiment's finished runs, the latest first.
+
+    Raises:
+        ValueError: no experiment of that name.
+    """
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from mlflow import MlflowClient
+
+        client = _client(MlflowClient, uri)
+        found = client.get_experiment_by_name(experiment)
+        if found is None:
+            known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
+            raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
+        order = ["attributes.start_time DESC"]
+        runs = client.search_runs([found.experiment_id], "attributes.status = 'FINISHED'", order_by=order)
+        return [Path(client.download_artifacts(run.info.run_id, "")) for run in runs]
+
+
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested mappings as dotted keys, as MLflow's parameters are filtered by."""
     flat: dict[str, Any] = {}

@@ -1,0 +1,119 @@
+"""All methods of an experiment side by side: the paper-style table, AP against images and seconds, what is certain."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neural_sim.report import figures, tracking
+from neural_sim.report.curves import curves
+from neural_sim.report.finished import FinishedRun, finished_runs
+from neural_sim.report.statistics import BOUNDS, Comparison, Estimate, compare
+
+
+@dataclass(frozen=True)
+class Compare:
+    """``+experiment=compare``.
+
+    Args:
+        experiments: MLflow experiments whose runs are compared, each by itself and at each gap.
+        reference: the method that the others are held against.
+        draws: of the bootstrap.
+
+    Raises:
+        ValueError: no experiment, or fewer than two draws.
+    """
+
+    experiments: tuple[str, ...]
+    reference: str = "neural_sim"
+    draws: int = 300
+
+    def __post_init__(self) -> None:
+        if not self.experiments or self.draws < 2:
+            raise ValueError(
+                f"compare: want experiments and at least 2 draws, got {list(self.experiments)}, {self.draws}"
+            )
+
+    def run(self, uri: str, seed: int, config: Mapping[str, Any], folder: Path) -> list[Comparison]:
+        """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow."""
+        runs = finished_runs(uri, self.experiments)
+        settings = {run.setting: [other for other in runs if other.setting == run.setting] for run in runs}
+        found = [compare(held, self.reference, self.draws, seed) for held in settings.values()]
+        folder.mkdir(parents=True, exist_ok=True)
+        document = [dataclasses.asdict(comparison) for comparison in found]
+        (folder / "compare.json").write_text(json.dumps(document, indent=1))
+        text = "\n\n".join(markdown(c, settings[c.setting]) for c in found)
+        (folder / "compare.md").write_text(text + "\n")
+        for comparison in found:
+            held = [run for run in settings[comparison.setting] if run.seed in comparison.seeds]
+            name = comparison.setting.replace(", ", "_")
+            figures.save(curves(comparison, held), folder / "figures" / f"{name}.png")
+        metrics = {
+            f"{c.setting.replace(', ', '_')}/{method}/ap": c.ap[method].value
+            for c in found
+            for method in c.methods
+        }
+        tags = {"compared": ",".join(settings)}
+        tracking.log_run(
+            uri, "compare", ", ".join(settings), tags, tracking.flatten(config), metrics, {}, folder
+        )
+        print(text)
+        print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
+        return found
+
+
+def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
+    """The table of one setting, its differences, and the distances of the learned distributions."""
+    c, count = comparison, len(comparison.seeds)
+    lines = [
+        f"## {c.setting}",
+        f"Seeds {', '.join(map(str, c.seeds))}; AP (0.50 to 0.95) of {', '.join(runs[0].results['biased'])} in points, "
+        "with 95 % bootstrap intervals over seeds and test images"
+        + (" (one seed: over images alone)." if count == 1 else "."),
+        "",
+        f"| method | AP | of the gap won back | {c.reference} ahead by | area ahead by "
+        "| images | detector steps | seconds |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for bound in BOUNDS:
+        lines.append(f"| {bound} | {points(c.ap[bound])} | | | | | | |")
+    for method in c.methods:
+        ahead = points(c.ahead[method], sure=True) if method in c.ahead else ""
+        area = points(c.area[method], sure=True) if method in c.area else ""
+        spent = c.spent[method]
+        lines.append(
+            f"| {method} | {points(c.ap[method])} | {points(c.won_back[method], '%')} | {ahead} | {area} "
+            f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent['seconds']:.0f} |"
+        )
+    lines += ["", "Differences in bold exceed the spread: their interval leaves 0 out.", ""]
+    lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]
+    lines += ["|---|" + "---|" * (1 + len(c.methods))]
+    return "\n".join(lines + _distances(c, runs))
+
+
+def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
+    """A share in points with its interval; in bold where it is certain and that is asked for."""
+    value, low, high = (100 * part for part in (estimate.value, estimate.low, estimate.high))
+    text = f"{value:.1f}" if not unit else f"{value:.0f} {unit}"
+    digits = 1 if not unit else 0
+    text = f"**{text}**" if sure and estimate.certain else text
+    return f"{text} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:
+    """Mean distances of every biased object and factor, before and after."""
+    rows = []
+    table = {(run.method, run.seed): run.results["total_variation"] for run in runs}
+    for name in runs[0].results["biased"]:
+        for factor in runs[0].results["total_variation"][name]:
+            means = []
+            for method in comparison.methods:
+                each = [table[method, seed][name][factor] for seed in comparison.seeds]
+                means.append({w: sum(held[w] for held in each) / len(each) for w in ("initial", "learned")})
+            cells = " | ".join(f"{mean['learned']:.2f}" for mean in means)
+            rows.append(f"| {name}, {factor} | {means[0]['initial']:.2f} | {cells} |")
+    return rows

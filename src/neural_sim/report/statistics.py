@@ -1,0 +1,157 @@
+"""What methods differ by, and whether the differences exceed the spread over seeds and test images.
+
+All methods of a seed are scored on one test set, so that they are compared in pairs: a bootstrap draw takes the same
+seeds and the same images for all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from neural_sim.report.bootstrap import Matches, average_precision
+from neural_sim.report.finished import FinishedRun
+
+BOUNDS = ("ns", "matched")
+"""Detectors that every run of a seed has, and that do not depend on its method. They stand for the methods ``ns`` and
+``oracle``, whose own runs are not compared again."""
+FIXED = ("ns", "oracle")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether the interval leaves 0 out."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The methods of one setting over the seeds that all of them have.
+
+    ``ap`` is the biased objects' mean AP, ``won_back`` the share of the gap from ns to matched, ``ahead`` the
+    reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
+    unit of log seconds. ``spent`` are means over seeds.
+    """
+
+    setting: str
+    seeds: tuple[int, ...]
+    methods: tuple[str, ...]
+    reference: str
+    ap: Mapping[str, Estimate]
+    won_back: Mapping[str, Estimate]
+    ahead: Mapping[str, Estimate]
+    area: Mapping[str, Estimate]
+    spent: Mapping[str, Mapping[str, float]]
+
+
+def compare(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> Comparison:
+    """Compare the runs of one setting.
+
+    Raises:
+        ValueError: the reference has no run, or no seed is common to all methods.
+    """
+    methods = {run.method for run in runs} - set(FIXED) | {reference}
+    methods = tuple(sorted(methods, key=lambda m: (m != reference, m)))
+    table = {(run.method, run.seed): run for run in runs}
+    if not any(method == reference for method, _ in table):
+        raise ValueError(f"compare.reference: no run of {reference!r}, got {sorted({m for m, _ in table})}")
+    seeds = tuple(sorted({s for _, s in table if all((method, s) in table for method in methods)}))
+    if not seeds:
+        raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
+    columns = (*BOUNDS, *methods)
+    held = [
+        [table[reference, s].matches[bound] for bound in BOUNDS]
+        + [table[method, s].matches["learned"] for method in methods]
+        for s in seeds
+    ]
+    point = np.asarray([[mean_ap(matches) for matches in row] for row in held]).mean(0)
+    spread = resampled(held, draws, seed)
+    ap = dict(zip(columns, _estimates(point, spread), strict=True))
+    gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
+    won = _estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
+    ahead = _estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
+    return Comparison(
+        runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
+        dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed),
+        {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", "seconds")}
+         for m in methods},
+    )  # fmt: skip
+
+
+def mean_ap(matches: Sequence[Matches], weights: Float[np.ndarray, "images"] | None = None) -> float:
+    """Mean over classes; those without a box among the weighted images stay out of it."""
+    return float(np.nanmean([average_precision(m, weights) for m in matches]))
+
+
+def resampled(
+    held: Sequence[Sequence[Sequence[Matches]]], draws: int, seed: int
+) -> Float[np.ndarray, "draws columns"]:
+    """Mean AP of each column of ``held`` [seeds][columns][classes] under resampled seeds and images."""
+    random, rows = np.random.default_rng(seed), []
+    for _ in range(draws):
+        each = []
+        for i in random.integers(len(held), size=len(held)):
+            count = len(held[i][0][0].boxes_per_image)
+            weights = np.bincount(random.integers(count, size=count), minlength=count).astype(float)
+            each.append([mean_ap(matches, weights) for matches in held[i]])
+        rows.append(np.mean(each, 0))
+    return np.asarray(rows)
+
+
+def biased_ap(run: FinishedRun) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]:
+    """Seconds spent, and the biased objects' mean AP, at every iteration that was scored."""
+    curve, biased = run.results["curve"], run.results["biased"]
+    ap = [_mean(point["ap"]["per_class"][name] for name in biased) for point in curve]
+    return np.asarray([point["seconds"] for point in curve]), np.asarray(ap)
+
+
+def area_under(
+    seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
+) -> float:
+    """Mean of AP over log seconds in [first, last]: a method is worth what it has reached, until it reaches more."""
+    edges = np.concatenate([[first], seconds[(seconds > first) & (seconds < last)], [last]])
+    reached = np.searchsorted(seconds, edges[:-1], side="right") - 1
+    return float((ap[reached.clip(0)] * np.diff(np.log(edges))).sum() / math.log(last / first))
+
+
+def _areas(
+    table: Mapping[tuple[str, int], FinishedRun],
+    seeds: Sequence[int],
+    methods: Sequence[str],
+    draws: int,
+    seed: int,
+) -> dict[str, Estimate]:
+    curves = {key: biased_ap(run) for key, run in table.items() if key[1] in seeds}
+    spent = [times[times > 0.0] for times, _ in curves.values()]
+    starts, ends = [t.min() for t in spent if len(t)], [t.max() for t in spent if len(t)]
+    if not starts or min(starts) >= max(ends):
+        return {}
+    areas = {key: area_under(*curve, min(starts), max(ends)) for key, curve in curves.items()}
+    random = np.random.default_rng(seed)
+    chosen = random.integers(len(seeds), size=(draws, len(seeds)))
+    found = {}
+    for method in methods[1:]:
+        ahead = np.asarray([areas[methods[0], s] - areas[method, s] for s in seeds])
+        found[method] = _estimates(ahead.mean(keepdims=True), ahead[chosen].mean(1, keepdims=True))[0]
+    return found
+
+
+def _estimates(point: np.ndarray, spread: Float[np.ndarray, "draws columns"]) -> list[Estimate]:
+    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
+    return [Estimate(float(p), float(a), float(b)) for p, a, b in zip(point, low, high, strict=True)]
+
+
+def _mean(values) -> float:
+    return float(np.mean(list(values)))

@@ -1,0 +1,76 @@
+"""Comparisons on made-up runs whose answers are known: who is ahead, by how much, and whether it is certain."""
+
+import numpy as np
+import pytest
+
+from neural_sim.report.bootstrap import THRESHOLDS, Matches
+from neural_sim.report.finished import FinishedRun
+from neural_sim.report.statistics import area_under, biased_ap, compare
+
+IMAGES = 100
+
+
+def matches(share, seed=0):
+    """One box an image, ``share`` of them found at every overlap and nothing else: AP is about that share."""
+    random = np.random.default_rng(seed)
+    found = np.sort(random.permutation(IMAGES)[: round(share * IMAGES)])
+    correct = np.ones((len(found), len(THRESHOLDS)), dtype=bool)
+    return [Matches(found, correct, np.ones(IMAGES, dtype=int))]
+
+
+def run(method, seed, learned, seconds=(10.0, 100.0)):
+    curve = [
+        {"seconds": s, "images": 10 * s, "detector_steps": 1, "products": 0, "ap": {"per_class": {"mug": ap}}}
+        for s, ap in zip((0.0, *seconds), (0.2, 0.5 * (0.2 + learned), learned), strict=True)
+    ]
+    results = {
+        "method": method, "seed": seed, "experiment": "gap", "gap": "disjoint", "biased": ["mug"], "curve": curve,
+    }  # fmt: skip
+    held = {"ns": matches(0.2), "learned": matches(learned, seed), "matched": matches(0.8)}
+    return FinishedRun(results, held)
+
+
+def test_shares_won_back_and_leads_are_those_of_the_runs():
+    runs = [run("ours", s, 0.7) for s in range(3)] + [run("other", s, 0.4) for s in range(3)]
+    found = compare(runs, "ours", draws=50)
+    assert found.methods == ("ours", "other") and found.seeds == (0, 1, 2)
+    assert found.ap["ours"].value == pytest.approx(0.7, abs=0.01)
+    assert found.won_back["ours"].value == pytest.approx(0.5 / 0.6, abs=0.02)
+    assert found.ahead["other"].value == pytest.approx(0.3, abs=0.01) and found.ahead["other"].certain
+    assert found.ap["ours"].low < found.ap["ours"].value < found.ap["ours"].high
+    assert found.spent["other"] == {
+        "images": 1000.0,
+        "detector_steps": 1.0,
+        "products": 0.0,
+        "seconds": 100.0,
+    }
+
+
+def test_a_lead_that_hangs_on_the_seed_is_not_certain():
+    runs = [run("ours", s, ap) for s, ap in enumerate((0.3, 0.7, 0.5))]
+    runs += [run("other", s, ap) for s, ap in enumerate((0.6, 0.4, 0.5))]
+    assert not compare(runs, "ours", draws=100).ahead["other"].certain
+
+
+def test_only_seeds_that_all_methods_have_are_compared():
+    runs = [run("ours", s, 0.7) for s in (0, 1)] + [run("other", s, 0.4) for s in (1, 2)]
+    assert compare(runs, "ours", draws=5).seeds == (1,)
+    with pytest.raises(ValueError, match="no seed is common"):
+        compare([run("ours", 0, 0.7), run("other", 1, 0.4)], "ours", draws=5)
+    with pytest.raises(ValueError, match="no run of 'ours'"):
+        compare([run("other", 0, 0.4)], "ours", draws=5)
+
+
+def test_the_area_is_the_time_mean_of_what_was_reached():
+    seconds, ap = np.asarray([0.0, 10.0, 100.0]), np.asarray([0.2, 0.5, 0.8])
+    assert area_under(seconds, ap, 1.0, 100.0) == pytest.approx((0.2 + 0.5) / 2)  # a decade each
+    assert area_under(seconds, ap, 10.0, 1000.0) == pytest.approx((0.5 + 0.8) / 2)
+    assert area_under(seconds, ap, 100.0, 1000.0) == pytest.approx(0.8)
+
+
+def test_who_reaches_the_same_sooner_has_the_larger_area():
+    runs = [run("ours", s, 0.7, (1.0, 10.0)) for s in range(2)] + [run("other", s, 0.7) for s in range(2)]
+    found = compare(runs, "ours", draws=20)
+    # Over two decades from 1 to 100 s: ours has 0.45 then 0.7, the other 0.2 then 0.45.
+    assert found.area["other"].value == pytest.approx(0.25) and found.area["other"].certain
+    np.testing.assert_allclose(biased_ap(runs[0])[1], [0.2, 0.45, 0.7])

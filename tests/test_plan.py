@@ -1,0 +1,46 @@
+"""The plan says what a configuration leaves out, and only that."""
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim.main import build, conf_directory
+from neural_sim.plan import plan
+
+
+def left_out(*overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        experiment = build(compose("config", list(overrides)))
+    return {omission.what: omission for omission in plan(experiment, 6)}
+
+
+def test_the_default_differentiates_no_render_and_renders_every_bin_once():
+    found = left_out("scale=quick")
+    assert {"appearance codes", "view-dependent colour", "the renderer's derivative"} <= set(found)
+    assert found["images in Hessian products"].share == pytest.approx(1 - 64 / 300)
+    # 192 renders an object in place of 14 iterations of 50 images and 16 probes in each of 8 bins
+    assert found["renders of the loop"].share == pytest.approx(1 - 192 / (14 * (50 + 128)))
+    assert found["backbone passes of the loop's training"].share == pytest.approx(1 - 1 / 12)
+
+
+def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
+    found = left_out("gradient=pathwise")
+    assert "the renderer's derivative" not in found and "renders of the loop" not in found
+    assert "the boxes' derivative" in found
+    assert "the boxes' derivative" not in left_out(
+        "gradient=pathwise", "synthesis.label_gradient=differentiable"
+    )
+
+
+def test_what_is_needed_is_not_left_out():
+    found = left_out(
+        "field.field.head_width=16", "outer.curvature_images=0", "outer.pool_per_bin=0", "outer.epochs=1"
+    )
+    assert not {
+        "view-dependent colour", "images in Hessian products", "renders of the loop",
+        "backbone passes of the loop's training",
+    } & set(found)  # fmt: skip
+
+
+def test_methods_without_a_hypergradient_say_so():
+    assert left_out("baseline=lts")["hypergradients"].share == 1.0
+    assert "the psi loop" in left_out("baseline=ns") and "hypergradients" not in left_out("baseline=ns")
