@@ -1,0 +1,127 @@
+"""Seconds of each phase of one outer iteration against objects and images: `python benchmarks/outer.py`.
+
+The loop is `scale=quick` at its defaults (96 px, detector=tiny, 50 target images an object); any key can be changed, as
+in `python benchmarks/outer.py solver.rtol=1e-3`. The six embedded objects, their fields fitted in few steps, are
+repeated under new names where more are asked for. The backbone is untrained: what is learned changes, not the cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import math
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from machine import machine
+
+from neural_sim.artifacts import Artifacts
+from neural_sim.main import build, conf_directory
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.synthesis.scene import Scene, join
+
+SMALL_FIELDS = [
+    "scale=quick", "progress=false", "views.count=56", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",
+    "budget.grid.prune_steps=[60]",
+]  # fmt: skip
+PHASES = ("render", "probes", "features", "train", "validation", "solve", "mixed", "rest")
+
+
+def repeated(scene: Scene, count: int) -> Scene:
+    """The first ``count`` objects, and the same ones again under new names once they are used up."""
+    index = [i % len(scene.names) for i in range(count)]
+    names = tuple(f"{scene.names[i]}_{label}" for label, i in enumerate(index))
+    return dataclasses.replace(scene, names=names, fields=tuple(scene.fields[i] for i in index))
+
+
+def loop(made: Artifacts, count: int, images: int) -> SimulatorModule:
+    """The psi loop on ``count`` objects with ``images`` training images of each, from uniform poses."""
+    generator = torch.Generator().manual_seed(0)
+    scene = repeated(made.scene, count)
+    detector = made.x.detector(num_classes=count, image_size=made.x.training.image_size)
+    psi = torch.zeros(count, made.psi("initial").shape[1])
+    validation = join(scene.training_set(psi, made.x.target.val_per_object, generator))
+    return SimulatorModule(
+        scene, detector, detector.init(generator), psi, validation,
+        dataclasses.replace(made.x.outer, images_per_object=images), made.x.gradient, made.x.solver,
+        made.x.training.batch_size, made.x.training.weight_decay, generator,
+    )  # fmt: skip
+
+
+def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:
+    """Medians over iterations, the first one (memory, kernels chosen) left out."""
+    walls, rows = [], []
+    for step in range(repeats + 1):
+        begun = time.perf_counter()
+        module.training_step(step, step)
+        walls.append(time.perf_counter() - begun)
+        seconds = module.records[-1].seconds
+        row = {phase: seconds.get(phase, seconds.get(f"hypergradient_{phase}", 0.0)) for phase in PHASES}
+        rows.append(row | {"rest": walls[-1] - sum(row.values())})
+    found = {phase: statistics.median(row[phase] for row in rows[1:]) for phase in PHASES}
+    return found | {"seconds": statistics.median(walls[1:])}
+
+
+def exponent(rows: list[dict[str, Any]], size: str, key: str = "seconds") -> float:
+    """Least-squares slope of log seconds over log size."""
+    x = torch.tensor([math.log(row[size]) for row in rows], dtype=torch.float64)
+    y = torch.tensor([math.log(row[key]) for row in rows], dtype=torch.float64)
+    return float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
+
+
+def last_exponent(rows: list[dict[str, Any]], size: str) -> float:
+    """The slope between the two largest sizes, where what does not grow with them matters least."""
+    return exponent(sorted(rows, key=lambda row: row[size])[-2:], size)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
+    parser.add_argument("--objects", type=int, nargs="*", default=[1, 6, 21], help="at 50 images each")
+    parser.add_argument(
+        "--images", type=int, nargs="*", default=[10, 50, 100, 200], help="of each of six objects"
+    )
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--store", type=Path, default=Path("outputs/store"), help="fields are kept here")
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/outer.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    overrides = [*SMALL_FIELDS, f"paths.store={arguments.store}", *arguments.overrides]
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        made = Artifacts(build(compose("config", overrides)))
+    grid = dict.fromkeys([(count, 50) for count in arguments.objects] + [(6, n) for n in arguments.images])
+    print(
+        f"{'objects':>7}{'images':>7}"
+        + "".join(f"{phase:>11}" for phase in PHASES)
+        + f"{'all':>8}{'steps':>7}"
+    )
+    rows = []
+    for count, images in grid:
+        module = loop(made, count, images)
+        row = {"objects": count, "images": images, **measure(module, arguments.repeats)}
+        row["steps"] = module.records[-1].certificate.solver_steps
+        rows.append(row)
+        shown = "".join(f"{row[phase]:11.2f}" for phase in PHASES)
+        print(f"{count:7}{images:7}{shown}{row['seconds']:8.2f}{row['steps']:7}", flush=True)
+    slopes = {}
+    for size, held in (("objects", ("images", 50)), ("images", ("objects", 6))):
+        chosen = [row for row in rows if row[held[0]] == held[1]]
+        if len(chosen) > 1:
+            slopes[size] = {"all": exponent(chosen, size), "largest two": last_exponent(chosen, size)}
+            print(f"seconds grow with {size} to the power {slopes[size]['all']:.2f}, "
+                  f"{slopes[size]['largest two']:.2f} between the largest two")  # fmt: skip
+    result = {"machine": machine(), "overrides": arguments.overrides, "exponents": slopes, "rows": rows}
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
