@@ -23,6 +23,7 @@ from machine import machine
 
 from neural_sim.artifacts import Artifacts
 from neural_sim.main import build, conf_directory
+from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.synthesis.scene import Scene, join
 
@@ -47,11 +48,12 @@ def loop(made: Artifacts, count: int, images: int) -> SimulatorModule:
     detector = made.x.detector(num_classes=count, image_size=made.x.training.image_size)
     psi = torch.zeros(count, made.psi("initial").shape[1])
     validation = join(scene.training_set(psi, made.x.target.val_per_object, generator))
-    return SimulatorModule(
-        scene, detector, detector.init(generator), psi, validation,
-        dataclasses.replace(made.x.outer, images_per_object=images), made.x.gradient, made.x.solver,
-        made.x.training.batch_size, made.x.training.weight_decay, generator,
+    settings, training = dataclasses.replace(made.x.outer, images_per_object=images), made.x.training
+    inner = InnerLoop(
+        scene, detector, detector.init(generator), validation, settings, training.batch_size,
+        training.weight_decay, generator, made.x.gradient.relaxed,
     )  # fmt: skip
+    return SimulatorModule(inner, psi, made.x.gradient, made.x.solver)
 
 
 def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:

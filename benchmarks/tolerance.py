@@ -1,7 +1,7 @@
 """What an early end of the adjoint solve and fewer curvature images cost the hypergradient, beside its own noise.
 
 `python benchmarks/tolerance.py` writes docs/numerics.md. `+experiment=pose_gap scale=quick`: pyramid and head freshly
-trained on images from the initial and from the target distribution. The objects' derivatives are compared as one vector.
+trained on images from the initial and from the target distribution. The objects' derivatives form one vector.
 """
 
 from __future__ import annotations

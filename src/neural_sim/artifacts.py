@@ -47,8 +47,9 @@ class Artifacts:
         self.names: list[str] = experiment.objects.names()
         self.device = torch.device("cuda" if experiment.accelerator == "gpu" else "cpu")
         unknown = set(experiment.distribution.biased) - set(self.names)
+        unknown |= set(experiment.outer.learned or ()) - set(self.names)
         if unknown:
-            raise ValueError(f"parameter: biased names {sorted(unknown)}, objects are {self.names}")
+            raise ValueError(f"biased or outer.learned names {sorted(unknown)}, objects are {self.names}")
 
     @cached_property
     def digests(self) -> dict[str, str]:

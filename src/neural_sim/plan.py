@@ -59,6 +59,11 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
         yield Omission(
             "psi", "the boxes' derivative", "synthesis.label_gradient=ignored, as in the paper", 1.0
         )
+    if x.outer.learned is not None and len(x.outer.learned) < objects:
+        share = 1.0 - len(x.outer.learned) / objects
+        yield Omission(
+            "psi", "probes and second derivatives", "outer.learned fixes the other objects' psi", share
+        )
     images = objects * x.outer.images_per_object
     if 0 < x.outer.curvature_images < images:
         share = 1.0 - x.outer.curvature_images / images
@@ -73,7 +78,10 @@ def _pooled(x: Experiment, method: HypergradientLoop | RewardMethod, searched: b
         cells *= factor.bins
     rendered = -(-x.outer.pool_per_bin * finest // cells) * cells
     rounds = getattr(method, "rounds", 1) * x.outer.iterations
-    probes = 0 if searched else x.gradient.probes_per_bin * sum(factor.bins for factor in factors)
-    wanted = rounds * (x.outer.images_per_object + probes)
+    probes = 0.0
+    if not searched:
+        anew = 1.0 + (rounds - 1) * x.outer.refresh
+        probes = anew * x.gradient.probes_per_bin * sum(factor.bins for factor in factors)
+    wanted = rounds * x.outer.images_per_object + probes
     share = max(0.0, 1.0 - rendered / wanted)
     return Omission("psi", "renders of the loop", "fields do not change: every bin is rendered once", share)

@@ -108,9 +108,12 @@ class Outer:
     psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951).
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
-    estimator, which replays exact draws, always renders. ``on_untrusted`` is what happens to a step that fails
-    ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite
-    differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
+    estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
+    anew; the others keep their images, and what other factors of p_psi gave them. ``learned`` names the objects whose
+    psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
+    happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is
+    compared with finite differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1
+    trainings to stationarity.
     """
 
     update: Update
@@ -122,8 +125,10 @@ class Outer:
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
+    refresh: float = 1.0
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"
+    learned: tuple[str, ...] | None = None
     certify_every: int = 0
     certify_per_bin: int = 1
 
@@ -132,9 +137,13 @@ class Outer:
         _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
         _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         _at_least("outer", 0, certify_every=self.certify_every)
+        if not 0.0 < self.refresh <= 1.0:
+            raise ValueError(f"outer.refresh must lie in (0, 1], got {self.refresh}")
         _at_least("outer", 1, certify_per_bin=self.certify_per_bin)
         if self.start not in get_args(Start):
             raise ValueError(f"outer.start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
+        if self.learned is not None and not self.learned:
+            raise ValueError("outer.learned: want the names of objects, or null for all, got none")
         if not 0.0 < self.final_step <= 1.0:
             raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
         if self.on_untrusted not in get_args(OnUntrusted):

@@ -62,6 +62,16 @@ class CachedSet:
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
+    def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
+        """The same with ``others`` in the places ``index``."""
+        place = index.to(self.targets.labels.device)
+        features = tuple(
+            level.index_copy(0, place, new) for level, new in zip(self.features, others.features, strict=True)
+        )
+        labels = self.targets.labels.index_copy(0, place, others.targets.labels)
+        deltas = self.targets.deltas.index_copy(0, place, others.targets.deltas)
+        return CachedSet(self.detector, features, Targets(labels, deltas))
+
     def double(self) -> CachedSet:
         """The same in float64."""
         targets = Targets(self.targets.labels, self.targets.deltas.double())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.certificate import Certificate, certify
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
+from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.retrained import Check, as_double, binned_problem, check
 from neural_sim.parameter.update import UpdateState
 from neural_sim.solver.adjoint import AdjointSolver
@@ -35,10 +37,11 @@ class SimulatorModule(OuterLoop):
     ) -> None:
         super().__init__(inner, psi, inner.settings.iterations)
         self.estimator, self.solver = estimator, solver
-        parts = self.scene.distribution.split(self.psi)
+        wanted, names = inner.settings.learned, self.scene.names
+        self._learned = [i for i, name in enumerate(names) if wanted is None or name in wanted]
+        parts = self.scene.distribution.split(self.psi[self._learned])
         self._update_states = {name: UpdateState.zeros(part) for name, part in parts.items()}
-        self._probe_set: CachedSet | None = None
-        self._probes: list[dict[str, Probes]] = [{} for _ in self.scene.names]
+        self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
         # A generator of its own, so that being certified does not change a run.
         self._check_generator = torch.Generator().manual_seed(inner.generator.initial_seed() + 1)
@@ -76,12 +79,13 @@ class SimulatorModule(OuterLoop):
         self._stopped = certificate.action == "stopped"
         if certificate.action in ("skipped", "stopped"):
             return
+        names = [self.scene.names[i] for i in self._learned]
         gradient, error = (
-            torch.stack([values[name] for name in self.scene.names]).to(self.psi)
+            torch.stack([values[name] for name in names]).to(self.psi)
             for values in (result.psi_gradients, result.standard_errors)
         )
-        distribution = self.scene.distribution
-        psi, slope, noise = (distribution.split(values) for values in (self.psi, gradient, error))
+        distribution, before = self.scene.distribution, self.psi[self._learned]
+        psi, slope, noise = (distribution.split(values) for values in (before, gradient, error))
         moved = {}
         for factor in distribution.factors:
             name = factor.name
@@ -93,7 +97,7 @@ class SimulatorModule(OuterLoop):
         part = 1.0 + done * (self.settings.final_step - 1.0)
         if certificate.action == "shrunk":
             part *= self.settings.trust.shrink
-        self.psi.data = self.psi + part * (distribution.join(moved) - self.psi)
+        self.psi.data[self._learned] = before + part * (distribution.join(moved) - before)
 
     def _hypergradient(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
@@ -109,11 +113,13 @@ class SimulatorModule(OuterLoop):
             trainable, SplitLoss(cached.outputs, cached.losses_of), weights,
             proximal=self.inner.detector.proximal, anchor=self.inner.warm_start, subset=subset,
         )  # fmt: skip
-        losses = bound_losses(cached, self.inner.backbone, images.labels, self._probe_set)
+        probed = self._probes
+        losses = bound_losses(cached, self.inner.backbone, images.labels, probed.cached if probed else None)
         held = object_images(self.scene, rendered, self.psi, weights)
         estimates = {
-            name: self._bind(losses, part, probes)
-            for (name, part), probes in zip(held.items(), self._probes, strict=True)
+            name: self._bind(losses, held[name], probed.probes[label] if probed else {})
+            for label, name in enumerate(self.scene.names)
+            if label in self._learned
         }
         result = hypergradient(
             inner,
@@ -124,39 +130,42 @@ class SimulatorModule(OuterLoop):
             self._adjoint,
         )
         self._adjoint = result.solution.value
-        return result
+        return self._with_fixed(result)
+
+    def _with_fixed(self, result: Hypergradient) -> Hypergradient:
+        """Zeros for objects whose psi is fixed, for which nothing was computed."""
+        zeros = {name: torch.zeros(self.psi.shape[1]) for name in self.scene.names}
+        return replace(
+            result,
+            psi_gradients={**zeros, **result.psi_gradients},
+            standard_errors={**zeros, **result.standard_errors},
+            signal_to_noise={**zeros, **result.signal_to_noise},
+        )
 
     def _bind(self, losses: Losses, held: ObjectImages, probes: dict[str, Probes]) -> Callable:
         trainable = self.inner.trainable
         return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
 
     def _draw_probes(self) -> None:
-        """New probes each iteration, so that what is peculiar to some does not push psi the same way every time."""
-        if self.estimator.probes_per_bin:
-            self._probes, self._probe_set = self._every_bin(
-                self.estimator.probes_per_bin, self.inner.generator
-            )
+        """New probes, or a part of them, so that what is peculiar to some does not push psi the same way for ever."""
+        every = self.estimator.probes_per_bin
+        if not every:
+            return
+        if self._probes is None:
+            self._probes = self._every_bin(every, self.inner.generator, self._learned)
+            return
+        part = max(1, round(self.settings.refresh * every))
+        fresh = self._every_bin(part, self.inner.generator, self._learned)
+        self._probes = fresh if part == every else self._probes.renewed(fresh, len(self.records))
 
-    def _every_bin(
-        self, per_bin: int, generator: torch.Generator
-    ) -> tuple[list[dict[str, Probes]], CachedSet]:
-        """``per_bin`` images of every bin of every factor of every object, with their features."""
-        source = self.inner.pool.probes if self.inner.pool else self.scene.probes
-        drawn: list[RenderedObject] = []
-        probes: list[dict[str, Probes]] = []
-        first = 0
-        for label in range(len(self.scene.names)):
-            probes.append({})
-            for column, factor in enumerate(self.scene.distribution.factors):
-                part = source(label, factor.name, per_bin, self.psi[label], generator)
-                index = torch.arange(first, first + len(part.images))
-                probes[label][factor.name] = Probes(
-                    index, self.scene.distribution.bins_of(part.draw)[:, column]
-                )
-                first += len(index)
-                drawn.append(part)
-        self.inner.images += first
-        return probes, CachedSet.of(self.inner.detector, self.inner.backbone, join(drawn))
+    def _every_bin(self, per_bin: int, generator: torch.Generator, objects: Sequence[int]) -> ProbeSet:
+        """``per_bin`` images of every bin of every factor of the objects, with their features."""
+        source, inner = self.inner.pool or self.scene, self.inner
+        probed = ProbeSet.draw(
+            source, self.scene, inner.detector, inner.backbone, per_bin, self.psi, generator, objects
+        )
+        inner.images += len(probed.cached)
+        return probed
 
     def _check(self, result: Hypergradient) -> Check | None:
         """Every ``certify_every`` steps, one object's gradient of one factor against a retrained problem, in turn.
@@ -169,16 +178,18 @@ class SimulatorModule(OuterLoop):
         done = len(self.records) + 1
         if every == 0 or done % every:
             return None
-        probes, held = self._probes, self._probe_set
-        if held is None or self.estimator.probes_per_bin < per_bin:
-            probes, held = self._every_bin(per_bin, self._check_generator)
+        probed = self._probes
+        objects = range(len(self.scene.names))
+        if probed is None or probed.per_bin < per_bin or len(self._learned) < len(objects):
+            probed = self._every_bin(per_bin, self._check_generator, objects)
         distribution = self.scene.distribution
-        turn, label = divmod(done // every - 1, len(self.scene.names))
+        turn, place = divmod(done // every - 1, len(self._learned))
+        label = self._learned[place]
         factor = distribution.factors[turn % len(distribution.factors)]
         trainable = self.inner.trainable
         pulls = [(self.inner.detector.proximal, self.inner.warm_start), (result.damping.value, trainable)]
-        ordered = [part[factor.name] for part in probes]
-        problem = binned_problem(held, ordered, per_bin, pulls, factor.log_probabilities)
+        ordered = [part[factor.name] for part in probed.probes]
+        problem = binned_problem(probed.cached, ordered, per_bin, pulls, factor.log_probabilities)
         validation = self.inner.validation.double().mean_terms()
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]

@@ -1,0 +1,74 @@
+"""Probes: images of every bin drawn on purpose, and how a part of them is renewed from iteration to iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.gradient.base import Probes
+from neural_sim.synthesis.pool import ImagePool
+from neural_sim.synthesis.scene import RenderedObject, Scene, join
+
+
+@dataclass(frozen=True)
+class ProbeSet:
+    """``per_bin`` images of every bin of every factor of every object, bin after bin, with their features.
+
+    ``probes`` are an object's by the factor's name, none of objects that are left out.
+    """
+
+    probes: list[dict[str, Probes]]
+    cached: CachedSet
+    per_bin: int
+
+    @staticmethod
+    def draw(
+        source: Scene | ImagePool,
+        scene: Scene,
+        detector: Detector,
+        backbone: Parameters,
+        per_bin: int,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+        objects: Sequence[int],
+    ) -> ProbeSet:
+        """Images of some ``objects`` from ``source``; what a factor's bin does not fix is drawn from p_psi."""
+        drawn: list[RenderedObject] = []
+        probes: list[dict[str, Probes]] = [{} for _ in scene.names]
+        first = 0
+        for label in objects:
+            for column, factor in enumerate(scene.distribution.factors):
+                part = source.probes(label, factor.name, per_bin, psi[label], generator)
+                index = torch.arange(first, first + len(part.images))
+                probes[label][factor.name] = Probes(index, scene.distribution.bins_of(part.draw)[:, column])
+                first += len(index)
+                drawn.append(part)
+        return ProbeSet(probes, CachedSet.of(detector, backbone, join(drawn)), per_bin)
+
+    def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
+        """These probes with ``fresh`` ones, fewer in every bin, in the places whose turn it is; all places in turn.
+
+        Raises:
+            ValueError: for more fresh probes a bin than there are places.
+        """
+        if fresh.per_bin > self.per_bin:
+            raise ValueError(f"probes: got {fresh.per_bin} fresh ones a bin for {self.per_bin} places")
+        places = (turn * fresh.per_bin + torch.arange(fresh.per_bin)) % self.per_bin
+        targets, sources, probes = [], [], []
+        for held, new in zip(self.probes, fresh.probes, strict=True):
+            probes.append({})
+            for name, part in held.items():
+                rows = part.index.view(-1, self.per_bin)[:, places]
+                bins = part.bins.view(-1, self.per_bin).clone()
+                bins[:, places] = new[name].bins.view(-1, fresh.per_bin)
+                probes[-1][name] = Probes(part.index, bins.view(-1))
+                targets.append(rows.reshape(-1))
+                sources.append(new[name].index)
+        cached = self.cached.replaced(torch.cat(targets), fresh.cached.select(torch.cat(sources)))
+        return ProbeSet(probes, cached, self.per_bin)
