@@ -46,6 +46,25 @@ def test_scores_equal_single_gradients(setting, mode, chunk_size):
     assert not ours.requires_grad
 
 
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
+def test_differenced_scores_are_within_their_order_whatever_the_vectors_size(setting, size):
+    """eps^(2/3) is 4e-11 in float64; third derivatives and the size of the losses here leave 1e-8 of it."""
+    loss_of, params, vector, images, _ = setting
+    vector = {name: size * part for name, part in vector.items()}
+
+    def found(mode, along=vector):
+        return scores(lambda p, rows: loss_of(p, images[rows], rows), params, along, torch.arange(5), 2, mode)
+
+    torch.testing.assert_close(
+        found("central_difference"),
+        found("forward"),
+        rtol=1e-8,
+        atol=1e-8 * float(found("forward").abs().max()),
+    )
+    nothing = {name: 0.0 * part for name, part in vector.items()}
+    assert torch.equal(found("central_difference", nothing), torch.zeros(5, dtype=DOUBLE))
+
+
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 @pytest.mark.parametrize("chunk_size", [1, 2, 100])
 def test_image_cotangent_equals_autograd(setting, mode, chunk_size):

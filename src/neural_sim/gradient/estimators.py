@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import torch
 from torch import Tensor
 
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
-from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.stratified import stratified
@@ -20,16 +20,22 @@ from neural_sim.gradient.stratified import stratified
 class StratifiedEstimator:
     """Mean scores of every bin of every factor from images drawn from it on purpose, see :mod:`gradient.stratified`.
 
-    An outer iteration pays one Jacobian-vector product over the predictor for its probes.
+    An outer iteration pays one Jacobian-vector product over the predictor for its probes, taken as ``theta_mode`` says
+    (see :func:`gradient.mixed.scores`).
     """
 
     relaxed: ClassVar[None] = None
     probes_per_bin: int = 8
     chunk_size: int = 64
+    theta_mode: ThetaMode = "forward"
 
     def __post_init__(self) -> None:
         if self.probes_per_bin < 1:
             raise ValueError(f"gradient.probes_per_bin must be at least 1, got {self.probes_per_bin}")
+        if self.theta_mode not in get_args(ThetaMode):
+            raise ValueError(
+                f"gradient.theta_mode must be one of {get_args(ThetaMode)}, got {self.theta_mode!r}"
+            )
 
     def estimate(
         self,
@@ -47,7 +53,8 @@ class StratifiedEstimator:
         share, psi, parts = float(images.weights.sum()), images.distribution.split(images.psi), []
         for factor in images.distribution.factors:
             held = probes[factor.name]
-            along = scores(losses.probes, params, vector, held.index, self.chunk_size).to(images.psi.dtype)
+            along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
+            along = along.to(images.psi.dtype)
             parts.append(stratified(along, held.bins, psi[factor.name], factor.log_probabilities, share))
         values, errors = ([getattr(part, name) for part in parts] for name in ("value", "standard_error"))
         return MixedDerivative(torch.cat(values), torch.cat(errors))

@@ -14,8 +14,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
+from neural_sim.solver.flatten import flatten
+from neural_sim.solver.hvp import difference_length
 
-ThetaMode = Literal["forward", "reverse"]
+ThetaMode = Literal["forward", "reverse", "central_difference"]
 
 
 def scores(
@@ -30,11 +32,12 @@ def scores(
     time.
 
     ``forward``: one Jacobian-vector product gives a chunk's scores. ``reverse`` differentiates the
-    vector-Jacobian product by its own cotangent, for losses without forward-mode rules. Raises ``ValueError``
-    for an unknown mode.
+    vector-Jacobian product by its own cotangent, for losses without forward-mode rules. ``central_difference``:
+    the losses at ``theta +- h v``, two plain passes instead of forward mode's four, with an error of relative order
+    eps^(2/3). Raises ``ValueError`` for an unknown mode.
     """
     _check(mode, chunk_size)
-    along = _forward_scores if mode == "forward" else _reverse_scores
+    along = _ALONG[mode]
     if not len(index):
         return next(iter(params.values())).new_zeros(0)
     parts = [along(lambda p, rows=rows: losses(p, rows), params, vector) for rows in index.split(chunk_size)]
@@ -71,7 +74,7 @@ def input_cotangents(
 ) -> tuple[Tensor, ...]:
     """``image_cotangent`` of images and, where ``inputs`` has them too, boxes."""
     _check(mode, chunk_size)
-    along = _forward_scores if mode == "forward" else _reverse_scores
+    along = _ALONG[mode]
     if not len(index):
         return tuple(torch.zeros_like(values) for values in inputs)
     parts = []
@@ -103,6 +106,25 @@ def _reverse_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"
             [(slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True)]
         ).sum()
         return torch.autograd.grad(along, probe, create_graph=True, materialize_grads=True)[0]
+
+
+def _differenced_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
+    fixed = {name: tensor.detach() for name, tensor in params.items()}
+    ahead = {name: vector[name].detach() for name in fixed}
+    length = difference_length(flatten(fixed), flatten(ahead))
+    if length == 0.0:
+        return torch.zeros_like(losses(fixed))
+    above, below = (
+        {name: tensor + h * ahead[name] for name, tensor in fixed.items()} for h in (length, -length)
+    )
+    return (losses(above) - losses(below)) * (0.5 / length)
+
+
+_ALONG = {
+    "forward": _forward_scores,
+    "reverse": _reverse_scores,
+    "central_difference": _differenced_scores,
+}
 
 
 def _check(mode: str, chunk_size: int) -> None:

@@ -108,14 +108,22 @@ class HessianOperator:
         return total
 
     def _central_difference(self, vector: Tensor) -> Tensor:
-        size = norm(vector)
-        if size == 0.0:
+        length = difference_length(self._point, vector)
+        if length == 0.0:
             return torch.zeros_like(vector)
-        # Truncation h^2 against rounding eps / h balance at h ~ eps^(1/3), relative to the point's own size.
-        reach = torch.finfo(vector.dtype).eps ** (1 / 3) * (1.0 + norm(self._point) / self.size**0.5)
-        step = vector * (reach / size)
+        step = length * vector
         difference = self.gradient(self._point + step) - self.gradient(self._point - step)
-        return difference * (0.5 * size / reach)
+        return difference * (0.5 / length)
+
+
+def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
+    """h of the central difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
+
+    Truncation (h |vector|)^2 and rounding eps / (h |vector|) balance at eps^(1/3), relative to the point's own size.
+    """
+    size = norm(vector)
+    reach = torch.finfo(vector.dtype).eps ** (1 / 3) * (1.0 + norm(point) / point.numel() ** 0.5)
+    return reach / size if size > 0.0 else 0.0
 
 
 def gradient(terms: Sequence[Term], params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
