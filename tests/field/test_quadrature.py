@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from neural_sim.field.base import PackedSamples
 from neural_sim.field.quadrature import alpha_from_sigma, composite, render_weights, sum_rays, transmittance
+from neural_sim.field.samples import PackedSamples
 
 
 def pack(counts: list[int], width: float = 0.1) -> PackedSamples:

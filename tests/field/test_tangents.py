@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
 from neural_sim.field.interpolation import gather_weighted, interpolate, trilinear_tangents, trilinear_weights
 from neural_sim.field.mlp import MLPField
 from neural_sim.field.quadrature import composite, composite_with_tangents
+from neural_sim.field.samples import PackedSamples
 
 DOUBLE = torch.float64
 

@@ -3,30 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from neural_sim.types import Rays
-
-
-@dataclass(frozen=True)
-class PackedSamples:
-    """Samples of many rays without padding, sorted by ray and then by distance (the layout of nerfacc).
-
-    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii and
-    ``width`` the length of ray the sample stands for. Ray r owns the samples ``starts[r]:starts[r + 1]``.
-    """
-
-    ray: Int[Tensor, "samples"]
-    distance: Float[Tensor, "samples"]
-    width: Float[Tensor, "samples"]
-    starts: Int[Tensor, "rays_plus_one"]
-
-    def __len__(self) -> int:
-        return self.ray.shape[0]
+from neural_sim.field.quadrature import composite
+from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.types import PinholeCamera, Rays
 
 
 class RadianceField(nn.Module, ABC):
@@ -73,6 +57,25 @@ class RadianceField(nn.Module, ABC):
         Deterministic and detached: the same rays always give the same distances. Samples behind a transmittance
         below ``termination`` may be left out; 0 leaves nothing out.
         """
+
+    @torch.no_grad()
+    def trace(
+        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the samples of ``sample``.
+
+        Without derivatives. ``span`` is what ``span`` says of these rays, and ``skip_empty`` whether space known to be
+        empty is stepped over; neither changes a pixel. A field that knows no empty space ignores both.
+        """
+        samples = self.sample(rays, termination)
+        directions = rays.directions.index_select(0, samples.ray)
+        origins = rays.origins.index_select(0, samples.ray)
+        sigma, rgb = self.query(origins + directions * samples.distance[:, None], directions)
+        return composite(sigma, rgb, samples)
+
+    def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span | None:
+        """Between which distances the rays of an image's ``rows`` may meet anything; None where nothing is known."""
+        return None
 
     @abstractmethod
     def settings(self) -> dict[str, object]:

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.cameras import focal_length
-from neural_sim.field.base import PackedSamples
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import visual_hull
 from neural_sim.field.objective import Fitting, Rendering, Rounds
@@ -17,6 +16,7 @@ from neural_sim.field.occupancy import crop
 from neural_sim.field.pool import RayPool, build_pool
 from neural_sim.field.quadrature import composite, render_weights
 from neural_sim.field.rendering import sample_points
+from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PosedViews
 
 BATCHES_PER_BLOCK = 4

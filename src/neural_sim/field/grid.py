@@ -7,18 +7,22 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.base import RadianceField
+from neural_sim.field.extinction import Extinction, sum_rows
 from neural_sim.field.interpolation import (
     CORNERS,
+    corner_weights,
     gather_weighted,
     interpolate,
     interpolate_for_training,
     trilinear_tangents,
     trilinear_weights,
 )
-from neural_sim.field.marching import SampleCollector, lookup, march
+from neural_sim.field.marching import SampleCollector, Wave, lookup, march
 from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, dilate, subdivide, vertices
-from neural_sim.types import Rays
+from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.field.screen import coarse_centres, screen_span
+from neural_sim.types import PinholeCamera, Rays
 
 EMPTY_DENSITY = -1e4
 """Raw density of the row that stands for all empty space: softplus gives exactly 0."""
@@ -196,29 +200,49 @@ class GridField(RadianceField):
         """``sample`` with a lattice phase per ray (see ``march``), and the number of the cell of each sample."""
         rays = Rays(rays.origins.detach(), rays.directions.detach())
         collector = SampleCollector(len(rays.origins), rays.origins)
-        depth = torch.zeros_like(rays.origins[:, 0])
-        deepest = float("inf") if termination <= 0.0 else -float(torch.tensor(termination).log())
+        extinction = Extinction(len(rays.origins), termination, rays.origins)
 
-        def visit(ray: Tensor, distance: Tensor, cell: Tensor, local: Tensor) -> Tensor:
-            if deepest == float("inf"):
-                collector.add(ray, distance, cell)
-                return torch.ones_like(ray, dtype=torch.bool)
-            optical = torch.zeros_like(distance).flatten()
-            where = (cell >= 0).flatten().nonzero()[:, 0]
-            position = local.flatten(0, 1).index_select(0, where)
-            corners = self.corners.index_select(0, cell.flatten().index_select(0, where))
-            weights = trilinear_weights(position - position.floor())
-            density = self.table[:, :1].contiguous()
-            raw = interpolate(density, corners, weights)[:, 0]
-            optical[where] = functional.softplus(self.density_gain * raw) * self.step_cells
-            optical = optical.view_as(distance)
-            inclusive = optical.cumsum(1) + depth.index_select(0, ray)[:, None]
-            collector.add(ray, distance, torch.where(inclusive - optical < deepest, cell, -1))
-            depth.index_copy_(0, ray, inclusive[:, -1])
-            return inclusive[:, -1] < deepest
+        def visit(wave: Wave) -> Tensor:
+            if termination <= 0.0:
+                collector.add(wave)
+                return torch.ones_like(wave.ray, dtype=torch.bool)
+            _, reached, alive = extinction.enter(wave, self.density(self._raw_of(wave)) * self.step)
+            collector.add(wave, reached)
+            return alive
 
         march(rays, self.occupancy, self.step, phase, visit)
         return collector.finish(self.step)
+
+    @torch.no_grad()
+    def trace(
+        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        """See the base class; each sample is found, interpolated and composited once, wave by wave."""
+        colour = rays.origins.new_zeros(len(rays.origins), 3)
+        extinction = Extinction(len(rays.origins), termination, rays.origins)
+
+        def visit(wave: Wave) -> Tensor:
+            directions = rays.directions
+            if self.head is not None:
+                directions = directions.index_select(0, wave.ray.index_select(0, wave.row))
+            sigma, rgb = self.decode(self._raw_of(wave), directions)
+            optical = sigma * self.step
+            depth, reached, alive = extinction.enter(wave, optical)
+            weights = torch.exp(-depth) * -torch.expm1(-optical) * reached
+            colour.index_add_(0, wave.ray, sum_rows(rgb, weights, wave))
+            return alive
+
+        march(rays, self.occupancy, self.step, 0.5, visit, span, skip_empty)
+        return colour, extinction.opacity()
+
+    def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
+        centres, radius = coarse_centres(self.occupancy)
+        return screen_span(centres, radius, camera, camera_to_world, rows)
+
+    def _raw_of(self, wave: Wave) -> Float[Tensor, "k channels"]:
+        """Table rows at a wave's samples, without derivatives."""
+        corners = self.corners.index_select(0, wave.cell)
+        return gather_weighted(self.table, corners, corner_weights(*wave.fraction))
 
 
 def _interpolate_from(

@@ -23,33 +23,44 @@ def trilinear_weights(fraction: Float[Tensor, "samples 3"]) -> Float[Tensor, "sa
     return (xy[..., None] * z[:, None, None, :]).flatten(1)
 
 
+def corner_weights(
+    x: Float[Tensor, "samples"], y: Float[Tensor, "samples"], z: Float[Tensor, "samples"]
+) -> Float[Tensor, "samples 8"]:
+    """``trilinear_weights`` of coordinates kept apart, an order of magnitude faster on a CPU; no derivative passes."""
+    weights = x.new_empty(len(x), 8)
+    for index, edge in enumerate(_bilinear(x, y)):
+        torch.mul(edge, z, out=weights[:, 2 * index + 1])
+        torch.sub(edge, weights[:, 2 * index + 1], out=weights[:, 2 * index])
+    return weights
+
+
 def trilinear_tangents(
     fraction: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
 ) -> tuple[Float[Tensor, "samples 8"], Float[Tensor, "m samples 8"]]:
     """``trilinear_weights``, and their derivatives where the fraction moves at ``velocities``.
 
-    Corner by corner over all samples, so that every operation runs over contiguous memory. No derivative passes.
+    Coordinate by coordinate over all samples, so that every operation runs over contiguous memory. No derivative
+    passes.
     """
     x, y, z = fraction.detach().t().contiguous().unbind(0)
-    xy = _bilinear(torch.ones_like(x), x, y, x * y)
-    rates = []
-    for velocity in velocities.detach():
+    edges = _bilinear(x, y)
+    rates = x.new_empty(len(velocities), len(x), 8)
+    for rate, velocity in zip(rates, velocities.detach(), strict=True):
         u, v, w = velocity.t().contiguous().unbind(0)
-        moved = _bilinear(torch.zeros_like(u), u, v, torch.addcmul(u * y, v, x))
-        rate = moved.new_empty(4, 2, len(x))
-        torch.mul(moved, z, out=rate[:, 1]).addcmul_(xy, w)
-        torch.sub(moved, rate[:, 1], out=rate[:, 0])
-        rates.append(rate.flatten(0, 1).t())
-    weights = xy.new_empty(4, 2, len(x))
-    torch.mul(xy, z, out=weights[:, 1])
-    torch.sub(xy, weights[:, 1], out=weights[:, 0])
-    return weights.flatten(0, 1).t().contiguous(), torch.stack(rates).contiguous()
+        both = torch.addcmul(u * y, v, x)
+        moved = (both - u - v, v - both, u - both, both)
+        for index, (edge, slope) in enumerate(zip(edges, moved, strict=True)):
+            upper = torch.mul(slope, z).addcmul_(edge, w)
+            rate[:, 2 * index + 1] = upper
+            torch.sub(slope, upper, out=rate[:, 2 * index])
+    return corner_weights(x, y, z), rates
 
 
-def _bilinear(one: Tensor, x: Tensor, y: Tensor, xy: Tensor) -> Float[Tensor, "4 samples"]:
-    """(1 - x)(1 - y), (1 - x) y, x (1 - y), x y from the product; or their derivatives, ``one`` being 0."""
-    low_y = y - xy
-    return torch.stack([one - x - low_y, low_y, x - xy, xy])
+def _bilinear(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(1 - x)(1 - y), (1 - x) y, x (1 - y), x y."""
+    both = x * y
+    low = y - both
+    return 1.0 - x - low, low, x - both, both
 
 
 def gather_weighted(

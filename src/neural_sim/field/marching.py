@@ -1,7 +1,8 @@
 """Samples where rays meet occupied cells: uniform steps on a fixed lattice, empty space skipped, rays that end dropped.
 
 The lattice of a ray is t_k = (k + phase) step from the ray's origin, whatever was skipped; so leaving empty space out
-changes no sample, and the same ray always has the same distances.
+changes no sample, and the same ray always has the same distances. Coordinates are kept apart, one contiguous array
+each: on a CPU that is several times faster than arrays of points.
 """
 
 from __future__ import annotations
@@ -13,126 +14,189 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neural_sim.field.base import PackedSamples
 from neural_sim.field.occupancy import COARSENING, Occupancy
+from neural_sim.field.samples import PackedSamples, Span
 from neural_sim.types import Rays
 
 WAVE = 8
-"""Lattice steps taken at once by each ray that has reached a coarse occupied cell."""
+"""Lattice steps taken at once by each ray that has reached a coarse occupied cell; a power of two."""
 
-Visitor = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Sees (ray [n], distance [n, WAVE], cell [n, WAVE] or -1, position [n, WAVE, 3]); returns which rays go on [n]."""
+Axes = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
-class _Front:
-    """Rays still under way: number, next lattice step, last step inside the grid, and the ray itself in cells."""
+class Wave:
+    """The next ``WAVE`` lattice steps of n rays, of which k lie in occupied cells.
+
+    ``ray`` numbers the rays, ``row`` counts within ``ray`` and ``place`` within the n x WAVE steps, both in increasing
+    order. ``fraction`` is the position inside the cell, x, y and z in [0, 1].
+    """
 
     ray: Int[Tensor, "n"]
-    step: Float[Tensor, "n"]
+    row: Int[Tensor, "k"]
+    place: Int[Tensor, "k"]
+    distance: Float[Tensor, "k"]
+    cell: Int[Tensor, "k"]
+    fraction: Axes
+
+
+Visitor = Callable[[Wave], Bool[Tensor, "n"]]
+"""Sees a wave, and says which of its rays go on."""
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """Rays in cells of the grid: one array for each coordinate, the last lattice step inside, the lattice's phase."""
+
+    origin: Axes
+    direction: Axes
     last: Float[Tensor, "n"]
-    origin: Float[Tensor, "n 3"]
-    direction: Float[Tensor, "n 3"]
     phase: Float[Tensor, "n"]
 
-    def keep(self, mask: Bool[Tensor, "n"], step: Float[Tensor, "n"]) -> _Front:
-        index = mask.nonzero()[:, 0]
-        pick = [
-            x.index_select(0, index)
-            for x in (self.ray, step, self.last, self.origin, self.direction, self.phase)
-        ]
-        return _Front(*pick)
+    def select(self, index: Int[Tensor, "m"]) -> _Walk:
+        x, y, z, u, v, w, last, phase = (
+            part.index_select(0, index) for part in (*self.origin, *self.direction, self.last, self.phase)
+        )
+        return _Walk((x, y, z), (u, v, w), last, phase)
+
+    def at(self, travelled: Float[Tensor, "n *steps"]) -> Axes:
+        """Positions after travelling so many cells."""
+        shape = (-1,) + (1,) * (travelled.ndim - 1)
+        x, y, z = (
+            torch.addcmul(start.view(shape), along.view(shape), travelled)
+            for start, along in zip(self.origin, self.direction, strict=True)
+        )
+        return x, y, z
 
 
 def march(
-    rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "rays"] | float, visit: Visitor
+    rays: Rays,
+    occupancy: Occupancy,
+    step: float,
+    phase: Float[Tensor, "rays"] | float,
+    visit: Visitor,
+    span: Span | None = None,
+    skip_empty: bool = True,
 ) -> None:
     """Walk rays of shape (rays, 3) through the grid and show ``visit`` every wave that may hold occupied cells.
 
-    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. Raises ValueError
-    where a ray starts so far away that its arithmetic cannot tell one lattice step from the next (float32: 2^22 steps).
+    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. ``span`` may say
+    between which distances the occupied cells of each ray lie. Without ``skip_empty`` a ray takes every step in the
+    grid's box. Raises ValueError where a ray starts so far away that its arithmetic cannot tell one lattice step from
+    the next (float32: 2^22 steps).
     """
-    front = _enter(rays, occupancy, step, phase)
-    distance = occupancy.distance.flatten()
-    offsets = torch.arange(WAVE, dtype=rays.origins.dtype, device=rays.origins.device)
-    while len(front.ray):
-        front = _skip_empty(front, occupancy, distance, step / occupancy.cell)
-        if not len(front.ray):
-            return
-        lattice = front.step[:, None] + offsets
-        distances = (lattice + front.phase[:, None]) * step
-        local = (
-            front.origin[:, None, :] + front.direction[:, None, :] * (distances / occupancy.cell)[..., None]
-        )
-        cell = lookup(local, occupancy)
-        cell = torch.where(lattice <= front.last[:, None], cell, -1)
-        alive = visit(front.ray, distances, cell, local)
-        front = front.keep(alive & (front.step + WAVE <= front.last), front.step + WAVE)
+    unit = step / occupancy.cell
+    ray, ahead, every = _enter(rays, occupancy, step, phase, span)
+    nearest = occupancy.distance.flatten() if skip_empty else torch.zeros_like(occupancy.distance).flatten()
+    while len(ray):
+        walk = every.select(ray)
+        away, following = _leap(walk, ahead, occupancy, nearest, unit)
+        there = (away == 0).nonzero()[:, 0]
+        going = following <= walk.last
+        if len(there):
+            # Most rays arrive together, so that few selections copy a part of the rays only.
+            whole = len(there) == len(ray)
+            arrived = walk if whole else walk.select(there)
+            number, first = (
+                (ray, ahead) if whole else (ray.index_select(0, there), ahead.index_select(0, there))
+            )
+            alive = visit(_wave(number, first, arrived, occupancy, unit))
+            beyond = first + WAVE
+            following.index_copy_(0, there, beyond)
+            going.index_copy_(0, there, alive & (beyond <= arrived.last))
+        index = going.nonzero()[:, 0]
+        ray, ahead = ray.index_select(0, index), following.index_select(0, index)
+
+
+def _wave(ray: Tensor, first: Tensor, walk: _Walk, occupancy: Occupancy, unit: float) -> Wave:
+    lattice = first[:, None] + torch.arange(WAVE, dtype=first.dtype, device=first.device)
+    travelled = (lattice + walk.phase[:, None]) * unit
+    local = walk.at(travelled)
+    cell = occupancy.index.flatten().index_select(0, _flat(local, occupancy.index.shape).flatten())
+    place = ((cell >= 0) & (lattice <= walk.last[:, None]).flatten()).nonzero()[:, 0]
+    x, y, z = (
+        _fraction(axis.flatten().index_select(0, place), size)
+        for axis, size in zip(local, occupancy.index.shape, strict=True)
+    )
+    distance = travelled.flatten().index_select(0, place) * occupancy.cell
+    row = torch.div(place, WAVE, rounding_mode="floor")
+    return Wave(ray, row, place, distance, cell.index_select(0, place), (x, y, z))
+
+
+def _fraction(local: Float[Tensor, "k"], size: int) -> Float[Tensor, "k"]:
+    """Position inside the cell that ``_flat`` finds."""
+    return local - local.clamp(0, size - 1).floor()
+
+
+def _flat(local: Axes, shape: torch.Size) -> Int[Tensor, "*n"]:
+    """Flat index of the grid's cell at each position; beyond the grid, of the nearest one."""
+    x, y, z = (axis.clamp(0, size - 1).to(torch.int32) for axis, size in zip(local, shape, strict=True))
+    return torch.add(z, torch.add(y, x, alpha=shape[1]), alpha=shape[2])
 
 
 def lookup(local: Float[Tensor, "*samples 3"], occupancy: Occupancy) -> Int[Tensor, "*samples"]:
     """Number of the occupied cell at positions in cell units from the grid's origin, or -1."""
     shape = occupancy.index.shape
-    x, y, z = local.floor().to(torch.int32).unbind(-1)
-    inside = (x >= 0) & (x < shape[0]) & (y >= 0) & (y < shape[1]) & (z >= 0) & (z < shape[2])
-    flat = (x * shape[1] + y) * shape[2] + z
-    flat = torch.where(inside, flat, torch.zeros_like(flat))
+    x, y, z = (axis.contiguous() for axis in local.unbind(-1))
+    flat = _flat((x, y, z), shape)
     found = occupancy.index.flatten().index_select(0, flat.flatten()).view(flat.shape)
-    return torch.where(inside, found, torch.full_like(found, -1))
+    outside = torch.zeros_like(found, dtype=torch.bool)
+    for axis, size in zip((x, y, z), shape, strict=True):
+        outside |= (axis < 0) | (axis >= size)
+    return found.masked_fill(outside, -1)
 
 
-def _enter(rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "rays"] | float) -> _Front:
-    """Rays that meet the grid's box, at their first lattice step inside."""
-    origin = (rays.origins - occupancy.origin) / occupancy.cell
+def _enter(
+    rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "rays"] | float, span: Span | None
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], _Walk]:
+    """Numbers of the rays that meet the grid's box, their first lattice steps inside, and all rays in cells."""
+    origin = ((rays.origins - occupancy.origin) / occupancy.cell).t().contiguous()
     # A direction component of exactly zero would divide by zero; the smallest slope has the same span.
-    slope = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
-    size = torch.tensor(occupancy.index.shape, dtype=origin.dtype, device=origin.device)
+    slope = rays.directions.t().contiguous()
+    slope = torch.where(slope.abs() < 1e-9, torch.full_like(slope, 1e-9), slope)
+    size = torch.tensor(occupancy.index.shape, dtype=origin.dtype, device=origin.device)[:, None]
     to_low, to_high = -origin / slope, (size - origin) / slope
-    unit = occupancy.cell / step
-    near = torch.minimum(to_low, to_high).amax(-1).clamp_min(0.0) * unit
-    far = torch.maximum(to_low, to_high).amin(-1) * unit
-    phases = torch.as_tensor(phase, dtype=origin.dtype, device=origin.device).expand(len(origin))
-    first, last = (near - phases).ceil().clamp_min(0.0), (far - phases).floor()
-    met, limit = last[first <= last], 0.5 / torch.finfo(origin.dtype).eps
-    farthest = float(met.amax()) if len(met) else 0.0
+    near, far = torch.minimum(to_low, to_high).amax(0).clamp_min(0.0), torch.maximum(to_low, to_high).amin(0)
+    unit = step / occupancy.cell
+    if span is not None:
+        near, far = (
+            torch.maximum(near, span.near / occupancy.cell),
+            torch.minimum(far, span.far / occupancy.cell),
+        )
+    phases = torch.as_tensor(phase, dtype=origin.dtype, device=origin.device).expand(len(near))
+    first, last = (near / unit - phases).ceil().clamp_min(0.0), (far / unit - phases).floor()
+    ray = (first <= last).nonzero()[:, 0]
+    limit = 0.5 / torch.finfo(origin.dtype).eps
+    farthest = float(last.index_select(0, ray).amax()) if len(ray) else 0.0
     if farthest > limit:
         raise ValueError(
             f"march: the grid lies {farthest:.3g} steps of {step:.3g} from a ray's origin, {origin.dtype} counts to "
             f"{limit:.3g}; bring the camera closer"
         )
-    number = torch.arange(len(origin), device=origin.device)
-    return _Front(number, first, last, origin, slope, phases).keep(first <= last, first)
+    x, y, z = origin.unbind(0)
+    u, v, w = slope.unbind(0)
+    return ray, first.index_select(0, ray), _Walk((x, y, z), (u, v, w), last, phases)
 
 
-def _skip_empty(front: _Front, occupancy: Occupancy, distance: Int[Tensor, "coarse"], unit: float) -> _Front:
-    """Move every ray to its next lattice step in an occupied coarse cell; drop the rays that leave the grid.
+def _leap(
+    walk: _Walk, ahead: Float[Tensor, "n"], occupancy: Occupancy, nearest: Int[Tensor, "coarse"], unit: float
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Coarse cells to the nearest occupied one, and the first lattice step behind the empty ones for certain.
 
     A ray whose coarse cell is d > 0 cells from the nearest occupied one may go on to the exit of the cube of
     d - 1 cells around its own.
     """
-    coarse = torch.tensor(occupancy.distance.shape, dtype=torch.int32, device=distance.device)
-    arrived: list[_Front] = []
-    while len(front.ray):
-        travelled = (front.step + front.phase) * unit
-        local = (front.origin + front.direction * travelled[:, None]) / COARSENING
-        own = local.floor()
-        x, y, z = torch.minimum(own.to(torch.int32).clamp_min(0), coarse - 1).unbind(-1)
-        away = distance.index_select(0, (x * coarse[1] + y) * coarse[2] + z)
-        there = away == 0
-        if bool(there.any()):
-            arrived.append(front.keep(there, front.step))
-        reach = (away - 1).to(local.dtype)[:, None]
-        wall = torch.where(front.direction > 0, own + 1.0 + reach, own - reach)
-        ahead = ((wall - local) / front.direction).amin(-1) * COARSENING
-        step = torch.maximum(((travelled + ahead) / unit - front.phase).ceil(), front.step + 1.0)
-        front = front.keep(~there & (step <= front.last), step)
-    if not arrived:
-        return front
-    return _Front(*(torch.cat(parts) for parts in zip(*(_fields(f) for f in arrived), strict=True)))
-
-
-def _fields(front: _Front) -> tuple[Tensor, ...]:
-    return front.ray, front.step, front.last, front.origin, front.direction, front.phase
+    travelled = (ahead + walk.phase) * unit
+    local = tuple(axis / COARSENING for axis in walk.at(travelled))
+    away = nearest.index_select(0, _flat((local[0], local[1], local[2]), occupancy.distance.shape))
+    reach = away.to(travelled.dtype) - 0.5
+    exits = []
+    for axis, along in zip(local, walk.direction, strict=True):
+        slowness = along.reciprocal()
+        exits.append(torch.addcmul((axis.floor() + 0.5 - axis) * slowness, reach, slowness.abs()))
+    free = torch.minimum(torch.minimum(exits[0], exits[1]), exits[2]) * COARSENING
+    following = ((travelled + free) / unit - walk.phase).ceil()
+    return away, torch.maximum(following, ahead + 1.0)
 
 
 class SampleCollector:
@@ -144,29 +208,26 @@ class SampleCollector:
         # One empty part, so that rays which all miss need no special case.
         self._parts = [(number, number, like.new_zeros(0), number.to(torch.int32))]
 
-    def add(
-        self, ray: Int[Tensor, "n"], distance: Float[Tensor, "n wave"], cell: Int[Tensor, "n wave"]
-    ) -> None:
-        """Keep the samples whose ``cell`` is not -1."""
-        kept = cell >= 0
-        rank = kept.cumsum(1)
-        before = self._count.index_select(0, ray)
-        where = kept.flatten().nonzero()[:, 0]
-        row = where // cell.shape[1]
-        order = (rank - 1 + before[:, None]).flatten().index_select(0, where)
-        self._parts.append(
-            (ray.index_select(0, row), order, distance.flatten()[where], cell.flatten()[where])
-        )
-        self._count.index_copy_(0, ray, before + rank[:, -1])
+    def add(self, wave: Wave, kept: Bool[Tensor, "k"] | None = None) -> None:
+        """Keep the samples of a wave, or some of them."""
+        row, distance, cell = wave.row, wave.distance, wave.cell
+        if kept is not None:
+            index = kept.nonzero()[:, 0]
+            row, distance, cell = (part.index_select(0, index) for part in (row, distance, cell))
+        count = torch.bincount(row, minlength=len(wave.ray))
+        before = self._count.index_select(0, wave.ray)
+        # Rows come in order: a sample's rank is its number less that of its row's first sample.
+        first = before - (count.cumsum(0) - count)
+        order = torch.arange(len(row), device=row.device) + first.index_select(0, row)
+        self._parts.append((wave.ray.index_select(0, row), order, distance, cell))
+        self._count.index_copy_(0, wave.ray, before + count)
 
     def finish(self, width: float) -> tuple[PackedSamples, Int[Tensor, "samples"]]:
         """All samples in packed order, each standing for ``width`` of its ray, and their cells."""
         starts = torch.nn.functional.pad(self._count.cumsum(0), (1, 0))
-        total = int(starts[-1])
         ray, order, distance, cell = (torch.cat(parts) for parts in zip(*self._parts, strict=True))
         place = starts.index_select(0, ray) + order
-        packed = [torch.empty(total, dtype=x.dtype, device=x.device) for x in (ray, distance, cell)]
-        for target, source in zip(packed, (ray, distance, cell), strict=True):
-            target[place] = source
-        widths = torch.full_like(packed[1], width)
-        return PackedSamples(packed[0], packed[1], widths, starts), packed[2]
+        packed = [torch.empty_like(x).index_copy_(0, place, x) for x in (distance, cell)]
+        rays = torch.arange(len(self._count), device=ray.device).repeat_interleave(self._count)
+        widths = torch.full_like(packed[0], width)
+        return PackedSamples(rays, packed[0], widths, starts), packed[1]

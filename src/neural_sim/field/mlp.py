@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neural_sim.cameras import unit_sphere_span
-from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.base import RadianceField
 from neural_sim.field.quadrature import render_weights
+from neural_sim.field.samples import PackedSamples
 from neural_sim.types import Rays
 
 SKIP_LAYER = 4

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.field.base import PackedSamples
+from neural_sim.field.samples import PackedSamples
 
 OPAQUE_DEPTH = 50.0
 """Optical depth of one sample behind which nothing is seen: exp(-50) = 2e-22 is lost beside 1 even in float64."""

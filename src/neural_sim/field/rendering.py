@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim import cameras
-from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.base import RadianceField
+from neural_sim.field.pixels import pixel_rays, seen_pixels
 from neural_sim.field.quadrature import composite, composite_with_tangents
+from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PinholeCamera, Rays
 
 
@@ -60,15 +61,17 @@ def render_views(
     camera_to_world: Float[Tensor, "views 4 4"],
     termination: float,
     rays_per_chunk: int,
+    cull: bool = True,
+    skip_empty: bool = True,
 ) -> Float[Tensor, "views height width 4"]:
-    """Premultiplied RGBA of whole views; chunks bound the memory and may span views."""
-    bundle = cameras.rays(camera, camera_to_world)
-    origins, directions = bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)
-    pixels = [
-        torch.cat([rgb, opacity[:, None]], -1)
-        for rgb, opacity in (
-            render_packed(field, Rays(o, d), termination)
-            for o, d in zip(origins.split(rays_per_chunk), directions.split(rays_per_chunk), strict=True)
-        )
-    ]
-    return torch.cat(pixels).view(*bundle.origins.shape[:-1], 4)
+    """Premultiplied RGBA of whole views; chunks bound the memory and may span views.
+
+    ``cull`` casts rays only for pixels that may see something; for ``skip_empty`` see ``RadianceField.trace``.
+    """
+    shape = (len(camera_to_world), camera.height, camera.width, 4)
+    image = camera_to_world.new_zeros(shape).view(-1, 4)
+    for seen in seen_pixels(field, camera, camera_to_world, rays_per_chunk, cull):
+        rays = pixel_rays(camera, camera_to_world, seen.pixel)
+        rgb, opacity = field.trace(rays, termination, seen.span, skip_empty)
+        image.index_copy_(0, seen.pixel, torch.cat([rgb, opacity[:, None]], -1))
+    return image.view(shape)

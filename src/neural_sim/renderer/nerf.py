@@ -37,7 +37,9 @@ class NerfRenderer:
     ) -> tuple[Float[Tensor, "views height width 3"], Float[Tensor, "views height width"]]:
         """Premultiplied colour and opacity; ``exact`` leaves no sample out behind opaque surfaces."""
         termination = 0.0 if exact else self.termination
-        image = render_views(field, camera, camera_to_world, termination, self.rays_per_chunk)
+        image = render_views(
+            field, camera, camera_to_world, termination, self.rays_per_chunk, not exact, not exact
+        )
         return image[..., :3], image[..., 3]
 
     @torch.no_grad()

@@ -1,0 +1,56 @@
+"""Light along rays that are walked wave by wave: how much reaches each sample, and which rays have none left."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from neural_sim.field.marching import WAVE, Wave
+from neural_sim.field.quadrature import OPAQUE_DEPTH
+
+
+class Extinction:
+    """Optical depth that each of ``rays`` has gathered so far; samples behind ``termination`` are not counted.
+
+    Sums run along one ray only, so that they keep the digits of the rays' own type.
+    """
+
+    def __init__(self, rays: int, termination: float, like: Float[Tensor, "*any"]) -> None:
+        self._depth = like.new_zeros(rays)
+        self._deepest = -math.log(termination) if termination > 0.0 else math.inf
+
+    def enter(
+        self, wave: Wave, optical: Float[Tensor, "k"]
+    ) -> tuple[Float[Tensor, "k"], Bool[Tensor, "k"], Bool[Tensor, "n"]]:
+        """Depth before each sample of optical thickness ``optical``, which samples count, and which rays go on."""
+        # One column more than steps: the sum before each sample is read off without subtracting its own.
+        thickness = optical.new_zeros(len(wave.ray), WAVE + 1)
+        thickness[:, 0] = self._depth.index_select(0, wave.ray)
+        slot = wave.place + wave.row
+        thickness.view(-1).index_copy_(0, slot + 1, optical.clamp_max(OPAQUE_DEPTH))
+        depth = thickness.cumsum(1)
+        before = depth.view(-1).index_select(0, slot)
+        after = depth[:, -1]
+        alive = after < self._deepest
+        if math.isfinite(self._deepest):
+            # The sample that crosses the limit is the last to count.
+            after = torch.minimum(after, depth.masked_fill(depth < self._deepest, math.inf).amin(1))
+        self._depth.index_copy_(0, wave.ray, after)
+        return before, before < self._deepest, alive
+
+    def opacity(self) -> Float[Tensor, "rays"]:
+        """What all counted samples together absorb: the sum of their weights."""
+        return -torch.expm1(-self._depth)
+
+
+def sum_rows(values: Float[Tensor, "k c"], weights: Float[Tensor, "k"], wave: Wave) -> Float[Tensor, "n c"]:
+    """Weighted sum of the samples of each of a wave's rays."""
+    count = torch.bincount(wave.row, minlength=len(wave.ray))
+    every = torch.arange(len(values), device=values.device)
+    return functional.embedding_bag(
+        every, values, count.cumsum(0) - count, per_sample_weights=weights, mode="sum"
+    )

@@ -1,0 +1,36 @@
+"""Where along rays a field is asked: samples without padding, and the spans that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PackedSamples:
+    """Samples of many rays without padding, sorted by ray and then by distance (the layout of nerfacc).
+
+    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii and
+    ``width`` the length of ray the sample stands for. Ray r owns the samples ``starts[r]:starts[r + 1]``.
+    """
+
+    ray: Int[Tensor, "samples"]
+    distance: Float[Tensor, "samples"]
+    width: Float[Tensor, "samples"]
+    starts: Int[Tensor, "rays_plus_one"]
+
+    def __len__(self) -> int:
+        return self.ray.shape[0]
+
+
+@dataclass(frozen=True)
+class Span:
+    """Distances between which each ray may meet something, in object radii; none where near > far."""
+
+    near: Float[Tensor, "rays"]
+    far: Float[Tensor, "rays"]
+
+    def select(self, index: Int[Tensor, "some"]) -> Span:
+        return Span(self.near.index_select(0, index), self.far.index_select(0, index))

@@ -1,0 +1,63 @@
+"""Which pixels can see occupied space, and between which distances: coarse cells projected before any ray is cast."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from neural_sim.cameras import focal_length
+from neural_sim.field.base import Span
+from neural_sim.field.occupancy import COARSENING, Occupancy
+from neural_sim.types import PinholeCamera
+
+
+def coarse_centres(occupancy: Occupancy) -> tuple[Float[Tensor, "3 cells"], float]:
+    """Centres of the occupied coarse cells and the radius of a ball round each, in object radii."""
+    edge = COARSENING * occupancy.cell
+    where = (occupancy.distance == 0).nonzero().t().to(occupancy.origin)
+    return occupancy.origin[:, None] + (where + 0.5) * edge, 0.5 * math.sqrt(3.0) * edge
+
+
+@torch.no_grad()
+def screen_span(
+    centres: Float[Tensor, "3 cells"],
+    radius: float,
+    camera: PinholeCamera,
+    camera_to_world: Float[Tensor, "4 4"],
+    rows: range,
+) -> Span:
+    """Distances between which the rays of the image's ``rows`` can meet balls of ``radius`` round ``centres``.
+
+    Never too short; near > far where a pixel sees none. Each ball is drawn as one pixel, its nearest and farthest
+    distance; all are widened together by as many pixels as the largest one covers. Where a ball touches the plane of
+    the camera nothing is known, and every pixel gets all distances.
+    """
+    rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
+    x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)
+    size = (len(rows), camera.width)
+    # A margin for the rounding of this arithmetic, far below a step.
+    radius = radius * (1.0 + 1e-4)
+    # A point of the ball lies at (x + u) / (-z + w), |u|, |w| <= radius: off the centre by at most this slope.
+    across, down = x / -z, -y / -z
+    slope = radius * (1.0 + torch.maximum(across.abs(), down.abs())) / (-z - radius)
+    largest = float(slope.amax()) if bool((-z > 1.01 * radius).all()) else math.inf
+    focal = focal_length(camera)
+    if focal * largest > max(camera.width, camera.height):
+        whole = x.new_zeros(size[0] * size[1])
+        return Span(whole, whole + math.inf)
+    reach = math.ceil(focal * largest + 0.5)
+    wide = (size[0] + 2 * reach, size[1] + 2 * reach)
+    column = (focal * across + (0.5 * camera.width + reach)).clamp(0, wide[1] - 1)
+    row = (focal * down + (0.5 * camera.height + reach - rows.start)).clamp(0, wide[0] - 1)
+    pixel = torch.add(column.long(), row.long(), alpha=wide[1])
+    distance = torch.sqrt(x * x + y * y + z * z)
+    bounds = x.new_full((2, wide[0] * wide[1]), -math.inf)
+    bounds[0].scatter_reduce_(0, pixel, radius - distance, "amax")
+    bounds[1].scatter_reduce_(0, pixel, radius + distance, "amax")
+    pooled = functional.max_pool2d(bounds.view(2, 1, *wide), (2 * reach + 1, 1), 1)
+    pooled = functional.max_pool2d(pooled, (1, 2 * reach + 1), 1).flatten(1)
+    return Span(-pooled[0], pooled[1])
