@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neural_sim.field.marching import WAVE, Wave
+from neural_sim.field.marching import Wave
 from neural_sim.field.quadrature import OPAQUE_DEPTH
 
 
@@ -28,17 +28,18 @@ class Extinction:
     ) -> tuple[Float[Tensor, "k"], Bool[Tensor, "k"], Bool[Tensor, "n"]]:
         """Depth before each sample of optical thickness ``optical``, which samples count, and which rays go on."""
         # One column more than steps: the sum before each sample is read off without subtracting its own.
-        thickness = optical.new_zeros(len(wave.ray), WAVE + 1)
+        thickness = optical.new_zeros(len(wave.ray), wave.length + 1)
         thickness[:, 0] = self._depth.index_select(0, wave.ray)
         slot = wave.place + wave.row
         thickness.view(-1).index_copy_(0, slot + 1, optical.clamp_max(OPAQUE_DEPTH))
         depth = thickness.cumsum(1)
         before = depth.view(-1).index_select(0, slot)
-        after = depth[:, -1]
+        after = depth[:, -1].contiguous()
         alive = after < self._deepest
-        if math.isfinite(self._deepest):
-            # The sample that crosses the limit is the last to count.
-            after = torch.minimum(after, depth.masked_fill(depth < self._deepest, math.inf).amin(1))
+        ended = (~alive).nonzero()[:, 0]
+        # The sample that crosses the limit is the last to count.
+        last = depth.index_select(0, ended)
+        after.index_copy_(0, ended, last.masked_fill(last < self._deepest, math.inf).amin(1))
         self._depth.index_copy_(0, wave.ray, after)
         return before, before < self._deepest, alive
 
@@ -49,8 +50,6 @@ class Extinction:
 
 def sum_rows(values: Float[Tensor, "k c"], weights: Float[Tensor, "k"], wave: Wave) -> Float[Tensor, "n c"]:
     """Weighted sum of the samples of each of a wave's rays."""
-    count = torch.bincount(wave.row, minlength=len(wave.ray))
     every = torch.arange(len(values), device=values.device)
-    return functional.embedding_bag(
-        every, values, count.cumsum(0) - count, per_sample_weights=weights, mode="sum"
-    )
+    first = wave.count.cumsum(0) - wave.count
+    return functional.embedding_bag(every, values, first, per_sample_weights=weights, mode="sum")

@@ -27,11 +27,12 @@ def corner_weights(
     x: Float[Tensor, "samples"], y: Float[Tensor, "samples"], z: Float[Tensor, "samples"]
 ) -> Float[Tensor, "samples 8"]:
     """``trilinear_weights`` of coordinates kept apart, an order of magnitude faster on a CPU; no derivative passes."""
-    weights = x.new_empty(len(x), 8)
-    for index, edge in enumerate(_bilinear(x, y)):
-        torch.mul(edge, z, out=weights[:, 2 * index + 1])
-        torch.sub(edge, weights[:, 2 * index + 1], out=weights[:, 2 * index])
-    return weights
+    edges = torch.stack(_bilinear(x, y))
+    upper = edges * z
+    weights = x.new_empty(len(x), 4, 2)
+    weights[..., 1] = upper.t()
+    torch.sub(edges.t(), upper.t(), out=weights[..., 0])
+    return weights.flatten(1)
 
 
 def trilinear_tangents(

@@ -18,21 +18,26 @@ from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.field.samples import PackedSamples, Span
 from neural_sim.types import Rays
 
-WAVE = 8
-"""Lattice steps taken at once by each ray that has reached a coarse occupied cell; a power of two."""
+SHORTEST, LONGEST = 8, 64
+"""Lattice steps taken at once by each ray that has reached a coarse occupied cell, powers of two."""
+POINTS = 131_072
+"""Below so many points a wave costs little more than its calls, and few rays take longer waves than many."""
 
 Axes = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Wave:
-    """The next ``WAVE`` lattice steps of n rays, of which k lie in occupied cells.
+    """The next ``length`` lattice steps of n rays, of which k lie in occupied cells.
 
-    ``ray`` numbers the rays, ``row`` counts within ``ray`` and ``place`` within the n x WAVE steps, both in increasing
-    order. ``fraction`` is the position inside the cell, x, y and z in [0, 1].
+    ``ray`` numbers the rays, ``row`` counts within ``ray`` and ``place`` within the n x length steps, both in
+    increasing order; ``count`` is the number of each ray's samples. ``fraction`` is the position inside the cell, x, y
+    and z in [0, 1].
     """
 
+    length: int
     ray: Int[Tensor, "n"]
+    count: Int[Tensor, "n"]
     row: Int[Tensor, "k"]
     place: Int[Tensor, "k"]
     distance: Float[Tensor, "k"]
@@ -91,7 +96,11 @@ def march(
     while len(ray):
         walk = every.select(ray)
         away, following = _leap(walk, ahead, occupancy, nearest, unit)
-        there = (away == 0).nonzero()[:, 0]
+        length = SHORTEST
+        while 2 * length * len(ray) <= POINTS and length < LONGEST:
+            length *= 2
+        # A long wave soon crosses the gap to an occupied coarse cell that is near.
+        there = (away <= length // (4 * COARSENING)).nonzero()[:, 0]
         going = following <= walk.last
         if len(there):
             # Most rays arrive together, so that few selections copy a part of the rays only.
@@ -100,27 +109,28 @@ def march(
             number, first = (
                 (ray, ahead) if whole else (ray.index_select(0, there), ahead.index_select(0, there))
             )
-            alive = visit(_wave(number, first, arrived, occupancy, unit))
-            beyond = first + WAVE
+            alive = visit(_wave(number, first, length, arrived, occupancy, unit))
+            beyond = first + length
             following.index_copy_(0, there, beyond)
             going.index_copy_(0, there, alive & (beyond <= arrived.last))
         index = going.nonzero()[:, 0]
         ray, ahead = ray.index_select(0, index), following.index_select(0, index)
 
 
-def _wave(ray: Tensor, first: Tensor, walk: _Walk, occupancy: Occupancy, unit: float) -> Wave:
-    lattice = first[:, None] + torch.arange(WAVE, dtype=first.dtype, device=first.device)
+def _wave(ray: Tensor, first: Tensor, length: int, walk: _Walk, occupancy: Occupancy, unit: float) -> Wave:
+    lattice = first[:, None] + torch.arange(length, dtype=first.dtype, device=first.device)
     travelled = (lattice + walk.phase[:, None]) * unit
     local = walk.at(travelled)
     cell = occupancy.index.flatten().index_select(0, _flat(local, occupancy.index.shape).flatten())
-    place = ((cell >= 0) & (lattice <= walk.last[:, None]).flatten()).nonzero()[:, 0]
+    kept = (cell.view_as(lattice) >= 0) & (lattice <= walk.last[:, None])
+    place = kept.flatten().nonzero()[:, 0]
     x, y, z = (
         _fraction(axis.flatten().index_select(0, place), size)
         for axis, size in zip(local, occupancy.index.shape, strict=True)
     )
     distance = travelled.flatten().index_select(0, place) * occupancy.cell
-    row = torch.div(place, WAVE, rounding_mode="floor")
-    return Wave(ray, row, place, distance, cell.index_select(0, place), (x, y, z))
+    row = place >> (length.bit_length() - 1)
+    return Wave(length, ray, kept.sum(1), row, place, distance, cell.index_select(0, place), (x, y, z))
 
 
 def _fraction(local: Float[Tensor, "k"], size: int) -> Float[Tensor, "k"]:
@@ -210,11 +220,11 @@ class SampleCollector:
 
     def add(self, wave: Wave, kept: Bool[Tensor, "k"] | None = None) -> None:
         """Keep the samples of a wave, or some of them."""
-        row, distance, cell = wave.row, wave.distance, wave.cell
+        row, distance, cell, count = wave.row, wave.distance, wave.cell, wave.count
         if kept is not None:
             index = kept.nonzero()[:, 0]
             row, distance, cell = (part.index_select(0, index) for part in (row, distance, cell))
-        count = torch.bincount(row, minlength=len(wave.ray))
+            count = torch.bincount(row, minlength=len(wave.ray))
         before = self._count.index_select(0, wave.ray)
         # Rows come in order: a sample's rank is its number less that of its row's first sample.
         first = before - (count.cumsum(0) - count)

@@ -7,7 +7,6 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from neural_sim.cameras import focal_length
 from neural_sim.field.base import Span
@@ -58,6 +57,21 @@ def screen_span(
     bounds = x.new_full((2, wide[0] * wide[1]), -math.inf)
     bounds[0].scatter_reduce_(0, pixel, radius - distance, "amax")
     bounds[1].scatter_reduce_(0, pixel, radius + distance, "amax")
-    pooled = functional.max_pool2d(bounds.view(2, 1, *wide), (2 * reach + 1, 1), 1)
-    pooled = functional.max_pool2d(pooled, (1, 2 * reach + 1), 1).flatten(1)
+    pooled = _sliding_max(_sliding_max(bounds.view(2, *wide), 1, 2 * reach + 1), 2, 2 * reach + 1).flatten(1)
     return Span(-pooled[0], pooled[1])
+
+
+def _sliding_max(values: Float[Tensor, "2 h w"], axis: int, width: int) -> Float[Tensor, "2 h2 w2"]:
+    """Largest of every ``width`` neighbours along an axis, by windows that double; far fewer steps than pooling."""
+    window = 1
+    while 2 * window <= width:
+        values = _larger(values, axis, window)
+        window *= 2
+    return _larger(values, axis, width - window)
+
+
+def _larger(values: Float[Tensor, "2 h w"], axis: int, shift: int) -> Float[Tensor, "2 h2 w2"]:
+    if not shift:
+        return values
+    rest = values.shape[axis] - shift
+    return torch.maximum(values.narrow(axis, 0, rest), values.narrow(axis, shift, rest))
