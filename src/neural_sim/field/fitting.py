@@ -19,7 +19,7 @@ from neural_sim.field.rendering import sample_points
 from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PosedViews
 
-BATCHES_PER_BLOCK = 4
+BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 
 

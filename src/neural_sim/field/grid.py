@@ -140,10 +140,10 @@ class GridField(RadianceField):
         if cells is None:
             cells = lookup(base, self.occupancy)
         corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
-        weights = trilinear_weights(local - base)
         if self.training:
+            weights = corner_weights(*(local - base).t().contiguous())
             return interpolate_for_training(self.table, corners, weights)
-        return interpolate(self.table, corners, weights)
+        return interpolate(self.table, corners, trilinear_weights(local - base))
 
     @torch.no_grad()
     def query_with_tangents(
@@ -257,9 +257,9 @@ def _interpolate_from(
         cell = lookup(here + nudge, occupancy)
         found = (cell >= 0).nonzero()[:, 0]
         base = (here + nudge).floor().index_select(0, found)
-        weights = trilinear_weights(here.index_select(0, found) - base)
+        weights = corner_weights(*(here.index_select(0, found) - base).t().contiguous())
         rows = corners.index_select(0, cell.index_select(0, found))
-        result[missing.index_select(0, found)] = interpolate(table, rows, weights)
+        result.index_copy_(0, missing.index_select(0, found), gather_weighted(table, rows, weights))
         missing = missing[cell < 0]
     return result
 
