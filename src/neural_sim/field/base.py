@@ -58,6 +58,10 @@ class RadianceField(nn.Module, ABC):
         below ``termination`` may be left out; 0 leaves nothing out.
         """
 
+    def with_step(self, multiple: float) -> RadianceField:
+        """This field, its tensors shared, sampled at ``multiple`` times its step; itself where it has no step."""
+        return self
+
     @torch.no_grad()
     def trace(
         self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -90,6 +92,13 @@ class GridField(RadianceField):
     def step(self) -> float:
         """The quadrature's step in object radii."""
         return self.step_cells * float(self.cell)
+
+    def with_step(self, multiple: float) -> GridField:
+        if multiple == 1.0:
+            return self
+        other = copy.copy(self)
+        other.step_cells = self.step_cells * multiple
+        return other
 
     def reset(self, occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> None:
         """Start over with these cells: raw density ``initial_density``, features 0."""

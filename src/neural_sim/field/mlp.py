@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -103,6 +105,15 @@ class MLPField(RadianceField):
 
     def settings(self) -> dict[str, object]:
         return dict(self._settings)
+
+    def with_step(self, multiple: float) -> MLPField:
+        """See the base class; fewer samples in both passes, at least two."""
+        if multiple == 1.0:
+            return self
+        other = copy.copy(self)
+        other.coarse_samples = max(2, round(self.coarse_samples / multiple))
+        other.fine_samples = max(2, round(self.fine_samples / multiple))
+        return other
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]

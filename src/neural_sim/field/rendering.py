@@ -12,6 +12,8 @@ from neural_sim.field.quadrature import composite, composite_with_tangents
 from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PinholeCamera, Rays
 
+RAY_NUMBERS = 6
+
 
 def sample_points(
     rays: Rays, samples: PackedSamples
@@ -44,14 +46,26 @@ def render_with_tangents(
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
     """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
 
-    One pass over the samples gives both: a sample at distance t moves at o' + t d'.
+    One pass over the samples gives both: a sample at distance t moves at o' + t d'. A ray has six numbers; of more
+    rates than that, the derivatives by these six are taken and combined.
     """
+    if len(rates.origins) > RAY_NUMBERS:
+        pixels, by_number = render_with_tangents(field, rays, _unit_rates(rays), termination)
+        numbers = torch.cat([rates.origins, rates.directions], -1)
+        return pixels, torch.einsum("mrk,krc->mrc", numbers, by_number)
     samples = field.sample(rays, termination)
     positions, directions = sample_points(rays, samples)
     turns = rates.directions.index_select(1, samples.ray)
     velocities = torch.addcmul(rates.origins.index_select(1, samples.ray), turns, samples.distance[:, None])
     queried = field.query_with_tangents(positions, directions, velocities, turns)
     return composite_with_tangents(*queried, samples)
+
+
+def _unit_rates(rays: Rays) -> Rays:
+    """Rays whose six numbers, origin and direction, change one at a time."""
+    unit = torch.eye(RAY_NUMBERS, dtype=rays.origins.dtype, device=rays.origins.device)
+    unit = unit[:, None].expand(-1, len(rays.origins), -1)
+    return Rays(unit[..., :3], unit[..., 3:])
 
 
 @torch.no_grad()
