@@ -1,6 +1,7 @@
-"""Milliseconds and samples of a field's images: `python benchmarks/render.py --root ../shared/ycb --names 019`.
+"""Milliseconds, samples and memory of a field's images: `python benchmarks/render.py --root ../shared/ycb --names 019`.
 
-Times `NerfRenderer.render` against image size, and its error against a render with nothing left out.
+Times `NerfRenderer.render` of each quality against image size, with its error against a render with nothing left out;
+at `--omit-size` also with each omission of the final quality undone, to see what it saves and costs.
 """
 
 from __future__ import annotations
@@ -15,31 +16,53 @@ from pathlib import Path
 
 import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
+from hypergradient import peak_bytes
 from machine import machine
 
 from neural_sim import cameras
 from neural_sim.field.base import RadianceField
-from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.field.pixels import seen_pixels
+from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.types import PinholeCamera, PosedViews, Rays
 
 
-def measure(field: RadianceField, views: PosedViews, size: int, repeats: int) -> dict[str, float]:
-    renderer = NerfRenderer()
+def variants(qualities: list[Quality], undo: bool) -> dict[str, NerfRenderer]:
+    made = {quality: NerfRenderer(quality) for quality in qualities}
+    if not undo:
+        return dict(made)
+    return {
+        **made,
+        "every pixel": NerfRenderer(cull=False),
+        "every step": NerfRenderer(skip_empty=False),
+        "every sample": NerfRenderer(termination=0.0),
+    }
+
+
+def measure(
+    field: RadianceField, renderer: NerfRenderer, views: PosedViews, size: int, repeats: int
+) -> dict[str, float]:
     camera, pose = PinholeCamera(size, size, math.radians(40.0)), views.camera_to_world[-HELD_OUT:]
-    seconds = []
-    for _ in range(repeats + 1):
-        begun = time.perf_counter()
-        rgb, opacity = renderer.render(field, camera, pose)
+    rgb, opacity = renderer.render(field, camera, pose)
+    seconds, processor = [], []
+    for _ in range(repeats):
+        begun, worked = time.perf_counter(), time.process_time()
+        renderer.render(field, camera, pose)
         seconds.append((time.perf_counter() - begun) / len(pose))
+        processor.append((time.process_time() - worked) / len(pose))
     every_rgb, every_opacity = renderer.render(field, camera, pose, exact=True)
     shown = (opacity > 0.01) | (every_opacity > 0.01)
     bundle = cameras.rays(camera, pose[:1])
     rays = Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3))
-    samples = field.sample(rays, renderer.termination)
+    samples = field.with_step(renderer.step).sample(rays, renderer.termination)
     hit = int((samples.starts.diff() > 0).sum())
+    cast = sum(len(seen.pixel) for seen in seen_pixels(field, camera, pose, 65536, renderer.cull))
     return {
         "size": size,
-        "milliseconds": 1e3 * statistics.median(seconds[1:]),
+        "milliseconds": 1e3 * statistics.median(seconds),
+        "cpu_milliseconds": 1e3 * statistics.median(processor),
+        "images_per_second": 1.0 / statistics.median(seconds),
+        "peak_megabytes": peak_bytes(lambda: renderer.render(field, camera, pose)) / 2**20,
+        "rays_cast": cast / (len(pose) * size * size),
         "rays_hit": hit / len(rays.origins),
         "samples_per_hit_ray": len(samples) / max(hit, 1),
         "opacity_error": float((opacity - every_opacity).abs()[shown].mean()),
@@ -53,6 +76,8 @@ def main() -> None:
     parser.add_argument("--names", nargs="*")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--sizes", type=int, nargs="*", default=[64, 96, 128, 256])
+    parser.add_argument("--qualities", nargs="*", default=["draft", "normal", "final"])
+    parser.add_argument("--omit-size", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/render.json"))
@@ -60,18 +85,23 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     rows = []
-    print(f"{'object':24}{'size':>6}{'ms':>8}{'hit':>6}{'samples/ray':>13}{'opacity err':>13}{'psnr':>7}")
+    print(
+        f"{'object':24}{'size':>5} {'variant':13}{'ms':>7}{'cpu ms':>8}{'MB':>7}{'cast':>6}{'hit':>6}{'smp/ray':>8}"
+        f"{'opacity err':>12}{'psnr':>7}"
+    )
     for item in load_objects(arguments.root, arguments.names):
         views = training_views(item, 128, 100)
         field, _ = fit(views, arguments.steps, 0)
         for size in arguments.sizes:
-            row = measure(field, views, size, arguments.repeats)
-            rows.append({"object": item.name, **row})
-            print(
-                f"{item.name:24}{size:6}{row['milliseconds']:8.1f}{row['rays_hit']:6.2f}"
-                f"{row['samples_per_hit_ray']:13.1f}{row['opacity_error']:13.2e}{row['colour_psnr']:7.1f}",
-                flush=True,
-            )
+            for name, renderer in variants(arguments.qualities, size == arguments.omit_size).items():
+                row = measure(field, renderer, views, size, arguments.repeats)
+                rows.append({"object": item.name, "variant": name, **row})
+                print(
+                    f"{item.name:24}{size:5} {name:13}{row['milliseconds']:7.1f}{row['cpu_milliseconds']:8.1f}"
+                    f"{row['peak_megabytes']:7.1f}{row['rays_cast']:6.2f}{row['rays_hit']:6.2f}"
+                    f"{row['samples_per_hit_ray']:8.1f}{row['opacity_error']:12.2e}{row['colour_psnr']:7.1f}",
+                    flush=True,
+                )
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=2))
 

@@ -110,3 +110,12 @@ def test_loading_something_else_is_refused(tmp_path: Path) -> None:
 def test_bad_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="GridField"):
         GridField(**wrong)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_type_too_coarse_for_places_in_a_cell_is_refused(dtype: torch.dtype) -> None:
+    field = GridField()
+    with pytest.raises(ValueError, match="float32 or float64"):
+        field.to(dtype)
+    assert field.table.dtype == field.origin.dtype == torch.float32
+    assert field.double().table.dtype == torch.float64

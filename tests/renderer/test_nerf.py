@@ -7,7 +7,7 @@ import torch
 
 from neural_sim import cameras
 from neural_sim.field.grid import GridField
-from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.nerf import QUALITIES, NerfRenderer, Quality
 from neural_sim.types import PinholeCamera, Rays
 
 
@@ -123,6 +123,75 @@ def test_tangents_ride_along_with_the_render(field: GridField, rays_per_chunk: i
         assert float(tangent.rgb.abs().max()) > 0.1
 
 
+@pytest.fixture(scope="module")
+def cup() -> GridField:
+    """A thin opaque cup with a painted side, as fits leave it: dense within two cells of its surface.
+
+    (A wall thinner than the draft's step of two cells shows through: one cell thick, this cup errs by 0.12.)
+    """
+    field, cell = GridField(), 1.0 / 24.0
+    field.reset(torch.ones(48, 48, 48, dtype=torch.bool), torch.full((3,), -1.0), cell)
+    grid = torch.stack(torch.meshgrid(*[torch.linspace(-1.0, 1.0, 49)] * 3, indexing="ij"), -1).flatten(0, 2)
+    radius, height = grid[:, :2].norm(dim=-1), grid[:, 2]
+    wall = torch.maximum((radius - 0.5).abs(), height.abs() - 0.6)
+    floor = torch.maximum((height + 0.6).abs(), radius - 0.5)
+    with torch.no_grad():
+        field.table[:-1, 0] = 16.0 - 8.0 * torch.minimum(wall, floor) / cell
+        field.table[:-1, 1:] = 2.0 * torch.sin(4.0 * grid)
+    field.keep(field.table[:-1, 0].detach().view(49, 49, 49)[:-1, :-1, :-1].flatten() > -12.0, refine=False)
+    return field.eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("quality", "opacity_error", "colour_psnr"),
+    [("draft", 0.02, 30.0), ("normal", 0.01, 45.0), ("final", 0.001, 65.0)],
+)
+def test_qualities_stay_within_their_errors(
+    cup: GridField, quality: Quality, opacity_error: float, colour_psnr: float
+) -> None:
+    camera, poses = PinholeCamera(64, 64, math.radians(40.0)), view()[1].float()
+    rgb, opacity = NerfRenderer(quality).render(cup, camera, poses)
+    every_rgb, every_opacity = NerfRenderer(quality).render(cup, camera, poses, exact=True)
+    shown = (opacity > 0.01) | (every_opacity > 0.01)
+    assert int(shown.sum()) > 500 and float(every_opacity.max()) > 0.99
+    assert 0.0 < float((opacity - every_opacity).abs()[shown].mean()) < opacity_error
+    assert float((rgb - every_rgb).square().mean()) < 10.0 ** (-colour_psnr / 10.0)
+
+
+@pytest.mark.parametrize("quality", list(QUALITIES))
+def test_values_and_derivatives_of_a_quality_are_those_of_one_function(
+    field: GridField, quality: Quality, generator: torch.Generator
+) -> None:
+    """Views, replayed rays, tangents and reverse mode agree, whatever the quality leaves out."""
+    camera, poses = view(7)
+    renderer = NerfRenderer(quality)
+    rates = torch.randn(9, 2, 4, 4, generator=generator, dtype=torch.float64)
+    maps, tangents = renderer.render_with_tangents(field, camera, poses, rates)
+    torch.testing.assert_close(
+        (maps.rgb, maps.opacity), renderer.render(field, camera, poses), rtol=0.0, atol=1e-12
+    )
+
+    def replayed(pose: torch.Tensor) -> torch.Tensor:
+        rgb, opacity = renderer.render_rays(field, flat(cameras.rays(camera, pose)))
+        return torch.cat([rgb, opacity[:, None]], -1)
+
+    first = replayed(poses)
+    assert torch.equal(first, replayed(poses))
+    # Nine rates are more than a ray has numbers; two are fewer.
+    few = renderer.render_with_tangents(field, camera, poses, rates[:2])[1]
+    for number, tangent in enumerate(tangents):
+        _, expected = torch.func.jvp(replayed, (poses,), (rates[number],))
+        stacked = torch.cat([tangent.rgb, tangent.opacity[..., None]], -1).view(-1, 4)
+        torch.testing.assert_close(stacked, expected, rtol=1e-9, atol=1e-10)
+        if number < len(few):
+            torch.testing.assert_close((few[number].rgb, few[number].opacity), (tangent.rgb, tangent.opacity))
+    cotangent = torch.randn(first.shape, generator=generator, dtype=torch.float64)
+    leaf = poses.clone().requires_grad_()
+    (pulled,) = torch.autograd.grad(replayed(leaf), leaf, cotangent)
+    along = torch.cat([tangents[0].rgb, tangents[0].opacity[..., None]], -1).view(-1, 4)
+    assert float((along * cotangent).sum()) == pytest.approx(float((pulled * rates[0]).sum()), rel=1e-9)
+
+
 def test_wrong_shapes_and_settings_are_refused(field: GridField) -> None:
     with pytest.raises(ValueError, match=r"\(rays, 3\)"):
         NerfRenderer().render_rays(field, Rays(torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)))
@@ -130,3 +199,7 @@ def test_wrong_shapes_and_settings_are_refused(field: GridField) -> None:
         NerfRenderer(termination=1.0)
     with pytest.raises(ValueError, match="rays_per_chunk"):
         NerfRenderer(rays_per_chunk=0)
+    with pytest.raises(ValueError, match="step"):
+        NerfRenderer(step=0.0)
+    with pytest.raises(ValueError, match="quality"):
+        NerfRenderer("best")  # pyright: ignore[reportArgumentType]

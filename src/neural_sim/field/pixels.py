@@ -14,7 +14,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.samples import Span
 from neural_sim.types import PinholeCamera, Rays
 
-STRIP = 16384
+SMALLEST_STRIP, LARGEST_STRIP = 4096, 16384
 """Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one."""
 
 
@@ -34,7 +34,8 @@ def seen_pixels(
     cull: bool = True,
 ) -> Iterator[SeenPixels]:
     """Chunks of at most ``rays_per_chunk`` pixels, in order; with ``cull`` only those that may see the field."""
-    rows_per_strip = max(1, STRIP // camera.width)
+    strip = max(SMALLEST_STRIP, min(rays_per_chunk, LARGEST_STRIP))
+    rows_per_strip = max(1, strip // camera.width)
     waiting: list[SeenPixels] = []
     for view, pose in enumerate(camera_to_world):
         for top in range(0, camera.height, rows_per_strip):
@@ -52,21 +53,15 @@ def pixel_rays(
 ) -> Rays:
     """Rays of the pixels with the given flat indices: those of ``cameras.rays``, linear in the pose like them."""
     per_view = camera.height * camera.width
-    view, inside = torch.div(pixel, per_view, rounding_mode="floor"), pixel % per_view
+    inside, focal = pixel % per_view, focal_length(camera)
+    x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
     row = torch.div(inside, camera.width, rounding_mode="floor")
-    focal, dtype = focal_length(camera), camera_to_world.dtype
-    across = ((inside % camera.width).to(dtype) + (0.5 - 0.5 * camera.width)) / focal
-    up = (row.to(dtype) + (0.5 - 0.5 * camera.height)) / -focal
-    length = torch.sqrt(across * across + up * up + 1.0)
-    across, up, ahead = across / length, up / length, -1.0 / length
-    pose = camera_to_world[:, :3].permute(1, 2, 0).contiguous()
-    directions = [
-        (line[0].index_select(0, view) * across)
-        .addcmul_(line[1].index_select(0, view), up)
-        .addcmul_(line[2].index_select(0, view), ahead)
-        for line in pose
-    ]
-    return Rays(camera_to_world[:, :3, 3].index_select(0, view), torch.stack(directions, -1))
+    y = (row.to(camera_to_world.dtype) + 0.5 - 0.5 * camera.height) / focal
+    local = torch.stack([x, -y, -torch.ones_like(x)], -1)
+    local = local / local.norm(dim=-1, keepdim=True)
+    pose = camera_to_world.index_select(0, torch.div(pixel, per_view, rounding_mode="floor"))
+    # The arithmetic of the estimators' rays: a sample that lands in another cell has another derivative.
+    return Rays(pose[:, :3, 3], torch.einsum("rij,rj->ri", pose[:, :3, :3], local))
 
 
 def _strip(

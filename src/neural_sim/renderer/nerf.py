@@ -26,7 +26,7 @@ class Omissions:
 
 
 QUALITIES: dict[Quality, Omissions] = {
-    "draft": Omissions(3e-2, 2.0),
+    "draft": Omissions(1e-2, 2.0),
     "normal": Omissions(1e-2, 1.0),
     "final": Omissions(1e-3, 1.0),
 }
@@ -39,8 +39,7 @@ class NerfRenderer:
     quality are those of the same function.
 
     Args:
-        quality: what is left out. Against a render with nothing left out (128 px, fields of six YCB objects), the mean error
-            of opacity over the pixels that show the object, and PSNR of colour: see conf/renderer/nerf.yaml.
+        quality: what is left out; conf/renderer/nerf.yaml has the measured error of each.
         rays_per_chunk: rays under way at once, which bounds the working memory.
         termination: transmittance behind which samples are left out (0: none are) instead of the quality's.
         step: the field's own step is multiplied by this, instead of by the quality's.
@@ -62,6 +61,7 @@ class NerfRenderer:
     ) -> None:
         if quality not in get_args(Quality):
             raise ValueError(f"NerfRenderer: quality must be one of {get_args(Quality)}, got {quality!r}")
+        self.quality: Quality = quality
         omitted = QUALITIES[quality]
         self.termination = omitted.termination if termination is None else termination
         self.step = omitted.step if step is None else step
