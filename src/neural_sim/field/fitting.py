@@ -85,14 +85,8 @@ class GridFitting(Fitting):
         batches = []
         for first in range(0, len(block), size):
             last = min(first + size, len(block))
-            begin, end = int(samples.starts[first]), int(samples.starts[last])
-            part = PackedSamples(
-                samples.ray[begin:end] - first,
-                samples.distance[begin:end],
-                samples.width[begin:end],
-                samples.starts[first : last + 1] - begin,
-            )
-            batches.append((block.select(slice(first, last)), part, cells[begin:end]))
+            part, own = samples.of_rays(first, last), slice(*samples.starts[[first, last]].tolist())
+            batches.append((block.select(slice(first, last)), part, cells[own]))
         return batches
 
     def advance(self, step: int) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +15,8 @@ from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PinholeCamera, Rays
 
 RAY_NUMBERS = 6
+SAMPLES_AT_ONCE = 16_384
+"""Samples asked for derivatives together: they keep to the cache."""
 
 
 def sample_points(
@@ -42,18 +46,41 @@ def render_packed(
 
 @torch.no_grad()
 def render_with_tangents(
-    field: RadianceField, rays: Rays, rates: Rays, termination: float
+    field: RadianceField,
+    rays: Rays,
+    rates: Rays,
+    termination: float,
+    samples_at_once: int = SAMPLES_AT_ONCE,
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
     """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
 
-    One pass over the samples gives both: a sample at distance t moves at o' + t d'. A ray has six numbers; of more
+    One pass over the samples gives both, about ``samples_at_once`` at a time: a sample at distance t moves at
+    o' + t d'. A ray has six numbers; of more
     rates than that, the derivatives by these six are taken and combined.
     """
     if len(rates.origins) > RAY_NUMBERS:
-        pixels, by_number = render_with_tangents(field, rays, _unit_rates(rays), termination)
+        pixels, by_number = render_with_tangents(field, rays, _unit_rates(rays), termination, samples_at_once)
         numbers = torch.cat([rates.origins, rates.directions], -1)
         return pixels, torch.einsum("mrk,krc->mrc", numbers, by_number)
     samples = field.sample(rays, termination)
+    # Pieces of about as many samples need the same memory wherever in an image their rays lie.
+    cuts = torch.arange(0, len(samples), samples_at_once, device=samples.starts.device)[1:]
+    edges = [0, *torch.searchsorted(samples.starts, cuts).tolist(), len(rays.origins)]
+    parts = [
+        _with_tangents(field, _rows(rays, a, b), _rows(rates, a, b), samples.of_rays(a, b))
+        for a, b in pairwise(edges)
+        if a < b
+    ]
+    return torch.cat([pixels for pixels, _ in parts]), torch.cat([moved for _, moved in parts], 1)
+
+
+def _rows(rays: Rays, first: int, last: int) -> Rays:
+    return Rays(rays.origins[..., first:last, :], rays.directions[..., first:last, :])
+
+
+def _with_tangents(
+    field: RadianceField, rays: Rays, rates: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
     positions, directions = sample_points(rays, samples)
     turns = rates.directions.index_select(1, samples.ray)
     velocities = torch.addcmul(rates.origins.index_select(1, samples.ray), turns, samples.distance[:, None])

@@ -24,6 +24,16 @@ class PackedSamples:
     def __len__(self) -> int:
         return self.ray.shape[0]
 
+    def of_rays(self, first: int, last: int) -> PackedSamples:
+        """The samples of rays ``first`` to ``last`` - 1, numbered from 0."""
+        begin, end = int(self.starts[first]), int(self.starts[last])
+        return PackedSamples(
+            self.ray[begin:end] - first,
+            self.distance[begin:end],
+            self.width[begin:end],
+            self.starts[first : last + 1] - begin,
+        )
+
 
 @dataclass(frozen=True)
 class Span:

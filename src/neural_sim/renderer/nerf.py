@@ -11,7 +11,12 @@ from torch import Tensor
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import pixel_rays, seen_pixels
-from neural_sim.field.rendering import render_packed, render_views, render_with_tangents
+from neural_sim.field.rendering import (
+    SAMPLES_AT_ONCE,
+    render_packed,
+    render_views,
+    render_with_tangents,
+)
 from neural_sim.types import Maps, PinholeCamera, Rays
 
 Quality = Literal["draft", "normal", "final"]
@@ -115,7 +120,8 @@ class NerfRenderer:
                 torch.stack([rays.directions for rays in moving]),
             )
             rays = pixel_rays(camera, camera_to_world, seen.pixel)
-            pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination)
+            samples_at_once = min(SAMPLES_AT_ONCE, 4 * self.rays_per_chunk)
+            pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination, samples_at_once)
             value.view(-1, 4).index_copy_(0, seen.pixel, pixels)
             tangents.view(len(rates), -1, 4).index_copy_(1, seen.pixel, moved)
         return _maps(value), [_maps(tangent) for tangent in tangents]
