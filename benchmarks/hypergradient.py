@@ -30,7 +30,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.training import load_field, save_field
 from neural_sim.gradient.pathwise import contract, patch_rays
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.synthesis.motion import CONTINUOUS, pose_rates
+from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, SceneDraw
 
 PATCHES = (64, 128, 256, 512, 4096)
@@ -65,7 +65,7 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
     draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, dtype=torch.long))
     rates = torch.randn(12, 1, 4, 4, generator=generator) * 0.3
     rates[:, :, 3] = 0.0
-    rates[:3] = pose_rates(draw, CONTINUOUS)
+    rates[:3] = pose_rates(draw, RIGID)
     cotangent = torch.randn(1, size, size, 4, generator=generator)
     pose = cameras.orbit(draw.phi, draw.rho, draw.distance)
     maps = Maps(cotangent[..., :3], cotangent[..., 3])
