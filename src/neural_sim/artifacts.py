@@ -35,6 +35,9 @@ DISTRIBUTIONS = tuple(
 )
 """What draws scenes; how psi steps (``parameter/update``) matters to the psi loop alone."""
 
+MESHES_DRAWN = ("objects", "renderer/mesh", "renderer/raycast", "renderer/surface", "renderer/lighting", "renderer/rig")
+"""What draws images from meshes."""
+
 
 class Artifacts:
     """Results of the stages. A result whose stage was not asked for must be in the store."""
@@ -89,7 +92,7 @@ class Artifacts:
     # --- views and fields: per object, shared by all runs ---
 
     def _views_key(self, name: str) -> dict[str, Any]:
-        version = code_version("objects", "renderer/mesh", "renderer/raycast", "renderer/views", "cameras")
+        version = code_version(*MESHES_DRAWN, "renderer/views", "cameras")
         return {"object": self.digests[name], **self._config("views"), "code": version}
 
     def views(self, name: str) -> Any:
@@ -100,7 +103,11 @@ class Artifacts:
             near, far = views.distance_range
             distance = near + (far - near) * uniform[2]
             poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], distance)
-            made = render_views(self.mesh_renderer, self.meshes[name], views.camera(views.image_size), poses)
+            rig, weights = None, None
+            if views.lights is not None:
+                rig, weights = views.lights.rig, views.lights.weights(views.count, generator)
+            camera = views.camera(views.image_size)
+            made = render_views(self.mesh_renderer, self.meshes[name], camera, poses, rig, weights)
             return codec.pack_views(made)
 
         key = self._views_key(name)
@@ -162,7 +169,7 @@ class Artifacts:
             "objects": self.digests, "names": self.names, "seed": self.x.seed,
             **self._config("target", "parameter", "unlearned", "synthesis", "views"),
             "size": self.x.training.image_size,
-            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", "synthesis", *DISTRIBUTIONS),
+            "code": code_version(*MESHES_DRAWN, "target", "synthesis", *DISTRIBUTIONS),
         }  # fmt: skip
         entry = self.store.fetch("target", key, make)
         return {name: codec.unpack_images(held) for name, held in entry.value.items()}
@@ -176,7 +183,7 @@ class Artifacts:
     def _equivalent(self, name: str, angle: str) -> list[list[int]]:
         key = {
             "object": self.digests[name], "factor": angle, **self._config("parameter", "unlearned", "views"),
-            "code": code_version("objects", "renderer/mesh", "renderer/raycast", "target", *DISTRIBUTIONS),
+            "code": code_version(*MESHES_DRAWN, "target", *DISTRIBUTIONS),
         }  # fmt: skip
 
         def make() -> list[list[int]]:

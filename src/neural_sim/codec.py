@@ -21,11 +21,12 @@ def _to_floats(images: Tensor) -> Tensor:
 
 def pack_views(views: PosedViews) -> dict[str, Any]:
     """Views with RGBA in 8 bits."""
-    camera = views.camera
+    camera, weights = views.camera, views.light_weights
     return {
         "images": _to_bytes(views.images),
         "camera_to_world": views.camera_to_world.cpu(),
         "camera": [camera.width, camera.height, camera.field_of_view],
+        "light_weights": None if weights is None else weights.cpu(),
     }
 
 
@@ -33,7 +34,7 @@ def unpack_views(held: Mapping[str, Any]) -> PosedViews:
     """Inverse of :func:`pack_views` up to the 8 bits."""
     width, height, field_of_view = held["camera"]
     camera = PinholeCamera(int(width), int(height), float(field_of_view))
-    return PosedViews(_to_floats(held["images"]), held["camera_to_world"], camera)
+    return PosedViews(_to_floats(held["images"]), held["camera_to_world"], camera, held["light_weights"])
 
 
 def pack_images(images: LabelledImages) -> dict[str, Tensor]:

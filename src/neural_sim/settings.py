@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from neural_sim.parameter.update import Update
+from neural_sim.renderer.rig import VariedLight
 from neural_sim.types import PinholeCamera
 
 Start = Literal["previous", "warm", "fresh"]
@@ -24,6 +25,7 @@ class Views:
     """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Sec. 4).
 
     ``image_size`` in pixels, ``distance_range`` in object radii; the last ``held_out`` views are never trained on.
+    ``lights`` vary over the views; None: one fixed light.
     """
 
     count: int = 100
@@ -33,6 +35,7 @@ class Views:
     distance_range: tuple[float, float] = (2.4, 4.0)
     supersample: int = 2
     backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    lights: VariedLight | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:

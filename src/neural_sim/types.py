@@ -41,17 +41,25 @@ class PosedViews:
 
     ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
     (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
+    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or lights that
+    nobody knows (photographs).
     """
 
     images: Float[Tensor, "views height width 4"]
     camera_to_world: Float[Tensor, "views 4 4"]
     camera: PinholeCamera
+    light_weights: Float[Tensor, "views k"] | None = None
 
     def __len__(self) -> int:
         return self.images.shape[0]
 
     def select(self, index: Tensor) -> PosedViews:
-        return PosedViews(self.images[index], self.camera_to_world[index], self.camera)
+        weights = None if self.light_weights is None else self.light_weights[index]
+        return PosedViews(self.images[index], self.camera_to_world[index], self.camera, weights)
+
+    def to(self, device: torch.device) -> PosedViews:
+        weights = None if self.light_weights is None else self.light_weights.to(device)
+        return PosedViews(self.images.to(device), self.camera_to_world.to(device), self.camera, weights)
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ import trimesh
 from neural_sim.cameras import orbit
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB
-from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.lighting import Light, Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.renderer.views import choose_mesh_renderer, opengl_platform
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(64, 64, math.radians(40.0))
-LIGHT = Lighting(direction=(0.5, -0.3, 1.0), ambient=0.5, directional=0.5)
+LIGHT = Lighting((Light((0.5, -0.3, 1.0), 0.5),), ambient=0.5)
 
 
 @pytest.fixture(scope="module")

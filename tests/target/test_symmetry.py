@@ -17,7 +17,7 @@ from neural_sim.types import PinholeCamera
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
 POSE = SceneDistribution.of([Pose()])
 # Even light, so that only shape and texture tell sides apart.
-RENDERER = RaycastRenderer(2, Lighting(ambient=1.0, directional=0.0))
+RENDERER = RaycastRenderer(2, Lighting((), ambient=1.0))
 
 
 def _grey(mesh, name):

@@ -40,7 +40,7 @@ class FieldRecipe:
         self, views: PosedViews, held_out: int, device: torch.device
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
         """The fitted field, and its scores on the last ``held_out`` views against steps and seconds."""
-        placed = PosedViews(views.images.to(device), views.camera_to_world.to(device), views.camera)
+        placed = views.to(device)
         fitting = self.fitting(self.field().to(device))
         generator = torch.Generator().manual_seed(self.seed)
         return fit_field(

@@ -26,9 +26,16 @@ class MeshRenderer(ABC):
 
     @abstractmethod
     def render(
-        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+        self,
+        mesh: trimesh.Trimesh,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "n 4 4"],
+        lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
-        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is."""
+        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
+
+        ``lighting`` is that of these views; None: the renderer's own.
+        """
 
     def close(self) -> None:
         """Free what the renderer holds; a later ``render`` makes it anew."""

@@ -1,4 +1,4 @@
-"""One directional and one ambient light, fixed in the object's frame, and Lambert's law under them."""
+"""Directional lights fixed in the object's frame, Lambert's law under them, and the colour of a temperature."""
 
 from __future__ import annotations
 
@@ -8,32 +8,88 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+Vector = tuple[float, float, float]
+
+SECOND_RADIATION_CONSTANT = 1.438777e7  # h c / k in nm K
+SRGB_FROM_XYZ = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)  # IEC 61966-2-1
+LOBES = (
+    ((1.056, 599.8, 37.9, 31.0), (0.362, 442.0, 16.0, 26.7), (-0.065, 501.1, 20.4, 26.2)),
+    ((0.821, 568.8, 46.9, 40.5), (0.286, 530.9, 16.3, 31.1)),
+    ((1.217, 437.0, 11.8, 36.0), (0.681, 459.0, 26.0, 13.8)),
+)
+"""The CIE 1931 observer's x, y, z as sums of (height, centre, width below, width above) in nm (Wyman et al. 2013)."""
+
 
 @dataclass(frozen=True)
-class Lighting:
-    """``direction`` points towards the light, in the world frame; it need not be of unit length.
+class Light:
+    """A directional light. ``direction`` points towards it, in the world frame; it need not be of unit length.
 
-    A white surface that faces the light has the colour ``ambient + directional``; one that faces away has
-    ``ambient``. Colours are sRGB values without gamma handling.
+    ``colour`` is sRGB and multiplies ``intensity``; a negative intensity takes light away (affine mixtures do).
+    ``fill`` is the part that arrives from all sides, as a room's walls scatter it.
     """
 
-    direction: tuple[float, float, float] = (0.3, 0.4, 1.0)
-    ambient: float = 0.7
-    directional: float = 0.3
+    direction: Vector
+    intensity: float
+    colour: Vector = (1.0, 1.0, 1.0)
+    fill: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.direction) != 3 or not all(map(math.isfinite, self.direction)) or not any(self.direction):
             raise ValueError(
-                f"lighting.direction: want three finite numbers, not all zero, got {self.direction}"
+                f"light.direction: want three finite numbers, not all zero, got {self.direction}"
             )
-        for name in ("ambient", "directional"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"lighting.{name}: want a finite number of at least 0, got {value}")
+        if not math.isfinite(self.intensity):
+            raise ValueError(f"light.intensity: want a finite number, got {self.intensity}")
+        if len(self.colour) != 3 or not all(0.0 <= value <= 1.0 for value in self.colour):
+            raise ValueError(f"light.colour: want three numbers in [0, 1], got {self.colour}")
+        if not 0.0 <= self.fill <= 1.0:
+            raise ValueError(f"light.fill: want a number in [0, 1], got {self.fill}")
 
 
-def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n"]:
-    """What albedo is multiplied by: ``ambient + directional * max(n . l, 0)``, for unit normals."""
-    towards = np.asarray(lighting.direction, dtype=np.float64)
-    towards = towards / np.linalg.norm(towards)
-    return lighting.ambient + lighting.directional * np.maximum(normals @ towards, 0.0)
+@dataclass(frozen=True)
+class Lighting:
+    """A white surface has the colour ``ambient`` plus what each of ``lights`` sheds on it.
+
+    Linear in the lights' intensities as long as nothing leaves [0, 1]. Colours are sRGB values without gamma handling.
+    """
+
+    lights: tuple[Light, ...] = (Light((0.3, 0.4, 1.0), 0.3),)
+    ambient: float = 0.7
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.ambient) and self.ambient >= 0.0):
+            raise ValueError(f"lighting.ambient: want a finite number of at least 0, got {self.ambient}")
+
+
+def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
+    """What albedo is multiplied by, for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
+    shade = np.full((len(normals), 3), lighting.ambient)
+    for light in lighting.lights:
+        towards = np.asarray(light.direction, dtype=np.float64)
+        towards = towards / np.linalg.norm(towards)
+        facing = light.fill + (1.0 - light.fill) * np.maximum(normals @ towards, 0.0)
+        shade = shade + light.intensity * np.asarray(light.colour) * facing[:, None]
+    return np.maximum(shade, 0.0)
+
+
+def temperature_colour(kelvin: float) -> Vector:
+    """sRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
+
+    Raises ``ValueError`` outside [1500, 40000] kelvin; colder bodies are outside sRGB's gamut.
+    """
+    if not 1500.0 <= kelvin <= 40000.0:
+        raise ValueError(f"light: want a colour temperature in [1500, 40000] kelvin, got {kelvin}")
+    wavelength = np.arange(360.0, 831.0, 5.0)
+    radiance = wavelength**-5 / np.expm1(SECOND_RADIATION_CONSTANT / (wavelength * kelvin))
+    observer = np.stack([sum(_lobe(wavelength, *lobe) for lobe in lobes) for lobes in LOBES])
+    linear = np.maximum(SRGB_FROM_XYZ @ (observer @ radiance), 0.0)
+    linear = linear / linear.max()
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    red, green, blue = np.clip(encoded, 0.0, 1.0).tolist()
+    return red, green, blue
+
+
+def _lobe(at: np.ndarray, height: float, centre: float, below: float, above: float) -> np.ndarray:
+    return height * np.exp(-0.5 * ((at - centre) / np.where(at < centre, below, above)) ** 2)

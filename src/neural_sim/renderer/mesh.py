@@ -15,6 +15,7 @@ from pyrender.constants import GLTF
 from torch import Tensor
 
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.types import PinholeCamera
@@ -40,10 +41,14 @@ class PyrenderRenderer(MeshRenderer):
     name = "pyrender"
 
     def render(
-        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+        self,
+        mesh: trimesh.Trimesh,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "n 4 4"],
+        lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
         scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
-        scene.add(_primitives(shaded_surface(mesh, self.lighting)))
+        scene.add(_primitives(shaded_surface(mesh, lighting or self.lighting)))
         lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)
         eye = scene.add(lens, pose=np.eye(4))
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
@@ -80,7 +85,7 @@ def _primitives(surface: Surface) -> pyrender.Mesh:
     sides = []
     for shade, faces in ((surface.front, surface.faces), (surface.back, surface.faces[:, ::-1])):
         colour = np.ones((len(shade), 4), dtype=np.float32)
-        colour[:, :3] = surface.albedo * shade[:, None]
+        colour[:, :3] = surface.albedo * shade
         uv = None if surface.uv is None else surface.uv.astype(np.float32)
         sides.append(
             pyrender.Primitive(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neural_sim.cameras import focal_length, rays
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.renderer.texture_sampling import Pyramid
@@ -26,9 +27,13 @@ class RaycastRenderer(MeshRenderer):
     name = "raycast"
 
     def render(
-        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+        self,
+        mesh: trimesh.Trimesh,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "n 4 4"],
+        lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
-        surface = shaded_surface(mesh, self.lighting)
+        surface = shaded_surface(mesh, lighting or self.lighting)
         bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         pyramid = None if surface.texture is None else Pyramid(surface.texture)
         fine = PinholeCamera(
@@ -102,9 +107,9 @@ def _colours(
 ) -> Float[np.ndarray, "hits 3"]:
     corners = surface.faces[face]
     weights, distance, cosine, area = _barycentric(surface.vertices[corners], origins, directions)
-    sides = np.where((cosine < 0.0)[:, None], surface.front[corners], surface.back[corners])
+    sides = np.where((cosine < 0.0)[:, None, None], surface.front[corners], surface.back[corners])
     # As in OpenGL, the product of albedo and shade is interpolated, not its factors.
-    vertex_colour = surface.albedo[corners] * sides[..., None]
+    vertex_colour = surface.albedo[corners] * sides
     colour = np.einsum("nk,nkc->nc", weights, vertex_colour)
     if pyramid is not None and surface.uv is not None:
         uv = surface.uv[corners]

@@ -26,8 +26,8 @@ class Surface:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     albedo: Float[np.ndarray, "v 3"]
-    front: Float[np.ndarray, "v"]
-    back: Float[np.ndarray, "v"]
+    front: Float[np.ndarray, "v 3"]
+    back: Float[np.ndarray, "v 3"]
     uv: Float[np.ndarray, "v 2"] | None
     texture: UInt8[np.ndarray, "h w 3"] | None
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from typing import Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
+from neural_sim.renderer.rig import LightRig
 from neural_sim.types import PinholeCamera, PosedViews
 
 log = logging.getLogger(__name__)
@@ -93,6 +95,19 @@ def render_views(
     item: ObjectMesh,
     camera: PinholeCamera,
     camera_to_world: Float[Tensor, "views 4 4"],
+    rig: LightRig | None = None,
+    weights: Float[Tensor, "views k"] | None = None,
 ) -> PosedViews:
-    """Views of a normalised object with their cameras (OpenGL axes, object radii)."""
-    return PosedViews(renderer.render(item.mesh, camera, camera_to_world), camera_to_world, camera)
+    """Views of a normalised object with their cameras (OpenGL axes, object radii).
+
+    With a ``rig`` each view is lit by the anchors at its ``weights``; views that share weights are rendered together.
+    """
+    if rig is None or weights is None:
+        images = renderer.render(item.mesh, camera, camera_to_world)
+        return PosedViews(images, camera_to_world, camera)
+    images = torch.zeros(len(camera_to_world), camera.height, camera.width, 4)
+    lights, light_of = weights.unique(dim=0, return_inverse=True)
+    for number, light in enumerate(lights):
+        seen = (light_of == number).nonzero()[:, 0]
+        images[seen] = renderer.render(item.mesh, camera, camera_to_world[seen], rig.lighting(light))
+    return PosedViews(images, camera_to_world, camera, weights)

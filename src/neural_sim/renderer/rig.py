@@ -1,0 +1,118 @@
+"""The anchor lights whose weights are an illumination, and the lights that training views see."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.renderer.lighting import Light, Lighting, temperature_colour
+
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class LightRig:
+    """k anchor lights around an object, and mixtures of them: shade = ambient + sum_i w_i light_i.
+
+    Directions lie on a spherical Fibonacci lattice; temperatures are even in mired over ``temperature_range`` (kelvin)
+    and intensities even over ``intensity_range``, each in an order of its own, so that neither goes along with the
+    direction. ``fill`` is the part of each light that comes from all sides. White surfaces stay within [0, 1] where
+    ``ambient`` and the largest intensity add up to at most 1 and weights are those of a simplex.
+    """
+
+    anchors: int = 6
+    temperature_range: tuple[float, float] = (2700.0, 9000.0)
+    intensity_range: tuple[float, float] = (0.5, 0.9)
+    fill: float = 0.35
+    ambient: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.anchors < 2:
+            raise ValueError(f"lights.anchors: want at least 2, got {self.anchors}")
+        for name in ("temperature_range", "intensity_range"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"lights.{name}: want two positive numbers in order, got {(low, high)}")
+        if self.ambient < 0.0 or self.ambient + self.intensity_range[1] > 1.0 + 1e-9:
+            raise ValueError(
+                "lights: ambient and the largest intensity must add up to at most 1, or white surfaces saturate; got "
+                f"{self.ambient} and {self.intensity_range[1]}"
+            )
+        self.lights()  # a range out of bounds is found here
+
+    def lights(self) -> tuple[Light, ...]:
+        """The k anchors."""
+        k = self.anchors
+        height = [1.0 - (2.0 * i + 1.0) / k for i in range(k)]
+        spread = zip(height, _spread(k, math.sqrt(5.0)), _spread(k, math.sqrt(2.0)), strict=True)
+        return tuple(
+            self._light(z, GOLDEN_ANGLE * i, warm, bright) for i, (z, warm, bright) in enumerate(spread)
+        )
+
+    def _light(self, height: float, turn: float, warm: float, bright: float) -> Light:
+        """Height of the direction in [-1, 1], its turn about +z, and places within the ranges in [0, 1]."""
+        radius = math.sqrt(1.0 - height * height)
+        direction = (radius * math.cos(turn), radius * math.sin(turn), height)
+        (low, high), (dim, full) = self.temperature_range, self.intensity_range
+        kelvin = 1.0 / (1.0 / low + warm * (1.0 / high - 1.0 / low))
+        return Light(direction, dim + bright * (full - dim), temperature_colour(kelvin), self.fill)
+
+    def lighting(self, weights: Sequence[float] | Float[Tensor, "k"]) -> Lighting:
+        """The anchors at these weights, of either sign. Raises ``ValueError`` for another number of them."""
+        values = [float(weight) for weight in weights]
+        if len(values) != self.anchors:
+            raise ValueError(f"lights: want {self.anchors} weights, got {len(values)}")
+        lights = (
+            replace(light, intensity=light.intensity * weight)
+            for light, weight in zip(self.lights(), values, strict=True)
+            if weight != 0.0
+        )
+        return Lighting(tuple(lights), self.ambient)
+
+
+@dataclass(frozen=True)
+class VariedLight:
+    """The lights under which a field's training views are rendered.
+
+    A share ``anchored`` of the views, evenly spread, sees one anchor each, in turn; the rest sees mixtures, in turn
+    too: ``mixtures`` different ones, uniform over the simplex.
+    """
+
+    rig: LightRig = field(default_factory=LightRig)
+    anchored: float = 0.5
+    mixtures: int = 12
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.anchored <= 1.0:
+            raise ValueError(f"lights.anchored: want a share in (0, 1], got {self.anchored}")
+        if self.mixtures < 1:
+            raise ValueError(f"lights.mixtures: want at least 1, got {self.mixtures}")
+
+    def weights(self, count: int, generator: torch.Generator) -> Float[Tensor, "count k"]:
+        """Each view's weights over the anchors, float32.
+
+        Raises ``ValueError`` where so few views leave an anchor out.
+        """
+        k = self.rig.anchors
+        if math.floor(count * self.anchored) < k:
+            raise ValueError(f"lights.anchored: {self.anchored} of {count} views cannot show all {k} anchors")
+        uniform = torch.rand((self.mixtures, k), generator=generator, dtype=torch.float64)
+        exponential = -uniform.clamp_min(1e-12).log()
+        mixed = itertools.cycle(exponential / exponential.sum(-1, keepdim=True))
+        pure = itertools.cycle(torch.eye(k, dtype=torch.float64))
+        steps = [
+            math.floor((view + 1) * self.anchored) > math.floor(view * self.anchored) for view in range(count)
+        ]
+        return torch.stack([next(pure if anchored else mixed) for anchored in steps]).float()
+
+
+def _spread(count: int, ratio: float) -> list[float]:
+    """0 to 1 in ``count`` even places, in the order of the fractions of multiples of an irrational ratio."""
+    order = sorted(range(count), key=lambda i: (i * ratio) % 1.0)
+    return [order.index(i) / (count - 1) for i in range(count)]
