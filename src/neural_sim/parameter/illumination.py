@@ -1,0 +1,143 @@
+"""The illumination parameter: psi are affine weights over anchor lights, deterministic and kept on their constraint.
+
+A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.3), so an object's images share one light, and
+psi steps by projected gradient descent. Estimators that need a density draw a Gaussian around psi instead and score the
+draw as it was before its projection: the projected one has no density.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.parameter.simplex import project_simplex, project_sum
+from neural_sim.parameter.update import Mirror, UpdateState
+
+Constraint = Literal["simplex", "affine"]
+
+
+@dataclass(frozen=True)
+class GaussianDraw:
+    """Draws around psi: ``log_prob`` scores ``unprojected``; ``weights``, on the constraint, are rendered."""
+
+    unprojected: Float[Tensor, "n k"]
+    weights: Float[Tensor, "n k"]
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Weights over ``anchors`` lights.
+
+    Args:
+        anchors: k, the number of anchor lights.
+        constraint: ``simplex``: no weight below 0; ``affine``: any that add up to 1.
+        deviation: standard deviation of each weight in Gaussian draws.
+        initial, target: weights of objects not named in ``biased``: ``uniform``, ``{dominant: b}``,
+            ``{modes: [b, ...]}`` (see :func:`distributions.distribution`) or k numbers that add up to 1.
+        biased: object name -> {initial: ..., target: ...}.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    anchors: int = 6
+    constraint: Constraint = "simplex"
+    deviation: float = 0.1
+    initial: Specification = "uniform"
+    target: Specification = "uniform"
+    biased: Mapping[str, Mapping[str, Specification]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.anchors < 2:
+            raise ValueError(f"parameter.illumination.anchors must be at least 2, got {self.anchors}")
+        if self.constraint not in get_args(Constraint):
+            raise ValueError(
+                f"parameter.illumination.constraint must be simplex or affine, got {self.constraint!r}"
+            )
+        if not (math.isfinite(self.deviation) and self.deviation > 0.0):
+            raise ValueError(f"parameter.illumination.deviation must be positive, got {self.deviation}")
+        for name in ("", *(self.biased or {})):  # what is wrong with a specification is said before any stage
+            self.weights("initial", name)
+            self.weights("target", name)
+
+    def weights(self, which: str, object_name: str) -> Float[Tensor, "k"]:
+        """The configured ``initial`` or ``target`` weights of one object, float64. They are psi itself."""
+        specification = self.initial if which == "initial" else self.target
+        if self.biased and object_name in self.biased:
+            specification = self.biased[object_name].get(which, specification)
+        where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
+        numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
+        if self.constraint == "affine" and numbers:
+            return _affine_numbers(specification, self.anchors, where)
+        return distribution(specification, self.anchors, where)
+
+    def project(self, values: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
+        return project_simplex(values) if self.constraint == "simplex" else project_sum(values)
+
+    def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
+        """Every image's weights: psi itself, nothing is random. Differentiable in psi."""
+        return psi.expand(count, -1)
+
+    def sample_gaussian(
+        self, psi: Float[Tensor, "k"], count: int, generator: torch.Generator
+    ) -> GaussianDraw:
+        """``count`` draws of N(psi, deviation^2 I), and the weights nearest to them. No derivative reaches psi."""
+        noise = torch.randn((count, self.anchors), generator=generator, dtype=torch.float64).to(psi)
+        unprojected = psi.detach() + self.deviation * noise
+        return GaussianDraw(unprojected, self.project(unprojected))
+
+    def log_prob(self, psi: Float[Tensor, "k"], unprojected: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
+        """log density of Gaussian draws before their projection; its gradient is (u - psi) / deviation^2."""
+        scaled = (unprojected.detach() - psi) / self.deviation
+        constant = self.anchors * (math.log(self.deviation) + 0.5 * math.log(2.0 * math.pi))
+        return -0.5 * scaled.square().sum(-1) - constant
+
+
+@dataclass(frozen=True)
+class ProjectedGradient:
+    """Gradient descent on weights, each step bounded and then projected on the constraint.
+
+    Direction, momentum, scale and ``shrink`` are those of :class:`Mirror` under the Euclidean metric, its own at p = 1:
+    ``learning_rate`` is in weights a step whatever the loss's units, and the common part of a gradient, which the
+    constraint would take back, moves nothing. ``max_step`` bounds the largest change of a weight.
+    """
+
+    learning_rate: float = 0.15
+    momentum: float = 0.6
+    max_step: float = 0.3
+    shrink: bool = True
+
+    def __post_init__(self) -> None:
+        self._free()
+
+    def _free(self) -> Mirror:
+        return Mirror(self.learning_rate, self.momentum, self.max_step, self.shrink)
+
+    def step(
+        self,
+        psi: Float[Tensor, "objects k"],
+        gradient: Float[Tensor, "objects k"],
+        standard_error: Float[Tensor, "objects k"],
+        state: UpdateState,
+        project: Callable[[Tensor], Tensor],
+    ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
+        """Weights after one step, and the state to pass to the next; a gradient that is not finite moves neither."""
+        moved, after = self._free().step(psi, torch.zeros_like(psi), gradient, standard_error, state)
+        return project(moved), after
+
+
+def _affine_numbers(values: object, anchors: int, where: str) -> Float[Tensor, "k"]:
+    weights = torch.tensor([float(str(value)) for value in values], dtype=torch.float64)  # pyright: ignore
+    if len(weights) != anchors:
+        raise ValueError(f"{where}: want {anchors} numbers, got {len(weights)}")
+    if not bool(torch.isfinite(weights).all()) or abs(float(weights.sum()) - 1.0) > 1e-6:
+        raise ValueError(f"{where}: want finite weights that add up to 1, got {weights.tolist()}")
+    return weights
