@@ -77,7 +77,7 @@ def run_pathwise(
     generator, found = torch.Generator().manual_seed(seed), []
     began = time.process_time()
     for _ in range(units):
-        rendered = world.scene.training_set(world.psi, UNIT, generator, estimator.relaxed)
+        rendered = world.scene.training_set(world.psi, UNIT, generator, estimator.draws)
         found.append(centred(differentiate(world, estimator, rendered)))
     return torch.stack(found), (time.process_time() - began) / (units * UNIT * len(world.psi))
 

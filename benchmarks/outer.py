@@ -51,7 +51,7 @@ def loop(made: Artifacts, count: int, images: int) -> SimulatorModule:
     settings, training = dataclasses.replace(made.x.outer, images_per_object=images), made.x.training
     inner = InnerLoop(
         scene, detector, detector.init(generator), validation, settings, training.batch_size,
-        training.weight_decay, generator, made.x.gradient.relaxed,
+        training.weight_decay, generator, made.x.gradient.draws,
     )  # fmt: skip
     return SimulatorModule(inner, psi, made.x.gradient, made.x.solver)
 

@@ -26,16 +26,24 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.renderer.views import choose_mesh_renderer, render_views
 from neural_sim.store import Store, code_version, digest, tensor_digest
-from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.scene import HardDraws, RenderedObject, Scene, join
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
 DISTRIBUTIONS = tuple(
-    f"parameter/{name}" for name in ("bins", "distributions", "factor", "pose", "product", "zoom")
+    f"parameter/{name}"
+    for name in ("bins", "distributions", "factor", "illumination", "pose", "product", "zoom")
 )
 """What draws scenes; how psi steps (``parameter/update``) matters to the psi loop alone."""
 
-MESHES_DRAWN = ("objects", "renderer/mesh", "renderer/raycast", "renderer/surface", "renderer/lighting", "renderer/rig")
+MESHES_DRAWN = (
+    "objects",
+    "renderer/mesh",
+    "renderer/raycast",
+    "renderer/surface",
+    "renderer/lighting",
+    "renderer/rig",
+)
 """What draws images from meshes."""
 
 
@@ -161,7 +169,13 @@ class Artifacts:
 
         def make() -> Any:
             made = self.x.target.sets(
-                self.meshes, self.mesh_renderer, self.x.distribution, camera, self.x.synthesis, self.x.seed
+                self.meshes,
+                self.mesh_renderer,
+                self.x.distribution,
+                camera,
+                self.x.synthesis,
+                self.x.seed,
+                self.x.views.rig,
             )
             return {name: codec.pack_images(images) for name, images in made.items()}
 
@@ -177,7 +191,7 @@ class Artifacts:
     @cached_property
     def symmetric_bins(self) -> dict[str, dict[str, list[list[int]]]]:
         """By object and angle: groups of bins, numbered from 1, that the object's symmetry makes the same."""
-        angles = [f.name for f in self.x.distribution.factors if f.coordinate in ("phi", "rho")]
+        angles = [f.name for f in self.x.distribution.binned if f.coordinate in ("phi", "rho")]
         return {name: {angle: self._equivalent(name, angle) for angle in angles} for name in self.names}
 
     def _equivalent(self, name: str, angle: str) -> list[list[int]]:
@@ -252,7 +266,7 @@ class Artifacts:
         training, searched = self.x.training, not isinstance(method, HypergradientLoop)
         inner = InnerLoop(
             self.scene, self.detector, self.warm_start(), self.targets["val"], self.x.outer, training.batch_size,
-            training.weight_decay, self._generator(2), None if searched else self.x.gradient.relaxed,
+            training.weight_decay, self._generator(2), HardDraws(explore=True) if searched else self.x.gradient.draws,
         )  # fmt: skip
         if isinstance(method, HypergradientLoop):
             return SimulatorModule(inner, self.psi("initial"), self.x.gradient, self.x.solver)

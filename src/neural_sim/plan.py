@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
 from neural_sim.experiment import Experiment, Omission
 from neural_sim.field.grid import GridField
+from neural_sim.synthesis.scene import HardDraws
 
 
 def plan(experiment: Experiment, objects: int) -> list[Omission]:
@@ -27,7 +28,7 @@ def _fields(x: Experiment) -> Iterator[Omission]:
                 "view-dependent colour",
                 "one fixed light on matt surfaces looks the same from all sides",
             )
-    if "illumination" not in x.distribution.names:
+    if x.distribution.light is None:
         yield Omission("field", "appearance codes", "no parameter moves the light")
 
 
@@ -41,7 +42,11 @@ def _loop(x: Experiment, objects: int) -> Iterator[Omission]:
         yield Omission("psi", "hypergradients", f"baseline={method.name} sees rewards only", 1.0)
     else:
         yield from _hypergradient(x, objects)
-    if outer.pool_per_bin and (searched or not x.gradient.relaxed):
+    if (
+        outer.pool_per_bin
+        and (searched or isinstance(x.gradient.draws, HardDraws))
+        and x.distribution.light is None
+    ):
         yield _pooled(x, method, searched)
     if outer.epochs > 1:
         what, why = "backbone passes of the loop's training", "a frozen backbone's features are kept"
@@ -51,7 +56,7 @@ def _loop(x: Experiment, objects: int) -> Iterator[Omission]:
 def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
     estimator = x.gradient
     name = type(estimator).__name__.removesuffix("Estimator").lower()
-    if not estimator.relaxed:
+    if isinstance(estimator.draws, HardDraws):
         yield Omission(
             "psi", "the renderer's derivative", f"gradient={name} scores images and differentiates none", 1.0
         )
@@ -72,7 +77,7 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
 
 def _pooled(x: Experiment, method: HypergradientLoop | RewardMethod, searched: bool) -> Omission:
     """Renders that a pool of every bin spares, of all that the loop's images would take."""
-    factors = x.distribution.factors
+    factors = x.distribution.binned
     cells, finest = 1, max(factor.bins for factor in factors)
     for factor in factors:
         cells *= factor.bins

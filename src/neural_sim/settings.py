@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+from neural_sim.parameter.illumination import ProjectedGradient
 from neural_sim.parameter.update import Update
 from neural_sim.renderer.rig import VariedLight
 from neural_sim.types import PinholeCamera
@@ -112,8 +113,8 @@ class Outer:
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
     estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
-    anew; the others keep their images, and what other factors of p_psi gave them. ``learned`` names the objects whose
-    psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
+    anew; the others keep their images, and what other factors of p_psi gave them. ``update`` steps
+    logits of bins, ``light_update`` weights of lights. ``learned`` names the objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
     happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is
     compared with finite differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1
     trainings to stationarity.
@@ -132,6 +133,7 @@ class Outer:
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"
     learned: tuple[str, ...] | None = None
+    light_update: ProjectedGradient = field(default_factory=ProjectedGradient)
     certify_every: int = 0
     certify_per_bin: int = 1
 

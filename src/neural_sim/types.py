@@ -119,8 +119,9 @@ class SceneDraw:
 
     ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the
     origin in object radii, ``magnification`` its focal length in units of the camera's own (None: 1). ``bins`` are
-    the indices of the drawn (or largest relaxed) bins from 0, a column for each factor of p_psi. The numbers may
-    carry gradients with respect to psi.
+    the indices of the drawn (or largest relaxed) bins from 0, a column for each binned factor of p_psi. ``weights`` are
+    those of the anchor lights (None: the light is fixed), ``explored`` the Gaussian draws whose projections they are,
+    where they were drawn. The numbers may carry gradients with respect to psi.
     """
 
     phi: Float[Tensor, "images"]
@@ -128,6 +129,8 @@ class SceneDraw:
     distance: Float[Tensor, "images"]
     bins: Int[Tensor, "images factors"]
     magnification: Float[Tensor, "images"] | None = None
+    weights: Float[Tensor, "images lights"] | None = None
+    explored: Float[Tensor, "images lights"] | None = None
 
     def __len__(self) -> int:
         return self.phi.shape[0]

@@ -47,7 +47,7 @@ def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=No
         Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer
     )
     inner = InnerLoop(
-        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.relaxed
+        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
     )
     return SimulatorModule(inner, psi, estimator, solver)
 
@@ -126,7 +126,7 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
     }
     psi = torch.randn(2, 4, generator=generator, dtype=torch.float64)
     forward = PathwiseEstimator(mode="forward", **settings)
-    rendered = wide.training_set(psi, 4, generator, forward.relaxed)
+    rendered = wide.training_set(psi, 4, generator, forward.draws)
     assert all(set(part.tangents) == {"phi"} for part in rendered)
     images = join(rendered)
     losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)

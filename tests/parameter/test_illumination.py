@@ -114,7 +114,7 @@ def test_a_gradient_that_is_not_finite_moves_nothing():
 def test_the_score_is_the_derivative_of_the_log_density(generator):
     illumination = Illumination(anchors=4, deviation=0.3)
     psi = illumination.project(normal(generator, 4)).requires_grad_()
-    draw = illumination.sample_gaussian(psi, 6, generator)
+    draw = illumination.explore(psi, torch.randn(6, len(psi), generator=generator, dtype=psi.dtype))
     assert not draw.unprojected.requires_grad
     density = torch.distributions.MultivariateNormal(psi, 0.09 * torch.eye(4, dtype=DOUBLE))
     torch.testing.assert_close(
@@ -135,7 +135,7 @@ def test_the_score_is_the_derivative_of_the_log_density(generator):
 def test_draws_lie_on_the_constraint_around_psi(constraint, generator):
     illumination = Illumination(anchors=4, constraint=constraint, deviation=0.05)
     psi = torch.tensor([0.4, 0.3, 0.2, 0.1], dtype=DOUBLE)
-    draw = illumination.sample_gaussian(psi, 4000, generator)
+    draw = illumination.explore(psi, torch.randn(4000, len(psi), generator=generator, dtype=psi.dtype))
     torch.testing.assert_close(draw.weights.sum(-1), torch.ones(4000, dtype=DOUBLE))
     if constraint == "simplex":
         assert draw.weights.min() >= 0.0
@@ -149,7 +149,7 @@ def test_the_score_estimates_the_gradient_of_the_expected_reward(generator):
     illumination = Illumination(anchors=3, constraint="affine", deviation=0.1)
     psi = torch.tensor([0.5, 0.3, 0.2], dtype=DOUBLE, requires_grad=True)
     slope = torch.tensor([1.0, -2.0, 0.5], dtype=DOUBLE)
-    draw = illumination.sample_gaussian(psi, 40_000, generator)
+    draw = illumination.explore(psi, torch.randn(40_000, len(psi), generator=generator, dtype=psi.dtype))
     reward = (draw.weights - psi.detach()) @ slope
     (estimate,) = torch.autograd.grad((reward * illumination.log_prob(psi, draw.unprojected)).mean(), psi)
     centred = slope - slope.mean()  # the projection on the plane takes the common part out

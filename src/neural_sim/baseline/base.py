@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.types import SceneDraw
 
-Draws = Sequence[Int[Tensor, "n factors"]]
-"""The bins of the images drawn from an asked psi, object by object."""
+Draws = Sequence[SceneDraw]
+"""The scenes drawn from an asked psi, object by object."""
 
 
 class Search(Protocol):

@@ -15,6 +15,7 @@ from torch import Tensor
 from neural_sim.baseline.base import Draws, positive
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import bound
+from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,17 @@ class Policy:
         if advantage == 0.0:
             return
         slope = torch.stack(
-            [score(self._distribution, psi, bins) for psi, bins in zip(self._psi, draws, strict=True)]
+            [score(self._distribution, psi, drawn) for psi, drawn in zip(self._psi, draws, strict=True)]
         )
         # A sum of n scores has a spread of sqrt(n): taken out, so that the rate is in logits.
         size = max(len(draws[0]), 1) ** 0.5
         step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)
         moved = {name: bound(part, self._settings.max_step) for name, part in step.items()}
-        self._psi = self._psi + self._distribution.join(moved)
+        light = self._distribution.light
+        if light is not None:
+            # A Gaussian's score is in units of one over its deviation, and a step of that size is one of exploration.
+            moved[light.name] = bound(light.deviation**2 * step[light.name], light.deviation)
+        self._psi = self._distribution.constrained(self._psi + self._distribution.join(moved))
 
     def _advantage(self, reward: float) -> float:
         """``R - b`` by the running standard deviation of rewards; then b moves on."""
@@ -92,9 +97,9 @@ class Policy:
         return above / self._variance**0.5 if self._variance > 0.0 else 0.0
 
 
-def score(distribution: SceneDistribution, psi: Float[Tensor, "K"], bins: Tensor) -> Float[Tensor, "K"]:
-    """``d log p(bins) / d psi`` of independent draws together."""
+def score(distribution: SceneDistribution, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "K"]:
+    """``d log p(draws) / d psi`` of independent draws together."""
     leaf = psi.detach().requires_grad_()
     with torch.enable_grad():
-        total = distribution.log_prob(leaf, bins).sum()
+        total = distribution.log_prob(leaf, draw).sum()
     return torch.autograd.grad(total, leaf)[0]

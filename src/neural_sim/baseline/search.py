@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.baseline.base import Draws, positive
+from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
 
 
@@ -40,7 +41,7 @@ class Incumbent:
 
 @dataclass(frozen=True)
 class RandomSearch:
-    """p of every object and factor uniform over the simplex; the best reward is reported.
+    """p of every object and factor, and weights of lights, uniform over the simplex; the best reward is reported.
 
     Raises:
         ValueError: a number of rounds that is not positive.
@@ -69,9 +70,10 @@ class _Random(Incumbent):
     def propose(self) -> Float[Tensor, "objects K"]:
         parts = {}
         for factor in self._distribution.factors:
-            empty = torch.empty(len(self.psi), factor.bins, dtype=torch.float64)
+            empty = torch.empty(len(self.psi), factor.size, dtype=torch.float64)
             spacings = empty.exponential_(generator=self._generator)
-            parts[factor.name] = factor.logits(spacings / spacings.sum(-1, keepdim=True))
+            p = spacings / spacings.sum(-1, keepdim=True)
+            parts[factor.name] = factor.logits(p) if isinstance(factor, BinnedFactor) else p
         return self._distribution.join(parts).to(self.psi)
 
 
@@ -101,13 +103,19 @@ class BayesOpt:
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         sampler = optuna.samplers.TPESampler(seed=generator.initial_seed() % 2**32)
         study = optuna.create_study(direction="maximize", sampler=sampler)
-        return _Bayes(self.reach, study, psi.detach().clone())
+        return _Bayes(self.reach, study, psi.detach().clone(), distribution)
 
 
 class _Bayes(Incumbent):
-    def __init__(self, reach: float, study: Any, psi: Float[Tensor, "objects K"]) -> None:
+    def __init__(
+        self,
+        reach: float,
+        study: Any,
+        psi: Float[Tensor, "objects K"],
+        distribution: SceneDistribution,
+    ) -> None:
         super().__init__(psi)
-        self._reach, self._study = reach, study
+        self._reach, self._study, self._distribution = reach, study, distribution
         start = psi.clamp(-reach, reach).flatten().tolist()
         study.enqueue_trial({f"psi_{i}": value for i, value in enumerate(start)})
         self._trial: Any = None
@@ -121,7 +129,7 @@ class _Bayes(Incumbent):
         values = [
             self._trial.suggest_float(f"psi_{i}", -self._reach, self._reach) for i in range(self.psi.numel())
         ]
-        return torch.tensor(values, dtype=self.psi.dtype).view_as(self.psi)
+        return self._distribution.constrained(torch.tensor(values, dtype=self.psi.dtype).view_as(self.psi))
 
     def tell(self, reward: float, draws: Draws) -> None:
         super().tell(reward, draws)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-import torch
 from torch import Tensor
 
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
@@ -14,6 +13,7 @@ from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.stratified import stratified
+from neural_sim.synthesis.scene import HardDraws
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class StratifiedEstimator:
     (see :func:`gradient.mixed.scores`).
     """
 
-    relaxed: ClassVar[None] = None
+    draws: ClassVar[HardDraws] = HardDraws(light_tangents=True)
     probes_per_bin: int = 8
     chunk_size: int = 64
     theta_mode: ThetaMode = "forward"
@@ -46,25 +46,50 @@ class StratifiedEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
-        if losses.probes is None or set(probes) != set(images.distribution.names):
+        distribution = images.distribution
+        parts: dict[str, MixedDerivative] = {}
+        if distribution.binned:
+            parts |= self._binned(losses, params, vector, images, probes)
+        if distribution.light is not None:
+            # A light has no bins: its images carry their derivatives by its weights.
+            along = PathwiseEstimator(chunk_size=self.chunk_size).estimate(losses, params, vector, images, {})
+            values, errors = (distribution.split(x) for x in (along.value, along.standard_error))
+            name = distribution.light.name
+            parts[name] = MixedDerivative(values[name], errors[name])
+        return MixedDerivative(
+            distribution.join({name: part.value for name, part in parts.items()}),
+            distribution.join({name: part.standard_error for name, part in parts.items()}),
+        )
+
+    def _binned(
+        self,
+        losses: Losses,
+        params: Params,
+        vector: Params,
+        images: ObjectImages,
+        probes: Mapping[str, Probes],
+    ) -> dict[str, MixedDerivative]:
+        factors = images.distribution.binned
+        if losses.probes is None or set(probes) != {factor.name for factor in factors}:
             raise ValueError(
-                f"stratified: wants probes of {images.distribution.names}, which it scores, got {list(probes)}"
+                f"stratified: wants probes of {[f.name for f in factors]}, which it scores, got {list(probes)}"
             )
-        share, psi, parts = float(images.weights.sum()), images.distribution.split(images.psi), []
-        for factor in images.distribution.factors:
+        share, psi, parts = float(images.weights.sum()), images.distribution.split(images.psi), {}
+        for factor in factors:
             held = probes[factor.name]
             along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
             along = along.to(images.psi.dtype)
-            parts.append(stratified(along, held.bins, psi[factor.name], factor.log_probabilities, share))
-        values, errors = ([getattr(part, name) for part in parts] for name in ("value", "standard_error"))
-        return MixedDerivative(torch.cat(values), torch.cat(errors))
+            parts[factor.name] = stratified(
+                along, held.bins, psi[factor.name], factor.log_probabilities, share
+            )
+        return parts
 
 
 @dataclass(frozen=True)
 class ReinforceEstimator:
     """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
 
-    relaxed: ClassVar[None] = None
+    draws: ClassVar[HardDraws] = HardDraws(explore=True)
     probes_per_bin: ClassVar[int] = 0
     chunk_size: int = 64
 
@@ -81,7 +106,7 @@ class ReinforceEstimator:
         share = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:
-            return images.distribution.log_prob(psi, images.draw.bins)
+            return images.distribution.log_prob(psi, images.draw)
 
         return reinforce(along.to(images.psi.dtype), log_prob, images.psi, share)
 

@@ -29,7 +29,7 @@ from neural_sim.gradient.base import (
 )
 from neural_sim.gradient.mixed import ThetaMode, input_cotangents
 from neural_sim.parameter.factor import Relaxation
-from neural_sim.synthesis.motion import RIGID
+from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.synthesis.scene import RelaxedDraws
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
@@ -78,7 +78,7 @@ class PathwiseEstimator:
                 raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
 
     @property
-    def relaxed(self) -> RelaxedDraws:
+    def draws(self) -> RelaxedDraws:
         """How this estimator's images are drawn."""
         return RelaxedDraws(
             self.relaxation,
@@ -111,10 +111,10 @@ class PathwiseEstimator:
             self.chunk_size, self.theta_mode,
         )  # fmt: skip
         maps = map_cotangents(path, *cotangents)
-        if path.tangents is not None:
-            along_draw = contract(path.tangents, maps)
-        else:
-            along_draw = draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
+        along_draw = contract(path.tangents or {}, maps)
+        if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
+            # Light's derivatives, a few numbers, ride along in any mode; those of the camera only in forward mode.
+            along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
 
 
@@ -190,7 +190,7 @@ def psi_contributions(
 
     def along(psi: Tensor) -> Tensor:
         draw = relaxed(psi)
-        return torch.stack([getattr(draw, name) * value for name, value in cotangents.items()]).sum(0)
+        return torch.stack([number_of(draw, name) * value for name, value in cotangents.items()]).sum(0)
 
     basis = torch.eye(psi.numel(), dtype=psi.dtype, device=psi.device)
     return torch.stack([torch.func.jvp(along, (psi.detach(),), (e,))[1] for e in basis], -1)

@@ -11,7 +11,7 @@ from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
 from neural_sim.synthesis.scene import RenderedObject, Scene
-from neural_sim.types import LabelledImages
+from neural_sim.types import LabelledImages, SceneDraw
 
 
 def image_losses(
@@ -40,18 +40,31 @@ def bound_losses(
 
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPath:
-    """How one object's images came from psi. Raises ``ValueError`` for images that were not drawn afresh."""
+    """How one object's images came from psi: the relaxed draw, or a hard one that psi's light still moves.
+
+    Raises ``ValueError`` for images that were not drawn afresh.
+    """
     noise, relaxed = part.noise, part.relaxed
-    if noise is None or relaxed is None:
+    if noise is None:
         raise ValueError("pathwise: these images were not drawn from psi afresh")
 
+    # All of an object's images are under psi's light, unless lights were explored, which nothing differentiates.
+    light = {} if part.draw.weights is None else {"weights": part.draw.weights[0]}
+
+    def replay(psi: Tensor) -> SceneDraw:
+        if relaxed is None:
+            return scene.distribution.lit(part.draw, psi)
+        return scene.distribution.relaxed(psi, noise, relaxed.relaxation)
+
     def compose(rgb: Tensor, opacity: Tensor) -> LabelledImages:
-        return scene.synthesizer.compose(rgb, opacity, part.nuisance, label, part.draw.bins[:, 0])
+        return scene.synthesizer.compose(
+            rgb, opacity, part.nuisance, label, scene.distribution.label_of(part.draw)
+        )
 
     moving = scene.synthesizer.label_gradient == "differentiable"
     return RenderedPath(
-        relaxed=lambda psi: scene.distribution.relaxed(psi, noise, relaxed.relaxation),
-        render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays),
+        relaxed=replay,
+        render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays, **light),
         compose=lambda rgb, opacity: compose(rgb, opacity).images,
         camera=scene.camera,
         rgb=part.rgb,
@@ -76,7 +89,7 @@ def object_images(
             index=index,
             weights=weights[index],
             draw=part.draw,
-            path=rendered_path(scene, label, part) if part.relaxed else None,
+            path=rendered_path(scene, label, part) if part.relaxed or part.tangents else None,
             group=part.relaxed.group if part.relaxed else 1,
         )
     return bound

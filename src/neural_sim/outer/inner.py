@@ -16,7 +16,7 @@ from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
 from neural_sim.settings import Outer
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import RelaxedDraws, RenderedObject, Scene
+from neural_sim.synthesis.scene import HARD, Draws, HardDraws, RenderedObject, Scene
 from neural_sim.types import LabelledImages
 
 
@@ -32,8 +32,9 @@ class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
     The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each
-    time. ``validation`` is the labelled target set; no step sees any other real image. ``relaxed`` says how the
-    pathwise estimator wants images drawn; those are always rendered anew, all others from a pool of every bin.
+    time. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how the
+    method wants images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all others come
+    from a pool of every bin.
     ``images`` and ``steps`` count the labelled images made and the detector's optimiser steps.
     """
 
@@ -47,16 +48,17 @@ class InnerLoop:
         batch_size: int,
         weight_decay: float,
         generator: torch.Generator,
-        relaxed: RelaxedDraws | None = None,
+        draws: Draws = HARD,
     ) -> None:
         self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
         self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
         self.backbone, self.warm_start = detector.split(params)
         self.validation = CachedSet.of(detector, self.backbone, validation)
-        self.relaxed = relaxed
+        self.draws = draws
         self.pool: ImagePool | None = None
         begun = time.perf_counter()
-        if settings.pool_per_bin and not relaxed:
+        fixed_light = scene.distribution.light is None
+        if settings.pool_per_bin and isinstance(draws, HardDraws) and fixed_light:
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self.pool_seconds = time.perf_counter() - begun
         self._start = params if settings.start == "warm" else {**detector.init(generator), **self.backbone}
@@ -72,7 +74,7 @@ class InnerLoop:
         count, labels = self.settings.images_per_object, range(len(self.scene.names))
         self.images += count * len(labels)
         if self.pool is None:
-            return self.scene.training_set(psi, count, self.generator, self.relaxed)
+            return self.scene.training_set(psi, count, self.generator, self.draws)
         return [self.pool.draw(label, psi[label], count, self.generator) for label in labels]
 
     def train(self, images: CachedSet) -> float:

@@ -19,6 +19,8 @@ from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.retrained import Check, as_double, binned_problem, check
+from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.product import Factor
 from neural_sim.parameter.update import UpdateState
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.scene import RenderedObject, join
@@ -88,16 +90,21 @@ class SimulatorModule(OuterLoop):
         psi, slope, noise = (distribution.split(values) for values in (before, gradient, error))
         moved = {}
         for factor in distribution.factors:
-            name = factor.name
-            log_p = factor.log_probabilities(psi[name])
-            moved[name], self._update_states[name] = self.settings.update.step(
-                psi[name], log_p, slope[name], noise[name], self._update_states[name]
-            )
+            held = psi[factor.name], slope[factor.name], noise[factor.name], self._update_states[factor.name]
+            moved[factor.name], self._update_states[factor.name] = self._step(factor, *held)
         done = (len(self.records) - 1) / max(1, self.settings.iterations - 1)
         part = 1.0 + done * (self.settings.final_step - 1.0)
         if certificate.action == "shrunk":
             part *= self.settings.trust.shrink
         self.psi.data[self._learned] = before + part * (distribution.join(moved) - before)
+
+    def _step(
+        self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor, state: UpdateState
+    ) -> tuple[Tensor, UpdateState]:
+        """One factor's step: in logits of bins, or in weights of lights."""
+        if isinstance(factor, Illumination):
+            return self.settings.light_update.step(psi, slope, noise, state, factor.project)
+        return self.settings.update.step(psi, factor.log_probabilities(psi), slope, noise, state)
 
     def _hypergradient(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
@@ -149,7 +156,7 @@ class SimulatorModule(OuterLoop):
     def _draw_probes(self) -> None:
         """New probes, or a part of them, so that what is peculiar to some does not push psi the same way for ever."""
         every = self.estimator.probes_per_bin
-        if not every:
+        if not every or not self.scene.distribution.binned:
             return
         if self._probes is None:
             self._probes = self._every_bin(every, self.inner.generator, self._learned)
@@ -176,7 +183,7 @@ class SimulatorModule(OuterLoop):
         """
         every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
         done = len(self.records) + 1
-        if every == 0 or done % every:
+        if every == 0 or done % every or not self.scene.distribution.binned:
             return None
         probed = self._probes
         objects = range(len(self.scene.names))
@@ -185,7 +192,7 @@ class SimulatorModule(OuterLoop):
         distribution = self.scene.distribution
         turn, place = divmod(done // every - 1, len(self._learned))
         label = self._learned[place]
-        factor = distribution.factors[turn % len(distribution.factors)]
+        factor = distribution.binned[turn % len(distribution.binned)]
         trainable = self.inner.trainable
         pulls = [(self.inner.detector.proximal, self.inner.warm_start), (result.damping.value, trainable)]
         ordered = [part[factor.name] for part in probed.probes]

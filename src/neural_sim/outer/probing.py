@@ -43,7 +43,7 @@ class ProbeSet:
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
         first = 0
         for label in objects:
-            for column, factor in enumerate(scene.distribution.factors):
+            for column, factor in enumerate(scene.distribution.binned):
                 part = source.probes(label, factor.name, per_bin, psi[label], generator)
                 index = torch.arange(first, first + len(part.images))
                 probes[label][factor.name] = Probes(index, scene.distribution.bins_of(part.draw)[:, column])

@@ -31,6 +31,6 @@ class RewardLoop(OuterLoop):
             training_loss = self.inner.train(cached)
         with timed(seconds, "reward"):
             record = self.record(asked, images, training_loss, seconds)
-        self.search.tell(-record.validation_loss, [part.draw.bins for part in rendered])
+        self.search.tell(-record.validation_loss, [part.draw for part in rendered])
         self.psi.data = self.search.psi.clone()
         self.trajectory.append(self.psi.detach().clone())

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.parameter.factor import Beliefs, Gap
 from neural_sim.parameter.simplex import project_simplex, project_sum
 from neural_sim.parameter.update import Mirror, UpdateState
 
@@ -41,7 +42,7 @@ class Illumination:
         deviation: standard deviation of each weight in Gaussian draws.
         initial, target: weights of objects not named in ``biased``: ``uniform``, ``{dominant: b}``,
             ``{modes: [b, ...]}`` (see :func:`distributions.distribution`) or k numbers that add up to 1.
-        biased: object name -> {initial: ..., target: ...}.
+        biased, gap: see :class:`Beliefs`.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -53,6 +54,7 @@ class Illumination:
     initial: Specification = "uniform"
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
+    gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:
         if self.anchors < 2:
@@ -63,15 +65,44 @@ class Illumination:
             )
         if not (math.isfinite(self.deviation) and self.deviation > 0.0):
             raise ValueError(f"parameter.illumination.deviation must be positive, got {self.deviation}")
+        if self.gap not in get_args(Gap):
+            raise ValueError(f"parameter.illumination.gap must be one of {get_args(Gap)}, got {self.gap!r}")
         for name in ("", *(self.biased or {})):  # what is wrong with a specification is said before any stage
             self.weights("initial", name)
             self.weights("target", name)
 
+    @property
+    def name(self) -> str:
+        """Of the factor."""
+        return "illumination"
+
+    @property
+    def size(self) -> int:
+        """How many numbers of psi an object has here."""
+        return self.anchors
+
+    @property
+    def factors(self) -> tuple[Illumination, ...]:
+        """Itself: the one factor that it is."""
+        return (self,)
+
+    @property
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Nothing else is drawn here."""
+        return {}
+
+    @property
+    def beliefs(self) -> Beliefs:
+        """The configured weights, by object."""
+        return Beliefs(self.initial, self.target, self.biased, self.gap)
+
+    def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
+        """psi are the weights themselves."""
+        return self.weights(which, object_name)
+
     def weights(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The configured ``initial`` or ``target`` weights of one object, float64. They are psi itself."""
-        specification = self.initial if which == "initial" else self.target
-        if self.biased and object_name in self.biased:
-            specification = self.biased[object_name].get(which, specification)
+        specification = self.beliefs.of(which, object_name)
         where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
         numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
         if self.constraint == "affine" and numbers:
@@ -86,11 +117,9 @@ class Illumination:
         """Every image's weights: psi itself, nothing is random. Differentiable in psi."""
         return psi.expand(count, -1)
 
-    def sample_gaussian(
-        self, psi: Float[Tensor, "k"], count: int, generator: torch.Generator
-    ) -> GaussianDraw:
-        """``count`` draws of N(psi, deviation^2 I), and the weights nearest to them. No derivative reaches psi."""
-        noise = torch.randn((count, self.anchors), generator=generator, dtype=torch.float64).to(psi)
+    def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
+        """Draws of N(psi, deviation^2 I) from standard normal ``noise``, and the weights nearest to them. No derivative
+        reaches psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -13,17 +13,21 @@ from torch import Tensor
 
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.factor import BinnedFactor, BinNoise, Coordinate, Relaxation
+from neural_sim.parameter.illumination import Illumination
 from neural_sim.types import SceneDraw
 
 COORDINATES: tuple[Coordinate, ...] = ("phi", "rho", "distance", "magnification")
 """The numbers of a :class:`SceneDraw` that images depend on smoothly."""
 
 
+Factor = BinnedFactor | Illumination
+
+
 class Parameter(Protocol):
     """A configured parameter: the factors that it learns, and uniform ranges of what it draws beside them."""
 
     @property
-    def factors(self) -> tuple[BinnedFactor, ...]: ...
+    def factors(self) -> tuple[Factor, ...]: ...
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]: ...
@@ -61,11 +65,13 @@ class SceneNoise:
     """All randomness of n draws, made once and replayed by every pass (paper, Tool 2).
 
     ``bins`` picks each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it.
+    where no factor draws it. ``light`` is standard normal: around psi's weights lights are explored, without it they are
+    psi's.
     """
 
     bins: Mapping[str, BinNoise]
     uniform: Mapping[str, Float[Tensor, "n"]]
+    light: Float[Tensor, "n k"] | None = None
 
     def __len__(self) -> int:
         return self.uniform["phi"].shape[0]
@@ -79,12 +85,12 @@ class SceneDistribution:
         ValueError: no factor, two factors of one name, or two of one coordinate.
     """
 
-    factors: tuple[BinnedFactor, ...]
+    factors: tuple[Factor, ...]
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=lambda: Unlearned().ranges)
 
     def __post_init__(self) -> None:
         names = [factor.name for factor in self.factors]
-        drawn = [factor.coordinate for factor in self.factors]
+        drawn = [factor.coordinate for factor in self.binned]
         if not names or len(set(names)) < len(names) or len(set(drawn)) < len(drawn):
             raise ValueError(
                 f"parameter: want one or more factors of different names and coordinates, got {names} of {drawn}"
@@ -98,6 +104,16 @@ class SceneDistribution:
         for parameter in parameters:
             ranges |= parameter.ranges
         return SceneDistribution(tuple(f for parameter in parameters for f in parameter.factors), ranges)
+
+    @property
+    def binned(self) -> tuple[BinnedFactor, ...]:
+        """The factors that draw bins."""
+        return tuple(factor for factor in self.factors if isinstance(factor, BinnedFactor))
+
+    @property
+    def light(self) -> Illumination | None:
+        """The factor that weighs lights, if there is one."""
+        return next((factor for factor in self.factors if isinstance(factor, Illumination)), None)
 
     # --- psi ---
 
@@ -127,9 +143,16 @@ class SceneDistribution:
         )
 
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
-        """Every factor's probabilities of its bins."""
+        """Every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
-        return {f.name: f.log_probabilities(parts[f.name]).exp() for f in self.factors}
+        return parts | {f.name: f.log_probabilities(parts[f.name]).exp() for f in self.binned}
+
+    def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
+        """psi with the weights of lights brought back to their constraint."""
+        if self.light is None:
+            return psi
+        parts = self.split(psi)
+        return self.join(parts | {self.light.name: self.light.project(parts[self.light.name])})
 
     @property
     def biased(self) -> tuple[str, ...]:
@@ -145,63 +168,93 @@ class SceneDistribution:
         dtype: torch.dtype = torch.float32,
         antithetic: bool = False,
         conditional: int = 0,
+        explore: bool = False,
     ) -> SceneNoise:
         """Randomness of n draws; independent of psi.
 
         ``antithetic``: Gumbel noise in pairs from uniforms u and 1 - u. ``conditional``: draws of the noise given the
-        bin, for ``gumbel_rao``. Raises ``ValueError`` for an odd number of antithetic draws.
+        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density. Raises ``ValueError`` for an odd number of antithetic draws.
         """
-        gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.factors}
+        gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.binned}
         drawn = [c for c in COORDINATES if c != "magnification" or self._binned(c)]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
         noise = {
             f.name: BinNoise(gumbel[f.name], _exponential(n, conditional, f.bins, generator, dtype))
-            for f in self.factors
+            for f in self.binned
         }
-        return SceneNoise(noise, dict(zip(drawn, uniform, strict=True)))
+        light = None
+        if explore and self.light is not None:
+            light = torch.randn((n, self.light.size), generator=generator, dtype=torch.float64).to(dtype)
+        return SceneNoise(noise, dict(zip(drawn, uniform, strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
         """Exact samples of p_psi; no derivative reaches psi."""
         parts = self.split(psi)
-        return self.at_bins({f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.factors}, noise)
+        bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
+        return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:
-        """Samples in given bins of every factor, uniform within each."""
-        placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.factors}
+        """Samples in given bins of every factor, uniform within each; their light is not said."""
+        placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.binned}
         return self._draw(placed, bins, noise)
+
+    def lit(
+        self, draw: SceneDraw, psi: Float[Tensor, "K"], noise: Float[Tensor, "n k"] | None = None
+    ) -> SceneDraw:
+        """``draw`` under psi's light, differentiable in psi; with ``noise`` under lights around it, which are not."""
+        if self.light is None:
+            return draw
+        weights = self.split(psi)[self.light.name]
+        if noise is None:
+            return replace(draw, weights=self.light.draw(weights, len(draw)))
+        drawn = self.light.explore(weights, noise)
+        return replace(draw, weights=drawn.weights, explored=drawn.unprojected)
 
     def relaxed(
         self, psi: Float[Tensor, "K"], noise: SceneNoise, relaxation: Relaxation = "gumbel_softmax"
     ) -> SceneDraw:
         """Samples that are differentiable in psi, see :meth:`BinnedFactor.relaxed`."""
         parts, placed, bins = self.split(psi), {}, {}
-        for f in self.factors:
+        for f in self.binned:
             within = noise.uniform[f.coordinate]
             placed[f.coordinate], bins[f.name] = f.relaxed(
                 parts[f.name], noise.bins[f.name], within, relaxation
             )
-        return self._draw(placed, bins, noise)
+        return self.lit(self._draw(placed, bins, noise), psi)
 
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise
     ) -> SceneDraw:
         """Samples in given bins of one factor, all others drawn from p_psi."""
         parts = self.split(psi)
-        others = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.factors if f.name != name}
-        return self.at_bins({**others, name: bins}, noise)
+        others = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned if f.name != name}
+        return self.lit(self.at_bins({**others, name: bins}, noise), psi.detach())
 
-    def log_prob(self, psi: Float[Tensor, "K"], bins: Int[Tensor, "n factors"]) -> Float[Tensor, "n"]:
-        """log-probability of drawn bins (for REINFORCE)."""
+    def log_prob(self, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "n"]:
+        """log p of drawn bins and explored lights (for REINFORCE).
+
+        Raises:
+            ValueError: a light that was not explored, which has no density.
+        """
         parts = self.split(psi)
-        logs = [f.log_probabilities(parts[f.name])[bins[:, i]] for i, f in enumerate(self.factors)]
+        logs = [f.log_probabilities(parts[f.name])[draw.bins[:, i]] for i, f in enumerate(self.binned)]
+        if self.light is not None:
+            if draw.explored is None:
+                raise ValueError("parameter.illumination: these lights were not drawn, they have no density")
+            logs.append(self.light.log_prob(parts[self.light.name], draw.explored))
         return torch.stack(logs).sum(0)
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
-        """The bins that each draw lies in, whatever bins it was drawn for."""
-        return torch.stack([f.bin_of(getattr(draw, f.coordinate)) for f in self.factors], -1)
+        """The bins that each draw lies in, whatever bins it was drawn for; a column for each binned factor."""
+        return _columns([f.bin_of(getattr(draw, f.coordinate)) for f in self.binned], draw.phi)
+
+    def label_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
+        """The first binned factor's bin, for reports; -1 where nothing is binned."""
+        found = self.bins_of(draw)
+        return found[:, 0] if found.shape[1] else torch.full((len(draw),), -1)
 
     def _binned(self, coordinate: Coordinate) -> bool:
-        return any(f.coordinate == coordinate for f in self.factors)
+        return any(f.coordinate == coordinate for f in self.binned)
 
     def _draw(
         self,
@@ -216,7 +269,12 @@ class SceneDistribution:
                 values[coordinate] = placed[coordinate]
             elif coordinate in noise.uniform:
                 values[coordinate] = low + (high - low) * noise.uniform[coordinate]
-        return SceneDraw(**values, bins=torch.stack([bins[name] for name in self.names], -1))
+        return SceneDraw(**values, bins=_columns([bins[f.name] for f in self.binned], values["phi"]))
+
+
+def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
+    """Bins side by side, none as no column."""
+    return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)
 
 
 def _exponential(

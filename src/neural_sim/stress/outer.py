@@ -25,7 +25,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
 from neural_sim.stress.rendering import block
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import HardDraws, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
@@ -180,7 +180,7 @@ class Constant:
     """An estimator that returns one number for everything."""
 
     value: float
-    relaxed: ClassVar[None] = None
+    draws: ClassVar[HardDraws] = HardDraws()
     probes_per_bin: ClassVar[int] = 0
 
     def estimate(self, losses: Any, params: Any, vector: Any, images: Any, probes: Any) -> MixedDerivative:

@@ -24,6 +24,18 @@ def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tens
     return tuple(name for name, value in values.items() if value is not None and value.requires_grad)
 
 
+def light_names(count: int) -> tuple[str, ...]:
+    """Names of the derivatives by each weight of a draw's light."""
+    return tuple(f"weights_{i}" for i in range(count))
+
+
+def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
+    """One number of every draw by its name, a coordinate's or that of a light's weight."""
+    if name.startswith("weights_") and draw.weights is not None:
+        return draw.weights[:, int(name.removeprefix("weights_"))]
+    return getattr(draw, name)
+
+
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
     """Derivatives of every image's camera-to-world pose by each of its draw's ``names``.
 

@@ -40,16 +40,18 @@ class ImagePool:
         """At least ``per_bin`` poses of every bin of every factor and object.
 
         Raises:
-            ValueError: fewer than one.
+            ValueError: fewer than one, or a light that moves with psi.
         """
         if per_bin < 1:
             raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
-        factors = scene.distribution.factors
+        if scene.distribution.light is not None:
+            raise ValueError("outer.pool_per_bin: images under a light that moves are no pool's, want 0")
+        factors = scene.distribution.binned
         cells = math.prod(factor.bins for factor in factors)
         per_cell = math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
         every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
         bins = every.repeat_interleave(per_cell, 0)
-        named = dict(zip(scene.distribution.names, bins.unbind(1), strict=True))
+        named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
         pools = []
         for label in range(len(scene.names)):
             noise = scene.distribution.draw_noise(len(bins), generator, scene.dtype(label))
@@ -70,9 +72,9 @@ class ImagePool:
     ) -> RenderedObject:
         """``per_bin`` images of every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
         distribution = self.scene.distribution
-        size = next(f.bins for f in distribution.factors if f.name == factor)
+        size = next(f.bins for f in distribution.binned if f.name == factor)
         bins = torch.arange(size).repeat_interleave(per_bin)
-        if len(distribution.factors) == 1:
+        if len(distribution.binned) == 1:
             return self._compose(label, bins[:, None], generator)
         noise = distribution.draw_noise(len(bins), generator)
         return self._compose(label, distribution.stratum(factor, bins, psi.float(), noise).bins, generator)
@@ -82,7 +84,7 @@ class ImagePool:
     ) -> RenderedObject:
         pool, scene = self.objects[label], self.scene
         cell = torch.zeros(len(bins), dtype=torch.long)
-        for column, factor in zip(bins.unbind(1), scene.distribution.factors, strict=True):
+        for column, factor in zip(bins.unbind(1), scene.distribution.binned, strict=True):
             cell = cell * factor.bins + column
         within = torch.randint(pool.per_cell, cell.shape, generator=generator)
         index = cell * pool.per_cell + within

@@ -14,7 +14,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.synthesis.motion import moved_by, pose_rates
+from neural_sim.synthesis.motion import light_names, moved_by, pose_rates
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
 
@@ -53,6 +53,19 @@ class RelaxedDraws:
 
 
 @dataclass(frozen=True)
+class HardDraws:
+    """How images are drawn whose bins are scored, not differentiated. ``light_tangents``: where lights are weighed, the
+    maps' derivatives by the weights ride along. ``explore``: lights around psi's, for estimators that need a density."""
+
+    light_tangents: bool = False
+    explore: bool = False
+
+
+Draws = HardDraws | RelaxedDraws
+HARD = HardDraws()
+
+
+@dataclass(frozen=True)
 class RenderedObject:
     """One object's images with all that made them: replaying ``noise`` and ``nuisance`` gives them again.
 
@@ -85,22 +98,27 @@ class Scene:
         self, label: int, draw: SceneDraw, noise: SceneNoise, generator: torch.Generator
     ) -> RenderedObject:
         """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
-        poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
-        if draw.magnification is None:
-            maps = Maps(*self.renderer.render(self.fields[label], self.camera, poses))
-        else:  # every image has a camera of its own
-            each = [
-                self.renderer.render(self.fields[label], magnified(self.camera, float(m)), pose[None])
-                for m, pose in zip(draw.magnification, poses, strict=True)
-            ]
-            maps = Maps(*(torch.cat(parts) for parts in zip(*each, strict=True)))
+        maps = self._maps(label, draw)
         nuisance = self.synthesizer.draw_nuisance(len(draw), self.camera, generator)
         return self._compose(label, draw, noise, maps, nuisance)
+
+    @torch.no_grad()
+    def _maps(self, label: int, draw: SceneDraw) -> Maps:
+        """Premultiplied colour and opacity at given scene parameters."""
+        poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
+        lights = {} if draw.weights is None else {"weights": draw.weights}
+        if draw.magnification is None:
+            return Maps(*self.renderer.render(self.fields[label], self.camera, poses, **lights))
+        each = []  # every image has a camera of its own
+        for i, magnification in enumerate(draw.magnification.tolist()):
+            camera, own = magnified(self.camera, magnification), {k: v[i : i + 1] for k, v in lights.items()}
+            each.append(self.renderer.render(self.fields[label], camera, poses[i : i + 1], **own))
+        return Maps(*(torch.cat(parts) for parts in zip(*each, strict=True)))
 
     def _compose(
         self, label: int, draw: SceneDraw, noise: SceneNoise, maps: Maps, nuisance: Nuisance
     ) -> RenderedObject:
-        bins = self.distribution.bins_of(draw)[:, 0]
+        bins = self.distribution.label_of(draw)
         with torch.no_grad():
             images = self.synthesizer.compose(maps.rgb, maps.opacity, nuisance, label, bins)
         return RenderedObject(images, noise, draw, nuisance, maps.rgb, maps.opacity)
@@ -115,14 +133,35 @@ class Scene:
         psi: Float[Tensor, "K"],
         count: int,
         generator: torch.Generator,
-        relaxed: RelaxedDraws | None = None,
+        how: Draws = HARD,
     ) -> RenderedObject:
-        """``count`` images of one object from p_psi: hard samples, or those that the pathwise estimator asks for."""
+        """``count`` images of one object from p_psi, as the estimator wants them."""
         logits = psi.detach().to(self.dtype(label))
-        if relaxed is not None:
-            return self._draw_relaxed(label, logits, count, generator, relaxed)
-        noise = self.distribution.draw_noise(count, generator, self.dtype(label))
-        return self.render(label, self.distribution.hard(logits, noise), noise, generator)
+        if isinstance(how, RelaxedDraws):
+            return self._draw_relaxed(label, logits, count, generator, how)
+        noise = self.distribution.draw_noise(count, generator, self.dtype(label), explore=how.explore)
+        draw = self.distribution.hard(logits, noise)
+        if not how.light_tangents or self.distribution.light is None:
+            return self.render(label, draw, noise, generator)
+        maps, tangents = self._maps_with_tangents(label, draw, ())
+        nuisance = self.synthesizer.draw_nuisance(count, self.camera, generator)
+        return replace(self._compose(label, draw, noise, maps, nuisance), tangents=tangents)
+
+    def _maps_with_tangents(
+        self, label: int, draw: SceneDraw, names: tuple[str, ...]
+    ) -> tuple[Maps, dict[str, Maps]]:
+        """The maps, and their derivatives by the named numbers of the draw and by every weight of a light."""
+        poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
+        rates = pose_rates(draw, names) if names else poses.new_zeros(0, *poses.shape)
+        if draw.weights is None:
+            maps, moved = self.renderer.render_with_tangents(self.fields[label], self.camera, poses, rates)
+            return maps, dict(zip(names, moved, strict=True))
+        count = draw.weights.shape[1]
+        turned = torch.eye(count, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
+        maps, moved = self.renderer.render_with_tangents(
+            self.fields[label], self.camera, poses, rates, weights=draw.weights, weight_rates=turned
+        )
+        return maps, dict(zip((*names, *light_names(count)), moved, strict=True))
 
     def _draw_relaxed(
         self, label: int, logits: Tensor, count: int, generator: torch.Generator, relaxed: RelaxedDraws
@@ -134,18 +173,15 @@ class Scene:
 
         with torch.no_grad():
             draw = replay(logits)
-        poses, field = orbit(draw.phi, draw.rho, draw.distance), self.fields[label]
         names = moved_by(replay, logits) if relaxed.tangents else ()
-        if names:
-            rates = pose_rates(draw, names)
-            maps, moved = self.renderer.render_with_tangents(field, self.camera, poses, rates)
-        else:
-            maps, moved = Maps(*self.renderer.render(field, self.camera, poses)), ()
+        lit = self.distribution.light is not None
+        maps, tangents = (
+            self._maps_with_tangents(label, draw, names) if names or lit else (self._maps(label, draw), None)
+        )
         shared = 2 if relaxed.common_backgrounds else 1
         nuisance = self.synthesizer.draw_nuisance(count // shared, self.camera, generator)
         nuisance = nuisance.select(torch.arange(count) // shared)
         made = self._compose(label, draw, noise, maps, nuisance)
-        tangents = dict(zip(names, moved, strict=True)) if names else None
         return replace(made, relaxed=relaxed, tangents=tangents)
 
     def training_set(
@@ -153,16 +189,16 @@ class Scene:
         psi: Float[Tensor, "objects K"],
         count: int,
         generator: torch.Generator,
-        relaxed: RelaxedDraws | None = None,
+        how: Draws = HARD,
     ) -> list[RenderedObject]:
         """``count`` images of every object."""
-        return [self.draw(label, psi[label], count, generator, relaxed) for label in range(len(self.names))]
+        return [self.draw(label, psi[label], count, generator, how) for label in range(len(self.names))]
 
     def probes(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
         """``per_bin`` images from every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
-        size = next(f.bins for f in self.distribution.factors if f.name == factor)
+        size = next(f.bins for f in self.distribution.binned if f.name == factor)
         bins = torch.arange(size).repeat_interleave(per_bin)
         noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
         logits = psi.detach().to(self.dtype(label))

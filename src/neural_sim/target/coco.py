@@ -17,6 +17,7 @@ from torch import Tensor
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.split import split
@@ -87,6 +88,7 @@ class CocoTarget:
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
+        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
         generator = torch.Generator().manual_seed(seed)

@@ -6,12 +6,14 @@ import logging
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.cameras import magnified, orbit
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
@@ -28,10 +30,11 @@ def render_target(
     camera: PinholeCamera,
     synthesizer: Synthesizer,
     generator: torch.Generator,
+    rig: LightRig | None = None,
 ) -> LabelledImages:
     """Images of every object at its draw, object by object; labels are positions in ``objects``.
 
-    Float32 on the CPU. Images without a box are counted in the log. Raises ``ValueError`` for another number of
+    Draws that weigh lights weigh those of ``rig``. Float32 on the CPU. Images without a box are counted in the log. Raises ``ValueError`` for another number of
     draws than of objects, or none.
     """
     if len(objects) != len(draws) or not objects:
@@ -42,9 +45,9 @@ def render_target(
     for label, (item, draw) in enumerate(zip(objects, draws, strict=True)):
         for start in range(0, len(draw), CHUNK):
             here = draw.select(slice(start, start + CHUNK))
-            rgb, opacity = _premultiplied(renderer, item, camera, here)
+            rgb, opacity = _premultiplied(renderer, item, camera, here, rig)
             nuisance = synthesizer.draw_nuisance(len(here), camera, generator)
-            parts.append(synthesizer.compose(rgb, opacity, nuisance, label, here.bins[:, 0]))
+            parts.append(synthesizer.compose(rgb, opacity, nuisance, label, _label(here)))
     images = LabelledImages.concatenate(parts)
     missing = images_without_boxes(images)
     if missing:
@@ -52,16 +55,34 @@ def render_target(
     return images
 
 
+def _label(draw: SceneDraw) -> Int[Tensor, "n"]:
+    """The first binned factor's bin, -1 where nothing is binned."""
+    return draw.bins[:, 0] if draw.bins.shape[1] else torch.full((len(draw),), -1)
+
+
+def _lighting(draw: SceneDraw, rig: LightRig | None) -> Lighting | None:
+    """The light of an object's images, which they share; None: the renderer's own."""
+    if draw.weights is None:
+        return None
+    if rig is None or bool((draw.weights != draw.weights[0]).any()):
+        raise ValueError("render_target: want a rig and one light for all of an object's images")
+    return rig.lighting(draw.weights[0])
+
+
 def _premultiplied(
-    renderer: MeshRenderer, item: ObjectMesh, camera: PinholeCamera, draw: SceneDraw
+    renderer: MeshRenderer,
+    item: ObjectMesh,
+    camera: PinholeCamera,
+    draw: SceneDraw,
+    rig: LightRig | None,
 ) -> tuple[Float[Tensor, "n h w 3"], Float[Tensor, "n h w"]]:
     with torch.no_grad():
         poses = orbit(draw.phi, draw.rho, draw.distance)
+        lighting = _lighting(draw, rig)
         if draw.magnification is None:
-            rgba = renderer.render(item.mesh, camera, poses)
+            rgba = renderer.render(item.mesh, camera, poses, lighting)
         else:  # every image has a camera of its own
-            pairs = zip(draw.magnification, poses, strict=True)
-            rgba = torch.cat(
-                [renderer.render(item.mesh, magnified(camera, float(m)), pose[None]) for m, pose in pairs]
-            )
+            cameras = [magnified(camera, m) for m in draw.magnification.tolist()]
+            pairs = zip(cameras, poses, strict=True)
+            rgba = torch.cat([renderer.render(item.mesh, own, pose[None], lighting) for own, pose in pairs])
     return rgba[..., :3] * rgba[..., 3:], rgba[..., 3]

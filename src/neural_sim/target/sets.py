@@ -10,6 +10,7 @@ import torch
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
 from neural_sim.types import LabelledImages, PinholeCamera
@@ -39,6 +40,7 @@ class RenderedTarget:
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
+        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
         biased, target = set(distribution.biased), distribution.psi("target", list(meshes)).float()
@@ -50,5 +52,7 @@ class RenderedTarget:
                 test_count = self.test_per_biased_object if item.name in biased else self.test_per_object
                 count = test_count if name == "test" else self.val_per_object
                 draws.append(distribution.hard(psi, distribution.draw_noise(count, generator)))
-            made[name] = render_target(list(meshes.values()), renderer, draws, camera, synthesizer, generator)
+            made[name] = render_target(
+                list(meshes.values()), renderer, draws, camera, synthesizer, generator, rig
+            )
         return made

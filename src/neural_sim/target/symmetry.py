@@ -32,7 +32,7 @@ def equivalent_bins(
     of their premultiplied views over the pixels that either covers is below ``tolerance``. Views of every bin use the
     same ``samples`` offsets and second angles; what the factor does not draw is at the middle of its range.
     """
-    count = next(f.bins for f in distribution.factors if f.name == factor)
+    count = next(f.bins for f in distribution.binned if f.name == factor)
     views = [_views(item, renderer, distribution, factor, camera, b, samples) for b in range(count)]
     groups: list[list[int]] = []
     for b in range(count):
@@ -81,7 +81,7 @@ def _at(
     middle = torch.full_like(within, 0.5)
     uniform = {name: other if name in ("phi", "rho") else middle for name in COORDINATES}
     bins, still = {}, {}
-    for f in distribution.factors:
+    for f in distribution.binned:
         if f.name == factor:
             bins[f.name], uniform[f.coordinate] = torch.full((len(within),), bin_index), within
         else:
