@@ -69,11 +69,15 @@ class GridFitting(Fitting):
         self._rounds = Rounds(build_pool(views, border, generator))
         self._ready = []
 
-    def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
+    def next_batch(self) -> tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]:
+        """The next rays with their samples and the cells of these."""
         if not self._ready:
             block = self._rounds.draw(self.batch_rays * BATCHES_PER_BLOCK)
             self._ready = self._batches(block, self.batch_rays)[::-1]
-        rays, samples, cells = self._ready.pop()
+        return self._ready.pop()
+
+    def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
+        rays, samples, cells = self.next_batch()
         positions, directions = sample_points(rays.rays, samples)
         sigma, rgb = self.field.decode(self.field.raw(positions, cells), directions)
         return [composite(sigma, rgb, samples)], rays.pixels

@@ -10,8 +10,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader
 
-from neural_sim.field.objective import Fitting, expected_error
-from neural_sim.field.scores import score_views
+from neural_sim.field.objective import Fitting
 from neural_sim.types import PosedViews
 
 TERMINATION = 1e-3
@@ -72,8 +71,7 @@ class RadianceFieldModule(lightning.LightningModule):
 
     def training_step(self, batch: Any, batch_index: int) -> None:
         optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
-        renderings, pixels = self.fitting.render()
-        loss = torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
+        loss = self.fitting.loss()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         for group in optimizer.param_groups:
@@ -93,7 +91,7 @@ class RadianceFieldModule(lightning.LightningModule):
             return
         now = time.perf_counter()
         self.field.eval()
-        scores = score_views(self.field, self.held_out, TERMINATION, RAYS_PER_CHUNK)
+        scores = self.fitting.score(self.held_out, TERMINATION, RAYS_PER_CHUNK)
         self.field.train()
         seconds = now - self._begun - self._paused
         self._paused += time.perf_counter() - now

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pool import RayPool
+from neural_sim.field.scores import score_views
 from neural_sim.types import PosedViews
 
 Rendering = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]
@@ -21,9 +22,14 @@ def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Flo
     With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
     E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
     """
+    return expected_errors(rendering, pixels).mean()
+
+
+def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
+    """The square error of each ray and channel, of which ``expected_error`` is the mean."""
     colour = rendering[0] - pixels[:, :3]
     opacity = (rendering[1] - pixels[:, 3])[:, None]
-    return (colour.square() - colour * opacity + opacity.square() / 3.0).mean()
+    return colour.square() - colour * opacity + opacity.square() / 3.0
 
 
 class Fitting(ABC):
@@ -42,6 +48,15 @@ class Fitting(ABC):
     @abstractmethod
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
         """All renderings of the next batch that the loss compares with its pixels, and these (premultiplied RGBA)."""
+
+    def loss(self) -> Float[Tensor, ""]:
+        """What the next step descends: the expected error of every rendering of the next batch."""
+        renderings, pixels = self.render()
+        return torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
+
+    def score(self, views: PosedViews, termination: float, rays_per_chunk: int) -> dict[str, float]:
+        """How well the field shows views that it is not fitted to, see ``score_views``."""
+        return score_views(self.field, views, termination, rays_per_chunk)
 
     @abstractmethod
     def advance(self, step: int) -> bool:

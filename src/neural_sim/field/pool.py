@@ -15,7 +15,7 @@ from neural_sim.types import PosedViews, Rays
 
 @dataclass(frozen=True)
 class RayPool:
-    """Rays (rays, 3), their premultiplied RGBA pixels, and a phase in [0, 1) that shifts each ray's sample lattice.
+    """Rays (rays, 3), their premultiplied RGBA pixels, views, and a phase in [0, 1) that shifts each sample lattice.
 
     With phases of their own, neighbouring rays see different depths, so that no depth stays unseen.
     """
@@ -23,13 +23,14 @@ class RayPool:
     rays: Rays
     pixels: Float[Tensor, "rays 4"]
     phase: Float[Tensor, "rays"]
+    view: Int[Tensor, "rays"]
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
 
     def select(self, index: Int[Tensor, "some"] | slice) -> RayPool:
         rays = Rays(self.rays.origins[index], self.rays.directions[index])
-        return RayPool(rays, self.pixels[index], self.phase[index])
+        return RayPool(rays, self.pixels[index], self.phase[index], self.view[index])
 
 
 def build_pool(views: PosedViews, border: int | None, generator: torch.Generator) -> RayPool:
@@ -56,4 +57,4 @@ def build_pool(views: PosedViews, border: int | None, generator: torch.Generator
     pose = views.camera_to_world.to(alpha).index_select(0, view)
     directions = torch.bmm(pose[:, :3, :3], local.index_select(0, pixel)[..., None])[..., 0]
     premultiplied = torch.cat([pixels[:, :3] * pixels[:, 3:], pixels[:, 3:]], -1)
-    return RayPool(Rays(pose[:, :3, 3].contiguous(), directions), premultiplied, phase)
+    return RayPool(Rays(pose[:, :3, 3].contiguous(), directions), premultiplied, phase, view)

@@ -21,15 +21,20 @@ def over_white(premultiplied: Float[Tensor, "views height width 4"]) -> Float[Te
 def score_views(
     field: RadianceField, views: PosedViews, termination: float, rays_per_chunk: int
 ) -> dict[str, float]:
+    """``compare`` of the field's images with these views."""
+    rendered = render_views(field, views.camera, views.camera_to_world, termination, rays_per_chunk)
+    return compare(rendered, views.images)
+
+
+def compare(
+    premultiplied: Float[Tensor, "views height width 4"], images: Float[Tensor, "views height width 4"]
+) -> dict[str, float]:
     """``psnr`` and ``ssim`` of whole images over white, ``psnr_foreground`` over the pixels of alpha above 0.
 
     PSNR in dB, mean over views of each view's value; SSIM as torchmetrics' default (Gaussian window, range 1).
     """
-    rendered = over_white(
-        render_views(field, views.camera, views.camera_to_world, termination, rays_per_chunk)
-    )
-    alpha = views.images[..., 3:]
-    target = over_white(torch.cat([views.images[..., :3] * alpha, alpha], -1))
+    rendered, alpha = over_white(premultiplied), images[..., 3:]
+    target = over_white(torch.cat([images[..., :3] * alpha, alpha], -1))
     psnr = peak_signal_noise_ratio(
         rendered, target, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean"
     )

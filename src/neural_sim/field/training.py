@@ -9,6 +9,7 @@ from typing import Any
 import lightning
 import torch
 
+from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
 from neural_sim.field.mlp import MLPField
@@ -16,7 +17,11 @@ from neural_sim.field.module import Progress, RadianceFieldModule
 from neural_sim.field.objective import Fitting
 from neural_sim.types import PosedViews
 
-KINDS: dict[str, type[RadianceField]] = {"GridField": GridField, "MLPField": MLPField}
+KINDS: dict[str, type[RadianceField]] = {
+    "AppearanceField": AppearanceField,
+    "GridField": GridField,
+    "MLPField": MLPField,
+}
 
 
 def fit_field(

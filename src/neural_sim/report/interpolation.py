@@ -1,0 +1,77 @@
+"""The way between two lights of a field: colour changes, geometry does not (the paper's figure of NeRF in the Wild)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from neural_sim.field.base import RadianceField
+from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.report.figures import INK, MUTED
+from neural_sim.types import PinholeCamera
+
+UNCHANGED = 1e-6
+"""Largest difference of opacity along the way that counts as none."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """One object's images between two lights; ``opacity_change`` is the largest along the way, over all pixels."""
+
+    images: Float[Tensor, "steps height width 3"]
+    opacity_change: float
+
+
+def interpolate(
+    field: RadianceField,
+    renderer: NerfWRenderer,
+    camera: PinholeCamera,
+    camera_to_world: Float[Tensor, "4 4"],
+    ends: tuple[Float[Tensor, "k"], Float[Tensor, "k"]],
+    steps: int = 7,
+) -> Way:
+    """Views over white from one camera under ``steps`` weights evenly spaced between two ends, these included.
+
+    Raises ``ValueError`` for fewer than two steps, and ``RuntimeError`` where opacity changes by more than
+    ``UNCHANGED``: the colour head must not reach the density.
+    """
+    if steps < 2:
+        raise ValueError(f"interpolate: want at least 2 steps, got {steps}")
+    parts = torch.linspace(0.0, 1.0, steps).to(ends[0])
+    images, opacities = [], []
+    for part in parts:
+        weights = torch.lerp(ends[0], ends[1], part)[None]
+        rgb, opacity = renderer.render(field, camera, camera_to_world[None], weights=weights)
+        images.append(rgb[0] + (1.0 - opacity[0])[..., None])
+        opacities.append(opacity[0])
+    change = float((torch.stack(opacities) - opacities[0]).abs().max())
+    if not change <= UNCHANGED:
+        raise RuntimeError(f"interpolate: opacity changes by {change:.3g} with the light, want {UNCHANGED:g}")
+    return Way(torch.stack(images).clamp(0.0, 1.0), change)
+
+
+def interpolation_figure(ways: Mapping[str, Way], title: str) -> Figure:
+    """A row for each object, from its first light on the left to its second on the right."""
+    count, height, width = next(iter(ways.values())).images.shape[:3]
+    canvas = np.concatenate(
+        [np.concatenate(list(way.images.cpu().numpy()), axis=1) for way in ways.values()], axis=0
+    )
+    figure = Figure(figsize=(1.4 * count + 0.9, 1.4 * len(ways) + 0.8))
+    left, bottom = 0.9 / (1.4 * count + 0.9), 0.35 / (1.4 * len(ways) + 0.8)
+    axes = figure.add_axes((left, bottom, 1.0 - left - 0.01, 1.4 * len(ways) / (1.4 * len(ways) + 0.8)))
+    axes.imshow(canvas)
+    axes.set_yticks([(row + 0.5) * height for row in range(len(ways))], list(ways))
+    shares = [f"{i / (count - 1):.2g}" for i in range(count)]
+    axes.set_xticks([(column + 0.5) * width for column in range(count)], shares)
+    axes.tick_params(length=0, colors=MUTED, labelsize=8)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    change = max(way.opacity_change for way in ways.values())
+    figure.suptitle(f"{title} (opacity changes by at most {change:.0e})", color=INK, fontsize=10)
+    return figure

@@ -1,0 +1,33 @@
+"""`renderer` swaps the whole chain: lights of the views, kind of field, and renderer."""
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from neural_sim.field.appearance import AppearanceField
+from neural_sim.field.appearance_fitting import AppearanceFitting
+from neural_sim.field.grid import GridField
+from neural_sim.main import build, conf_directory
+from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.renderer.rig import LightRig
+
+
+def experiment(*overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return build(compose("config", list(overrides)))
+
+
+def test_nerf_w_brings_varied_light_and_fields_with_codes():
+    made = experiment("renderer=nerf_w", "scale=smoke", "views.lights.rig.anchors=4")
+    assert isinstance(made.renderer, NerfWRenderer)
+    assert made.views.lights is not None and made.views.lights.rig == LightRig(anchors=4)
+    fitting = made.field.fitting(made.field.field())
+    assert isinstance(fitting, AppearanceFitting) and isinstance(fitting.field, AppearanceField)
+    assert fitting.grid.resolution == 64  # the scale's
+    weights = made.views.lights.weights(made.views.count - made.views.held_out, torch.Generator())
+    assert ((weights == 1.0).sum(0) >= 2).all()
+
+
+def test_without_it_no_light_varies_and_no_field_has_codes():
+    made = experiment()
+    assert made.views.lights is None and isinstance(made.field.field(), GridField)
+    assert not isinstance(made.renderer, NerfWRenderer)
