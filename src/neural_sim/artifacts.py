@@ -12,7 +12,6 @@ from torch import Tensor
 
 from neural_sim import codec
 from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
-from neural_sim.cameras import orbit
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
@@ -24,7 +23,7 @@ from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import OuterLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.rewarded import RewardLoop
-from neural_sim.renderer.views import choose_mesh_renderer, render_views
+from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.store import Store, code_version, digest, tensor_digest
 from neural_sim.synthesis.scene import HardDraws, RenderedObject, Scene, join
 from neural_sim.target.symmetry import equivalent_bins
@@ -105,18 +104,7 @@ class Artifacts:
 
     def views(self, name: str) -> Any:
         def make() -> Any:
-            views = self.x.views
-            generator = torch.Generator().manual_seed(views.seed)
-            uniform = torch.rand((3, views.count), generator=generator)
-            near, far = views.distance_range
-            distance = near + (far - near) * uniform[2]
-            poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], distance)
-            rig, weights = None, None
-            if views.lights is not None:
-                rig, weights = views.lights.rig, views.lights.weights(views.count, generator)
-            camera = views.camera(views.image_size)
-            made = render_views(self.mesh_renderer, self.meshes[name], camera, poses, rig, weights)
-            return codec.pack_views(made)
+            return codec.pack_views(self.x.views.render(self.mesh_renderer, self.meshes[name]))
 
         key = self._views_key(name)
         return self._fetch("views", "views", f"views of {name}", key, make)

@@ -6,10 +6,16 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+import torch
+
+from neural_sim.cameras import orbit
+from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.illumination import ProjectedGradient
 from neural_sim.parameter.update import Update
-from neural_sim.renderer.rig import VariedLight
-from neural_sim.types import PinholeCamera
+from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.rig import LightRig, VariedLight
+from neural_sim.renderer.views import render_views
+from neural_sim.types import PinholeCamera, PosedViews
 
 Start = Literal["previous", "warm", "fresh"]
 OnUntrusted = Literal["shrink", "skip", "stop"]
@@ -48,10 +54,30 @@ class Views:
             raise ValueError(
                 f"views.distance_range must be ordered and above 1 radius, got {self.distance_range}"
             )
+        if self.lights is not None:
+            self.lights.weights(
+                self.count - self.held_out, torch.Generator()
+            )  # each anchor lights a trained view
 
     def camera(self, image_size: int) -> PinholeCamera:
         """The square camera of this field of view."""
         return PinholeCamera(image_size, image_size, math.radians(self.field_of_view_deg))
+
+    @property
+    def rig(self) -> LightRig | None:
+        """The anchor lights, None where the light is fixed."""
+        return self.lights.rig if self.lights is not None else None
+
+    def render(self, renderer: MeshRenderer, item: ObjectMesh) -> PosedViews:
+        """All views of one object; equal seeds give equal poses and lights whatever the object."""
+        generator = torch.Generator().manual_seed(self.seed)
+        uniform = torch.rand((3, self.count), generator=generator)
+        near, far = self.distance_range
+        poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], near + (far - near) * uniform[2])
+        rig = weights = None
+        if self.lights is not None:
+            rig, weights = self.lights.rig, self.lights.weights(self.count, generator)
+        return render_views(renderer, item, self.camera(self.image_size), poses, rig, weights)
 
 
 @dataclass(frozen=True)

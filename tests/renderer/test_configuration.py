@@ -1,12 +1,13 @@
 """`renderer` swaps the whole chain: lights of the views, kind of field, and renderer."""
 
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
 from neural_sim.field.grid import GridField
-from neural_sim.main import build, conf_directory
+from neural_sim.main import UserError, build, conf_directory
 from neural_sim.renderer.nerf_w import NerfWRenderer
 
 
@@ -24,6 +25,11 @@ def test_nerf_w_brings_varied_light_and_fields_with_codes():
     assert fitting.grid.resolution == 64  # the scale's
     weights = made.views.lights.weights(made.views.count - made.views.held_out, torch.Generator())
     assert ((weights == 1.0).sum(0) >= 2).all()
+
+
+def test_views_too_few_for_the_anchors_are_refused():
+    with pytest.raises(UserError, match="12 anchors"):
+        experiment("renderer=nerf_w", "scale=smoke", "views.lights.rig.anchors=12")
 
 
 def test_without_it_no_light_varies_and_no_field_has_codes():
