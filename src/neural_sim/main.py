@@ -66,7 +66,7 @@ def build(config: DictConfig) -> Experiment:
     parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
     parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}
     if not parameters:
-        raise UserError("parameter: want at least one of pose, zoom, got none")
+        raise UserError("parameter: want at least one of pose, zoom, illumination, got none")
     return Experiment(
         name=plain["name"],
         seed=plain["seed"],
@@ -76,19 +76,35 @@ def build(config: DictConfig) -> Experiment:
         mlflow=plain["paths"]["mlflow"],
         progress=plain["progress"],
         accelerator=plain["trainer"]["accelerator"],
-        distribution=_product(parameters, _instantiate(plain["unlearned"], "unlearned")),
+        distribution=_product(
+            parameters, parts | {"unlearned": _instantiate(plain["unlearned"], "unlearned")}
+        ),
         config=plain,
         **parts,
     )
 
 
-def _product(parameters: Mapping[str, Any], unlearned: Any) -> Any:
+def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
+    """p_psi over all parameters, as far as views, renderer and estimator can serve it."""
     from neural_sim.parameter.product import SceneDistribution
+    from neural_sim.synthesis.scene import RelaxedDraws
 
     try:
-        return SceneDistribution.of(parameters.values(), unlearned)
+        made = SceneDistribution.of(parameters.values(), parts["unlearned"])
     except ValueError as error:
         raise UserError(_first_line(error)) from error
+    rig = parts["views"].rig
+    if made.light is not None and (rig is None or rig.anchors != made.light.anchors):
+        lights = "one fixed light" if rig is None else f"{rig.anchors} anchor lights"
+        raise UserError(
+            f"parameter.illumination: want renderer=nerf_w with {made.light.anchors} anchors, got {lights}"
+        )
+    focal = any(factor.coordinate == "magnification" for factor in made.binned)
+    if focal and isinstance(parts["gradient"].draws, RelaxedDraws):
+        raise UserError(
+            "parameter.zoom.by: gradient=pathwise differentiates by distance, not by focal_length"
+        )
+    return made
 
 
 def stress(config: DictConfig, folder: Path) -> int:

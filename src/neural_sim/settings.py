@@ -135,12 +135,13 @@ class Outer:
     Each iteration's training starts from the pyramid and head of the iteration before (``previous``, the paper), of the
     warm start (``warm``) or from new ones, always the same (``fresh``). A detector that goes on remembers bins that psi
     has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches.
-    psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951).
+    psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951);
+    ``update`` steps logits of bins, ``light_update`` weights of lights.
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
     estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
-    anew; the others keep their images, and what other factors of p_psi gave them. ``update`` steps
-    logits of bins, ``light_update`` weights of lights. ``learned`` names the objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
+    anew; the others keep their images, and what other factors of p_psi gave them. ``learned`` names the objects whose
+    psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
     happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is
     compared with finite differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1
     trainings to stationarity.

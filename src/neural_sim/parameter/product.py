@@ -65,8 +65,7 @@ class SceneNoise:
     """All randomness of n draws, made once and replayed by every pass (paper, Tool 2).
 
     ``bins`` picks each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it. ``light`` is standard normal: around psi's weights lights are explored, without it they are
-    psi's.
+    where no factor draws it. ``light`` is standard normal: lights are explored around psi's weights; None: they are psi's.
     """
 
     bins: Mapping[str, BinNoise]
@@ -173,7 +172,8 @@ class SceneDistribution:
         """Randomness of n draws; independent of psi.
 
         ``antithetic``: Gumbel noise in pairs from uniforms u and 1 - u. ``conditional``: draws of the noise given the
-        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density. Raises ``ValueError`` for an odd number of antithetic draws.
+        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density. Raises
+        ``ValueError`` for an odd number of antithetic draws.
         """
         gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.binned}
         drawn = [c for c in COORDINATES if c != "magnification" or self._binned(c)]

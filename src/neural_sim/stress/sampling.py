@@ -46,7 +46,7 @@ def one_hot(scope: Scope) -> Checks:
     underflows to 0.
     """
     scene = SceneDistribution.of([Pose(floor=0.0)])
-    (pose,) = scene.factors
+    (pose,) = scene.binned
     for dtype in DTYPES:
         psi = torch.zeros(8, dtype=dtype)
         psi[5] = 1000.0
@@ -189,7 +189,7 @@ def bin_counts(scope: Scope) -> Checks:
         (slope,) = torch.autograd.grad(draw.phi.sum(), psi, allow_unused=True, materialize_grads=True)
         yield Check(
             f"log p: k = 1, {_name(dtype)}",
-            float(scene.factors[0].log_probabilities(psi.detach()).abs()),
+            float(scene.binned[0].log_probabilities(psi.detach()).abs()),
             2 * eps(dtype),
         )
         yield Check(

@@ -14,6 +14,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.synthesis.motion import light_names, moved_by, pose_rates
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
@@ -54,8 +55,11 @@ class RelaxedDraws:
 
 @dataclass(frozen=True)
 class HardDraws:
-    """How images are drawn whose bins are scored, not differentiated. ``light_tangents``: where lights are weighed, the
-    maps' derivatives by the weights ride along. ``explore``: lights around psi's, for estimators that need a density."""
+    """How images are drawn whose bins are scored, not differentiated.
+
+    ``light_tangents``: where lights are weighed, the maps' derivatives by the weights ride along. ``explore``: lights
+    around psi's, for estimators that need a density.
+    """
 
     light_tangents: bool = False
     explore: bool = False
@@ -106,14 +110,30 @@ class Scene:
     def _maps(self, label: int, draw: SceneDraw) -> Maps:
         """Premultiplied colour and opacity at given scene parameters."""
         poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
-        lights = {} if draw.weights is None else {"weights": draw.weights}
         if draw.magnification is None:
-            return Maps(*self.renderer.render(self.fields[label], self.camera, poses, **lights))
+            return Maps(*self._render(label, self.camera, poses, draw.weights))
         each = []  # every image has a camera of its own
         for i, magnification in enumerate(draw.magnification.tolist()):
-            camera, own = magnified(self.camera, magnification), {k: v[i : i + 1] for k, v in lights.items()}
-            each.append(self.renderer.render(self.fields[label], camera, poses[i : i + 1], **own))
+            own = None if draw.weights is None else draw.weights[i : i + 1]
+            camera = magnified(self.camera, magnification)
+            each.append(self._render(label, camera, poses[i : i + 1], own))
         return Maps(*(torch.cat(parts) for parts in zip(*each, strict=True)))
+
+    def _render(
+        self, label: int, camera: PinholeCamera, poses: Tensor, weights: Float[Tensor, "n k"] | None
+    ) -> tuple[Tensor, Tensor]:
+        if weights is None:
+            return self.renderer.render(self.fields[label], camera, poses)
+        return self.lit_renderer.render(self.fields[label], camera, poses, weights=weights)
+
+    @property
+    def lit_renderer(self) -> NerfWRenderer:
+        """The renderer, which must know lights. Raises ``ValueError`` for one that does not."""
+        if not isinstance(self.renderer, NerfWRenderer):
+            raise ValueError(
+                f"parameter=illumination wants renderer=nerf_w, got {type(self.renderer).__name__}"
+            )
+        return self.renderer
 
     def _compose(
         self, label: int, draw: SceneDraw, noise: SceneNoise, maps: Maps, nuisance: Nuisance
@@ -158,7 +178,7 @@ class Scene:
             return maps, dict(zip(names, moved, strict=True))
         count = draw.weights.shape[1]
         turned = torch.eye(count, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
-        maps, moved = self.renderer.render_with_tangents(
+        maps, moved = self.lit_renderer.render_with_tangents(
             self.fields[label], self.camera, poses, rates, weights=draw.weights, weight_rates=turned
         )
         return maps, dict(zip((*names, *light_names(count)), moved, strict=True))

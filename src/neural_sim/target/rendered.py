@@ -34,8 +34,8 @@ def render_target(
 ) -> LabelledImages:
     """Images of every object at its draw, object by object; labels are positions in ``objects``.
 
-    Draws that weigh lights weigh those of ``rig``. Float32 on the CPU. Images without a box are counted in the log. Raises ``ValueError`` for another number of
-    draws than of objects, or none.
+    Draws that weigh lights weigh those of ``rig``. Float32 on the CPU. Images without a box are counted in the log.
+    Raises ``ValueError`` for another number of draws than of objects, or none.
     """
     if len(objects) != len(draws) or not objects:
         raise ValueError(
