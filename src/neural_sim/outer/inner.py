@@ -31,10 +31,10 @@ def timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
 class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
-    The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs
-    each time. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how the method wants
-    images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all others come from a
-    pool of every bin. ``images`` and ``steps`` count the labelled images made and the detector's optimiser steps.
+    The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each time
+    an iteration asks. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how
+    the method wants images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all
+    others come from a pool of every bin. ``images`` and ``steps`` count labelled images made and optimiser steps.
     """
 
     def __init__(

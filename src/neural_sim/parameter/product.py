@@ -65,7 +65,8 @@ class SceneNoise:
     """All randomness of n draws, made once and replayed by every pass (paper, Tool 2).
 
     ``bins`` picks each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it. ``light`` is standard normal: lights are explored around psi's weights; None: they are psi's.
+    where no factor draws it. ``light`` is standard normal: lights are explored around psi's weights, which
+    they are where it is None.
     """
 
     bins: Mapping[str, BinNoise]
