@@ -8,16 +8,17 @@ light that no view showed it in about 2 dB worse.)
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neural_sim.field.base import PackedSamples, RadianceField
+from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
-from neural_sim.field.interpolation import gather_weighted, trilinear_tangents
-from neural_sim.field.marching import lookup
-from neural_sim.types import Rays
+from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.types import PinholeCamera, Rays
 
 INITIAL_CODE = 0.3
 """Standard deviation of new codes."""
@@ -85,9 +86,21 @@ class AppearanceField(RadianceField):
         """The codes that an illumination weighs."""
         return self.mixing @ self.codes
 
-    def lit(self, code: Float[Tensor, "code"]) -> LitField:
-        """This field under one code."""
-        return LitField(self, self.gain(code))
+    def lit(self, code: Float[Tensor, "code"], rates: Float[Tensor, "q code"] | None = None) -> LitField:
+        """This field under one code, which moves at ``rates`` (None: it does not)."""
+        gain = self.gain(code)
+        gain_rates = (
+            gain.new_zeros(0, len(gain)) if rates is None else functional.linear(rates, self.code.weight)
+        )
+        return LitField(self, gain, gain_rates)
+
+    def with_step(self, multiple: float) -> AppearanceField:
+        if multiple == 1.0:
+            return self
+        other = copy.copy(self)
+        # A shallow copy shares the dictionary of modules, which an assignment would change in both.
+        other._modules = {**self._modules, "grid": self.grid.with_step(multiple)}
+        return other
 
     def gain(self, code: Float[Tensor, "*n code"]) -> Float[Tensor, "*n width"]:
         """What a code multiplies the head's hidden units by."""
@@ -100,69 +113,66 @@ class AppearanceField(RadianceField):
         gain: Float[Tensor, "*samples width"],
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         """Density and colour of table rows under one gain, or one for each sample."""
-        hidden = functional.silu(self.into(self._seen(raw, directions)))
+        hidden = functional.silu(self.into(self.seen(raw, directions)))
         if gain.ndim == 1:
             logits = functional.linear(hidden, self.out.weight * gain, self.out.bias)
         else:
             logits = self.out(hidden * gain)
         return self.grid.density(raw), torch.sigmoid(raw[:, 1:4] + logits)
 
-    def _seen(self, raw: Tensor, directions: Tensor) -> Float[Tensor, "*samples inputs"]:
+    def seen(self, raw: Tensor, directions: Tensor) -> Float[Tensor, "*samples inputs"]:
+        """What the head sees of table rows (or of their rates) and directions."""
         return torch.cat([raw[..., 1:], directions], -1) if self.view_dependent else raw[..., 1:]
-
-    @torch.no_grad()
-    def query_with_tangents_of_code(
-        self,
-        positions: Float[Tensor, "samples 3"],
-        directions: Float[Tensor, "samples 3"],
-        velocities: Float[Tensor, "m samples 3"],
-        turns: Float[Tensor, "m samples 3"],
-        gain: Float[Tensor, "width"],
-        gain_rates: Float[Tensor, "q width"],
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Float[Tensor, "samples q 3"]]:
-        """``query_with_tangents`` under a gain, and the colour's q derivatives where the gain moves at its rates.
-
-        Both m and q may be 0. All in closed form; a moving gain costs one small product a sample.
-        """
-        raw, raw_rates = _raw_with_tangents(self.grid, positions, velocities)
-        before = self.into(self._seen(raw, directions))
-        gate = torch.sigmoid(before)
-        hidden, weight = before * gate, self.out.weight * gain
-        rgb = torch.sigmoid(raw[:, 1:4] + functional.linear(hidden, weight, self.out.bias))
-        rgb_slope = rgb * (1.0 - rgb)
-        moved = functional.linear(self._seen(raw_rates, turns), self.into.weight)
-        moved = moved * (gate * (1.0 + before * (1.0 - gate)))  # the slope of SiLU
-        rgb_rates = rgb_slope * (raw_rates[..., 1:4] + functional.linear(moved, weight))
-        towards = (self.out.weight * gain_rates[:, None]).flatten(0, 1)
-        code_rates = rgb_slope[:, None] * (hidden @ towards.t()).unflatten(1, (-1, 3))
-        slope = self.grid.density_gain / float(self.grid.cell)
-        sigma_rates = slope * torch.sigmoid(self.grid.density_gain * raw[:, 0]) * raw_rates[..., 0]
-        return self.grid.density(raw), rgb, sigma_rates, rgb_rates, code_rates
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        return self.decode(self.grid.raw(positions), directions, self.gain(self.anchors.mean(0)))
+        return self.lit(self.anchors.mean(0)).query(positions, directions)
 
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         return self.grid.sample(rays, termination)
 
 
 class LitField(RadianceField):
-    """An appearance field under one code; shares its tensors."""
+    """An appearance field under one code; shares its tensors. Its colour has derivatives by the code's rates, too."""
 
-    def __init__(self, field: AppearanceField, gain: Float[Tensor, "width"]) -> None:
+    def __init__(
+        self, field: AppearanceField, gain: Float[Tensor, "width"], gain_rates: Float[Tensor, "q width"]
+    ) -> None:
         super().__init__()
-        self.field, self.gain = field, gain
+        self.field, self.gain, self.gain_rates = field, gain, gain_rates
+        self.light_rates = len(gain_rates)
 
     def settings(self) -> dict[str, object]:
         raise TypeError("LitField: save the appearance field itself")
 
+    def with_step(self, multiple: float) -> LitField:
+        return LitField(self.field.with_step(multiple), self.gain, self.gain_rates)
+
+    def sample(self, rays: Rays, termination: float) -> PackedSamples:
+        return self.field.sample(rays, termination)
+
+    def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
+        return self.field.grid.span(camera, camera_to_world, rows)
+
+    @torch.no_grad()
+    def trace(
+        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        grid = self.field.grid
+        return grid.trace_as(self._decode, self.field.view_dependent, rays, termination, span, skip_empty)
+
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        return self.field.decode(self.field.grid.raw(positions), directions, self.gain)
+        return self._decode(self.field.grid.raw(positions), directions)
 
+    def _decode(
+        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+        return self.field.decode(raw, directions, self.gain)
+
+    @torch.no_grad()
     def query_with_tangents(
         self,
         positions: Float[Tensor, "samples 3"],
@@ -170,27 +180,16 @@ class LitField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; in closed form."""
-        still = self.gain.new_zeros(0, len(self.gain))
-        return self.field.query_with_tangents_of_code(
-            positions, directions, velocities, turns, self.gain, still
-        )[:4]
-
-    def sample(self, rays: Rays, termination: float) -> PackedSamples:
-        return self.field.sample(rays, termination)
-
-
-def _raw_with_tangents(
-    grid: GridField, positions: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
-) -> tuple[Float[Tensor, "samples channels"], Float[Tensor, "m samples channels"]]:
-    """Table rows, and their derivatives where positions move at ``velocities``."""
-    if not len(velocities):
-        raw = grid.raw(positions)
-        return raw, raw.new_zeros(0, *raw.shape)
-    local = (positions - grid.origin) / float(grid.cell)
-    base = local.floor()
-    cells = lookup(base, grid.occupancy)
-    corners = grid.corners.index_select(0, torch.where(cells < 0, len(grid.corners) - 1, cells))
-    weights, rates = trilinear_tangents(local - base, velocities / float(grid.cell))
-    raw = gather_weighted(grid.table, corners, weights)
-    return raw, torch.stack([gather_weighted(grid.table, corners, rate) for rate in rates])
+        """See the base class; m may be 0. In closed form: a moving light costs one small product a sample."""
+        field, grid = self.field, self.field.grid
+        raw, raw_rates = grid.raw_with_tangents(positions, velocities)
+        before = field.into(field.seen(raw, directions))
+        gate = torch.sigmoid(before)
+        hidden, weight = before * gate, field.out.weight * self.gain
+        rgb = torch.sigmoid(raw[:, 1:4] + functional.linear(hidden, weight, field.out.bias))
+        moved = functional.linear(field.seen(raw_rates, turns), field.into.weight)
+        moved = moved * (gate * (1.0 + before * (1.0 - gate)))  # the slope of SiLU
+        by_camera = raw_rates[..., 1:4] + functional.linear(moved, weight)
+        by_light = torch.einsum("sw,qcw->qsc", hidden, field.out.weight * self.gain_rates[:, None])
+        rgb_rates = (rgb * (1.0 - rgb)) * torch.cat([by_camera, by_light])
+        return grid.density(raw), rgb, grid.density_rates(raw, raw_rates), rgb_rates

@@ -16,6 +16,9 @@ from neural_sim.types import PinholeCamera, Rays
 class RadianceField(nn.Module, ABC):
     """Density and colour in the object's frame (unit sphere round the origin)."""
 
+    light_rates: int = 0
+    """How many derivatives of colour alone ``query_with_tangents`` adds to those that were asked for."""
+
     @abstractmethod
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
@@ -39,6 +42,8 @@ class RadianceField(nn.Module, ABC):
         Float[Tensor, "m samples 3"],
     ]:
         """``query``, and its m >= 1 derivatives where positions move at ``velocities`` and directions at ``turns``.
+
+        A field whose light moves has more derivatives of colour than of density, the last ``light_rates`` of them.
 
         Here by Jacobian-vector products; a field that knows its own derivative overrides this.
         """

@@ -23,6 +23,7 @@ from neural_sim.field.interpolation import (
 )
 from neural_sim.field.marching import SampleCollector, Wave, lookup, march
 from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, dilate, subdivide, vertices
+from neural_sim.field.refinement import interpolate_from
 from neural_sim.field.samples import PackedSamples, Span
 from neural_sim.field.screen import coarse_centres, screen_span
 from neural_sim.types import PinholeCamera, Rays
@@ -95,10 +96,8 @@ class GridField(RadianceField):
         return self.step_cells * float(self.cell)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
-        """Moves and casts like any module; refuses a type that cannot tell two places in a cell apart.
-
-        Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
-        """
+        """Moves and casts like any module; refuses a type that cannot tell two places in a cell apart."""
+        # Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
             raise ValueError(f"GridField: want float32 or float64, got {wanted}")
@@ -137,7 +136,7 @@ class GridField(RadianceField):
         coordinates = self._set_cells(occupied, origin, cell)
         # New vertices lie on old cells' faces; nudged towards the inside of an occupied cell they find a row each.
         local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
-        rows = _interpolate_from(local, before, corners, table)
+        rows = interpolate_from(local, before, corners, table)
         self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
 
     def _set_cells(self, occupied: Tensor, origin: Tensor, cell: float) -> Int[Tensor, "vertices 3"]:
@@ -174,22 +173,39 @@ class GridField(RadianceField):
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """See the base class; in closed form but for a head, at little more than the cost of ``query``."""
-        local = (positions - self.origin) / float(self.cell)
-        base = local.floor()
-        cells = lookup(base, self.occupancy)
-        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
-        weights, rates = trilinear_tangents(local - base, velocities / float(self.cell))
-        raw = gather_weighted(self.table, corners, weights)
-        raw_rates = torch.stack([gather_weighted(self.table, corners, rate) for rate in rates])
-        slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / float(self.cell))
+        raw, raw_rates = self.raw_with_tangents(positions, velocities)
+        sigma_rates = self.density_rates(raw, raw_rates)
         sigma, rgb = self.decode(raw, directions)
         if self.head is None:
-            return sigma, rgb, slope * raw_rates[..., 0], (rgb * (1.0 - rgb)) * raw_rates[..., 1:4]
+            return sigma, rgb, sigma_rates, (rgb * (1.0 - rgb)) * raw_rates[..., 1:4]
         rgb_rates = [
             torch.func.jvp(lambda *at: self.decode(*at)[1], (raw, directions), (rate, turn))[1]
             for rate, turn in zip(raw_rates, turns, strict=True)
         ]
-        return sigma, rgb, slope * raw_rates[..., 0], torch.stack(rgb_rates)
+        return sigma, rgb, sigma_rates, torch.stack(rgb_rates)
+
+    @torch.no_grad()
+    def raw_with_tangents(
+        self, positions: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
+    ) -> tuple[Float[Tensor, "samples channels"], Float[Tensor, "m samples channels"]]:
+        """Table rows, and their m derivatives (none is allowed) where positions move at ``velocities``."""
+        local = (positions - self.origin) / float(self.cell)
+        base = local.floor()
+        cells = lookup(base, self.occupancy)
+        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
+        if not len(velocities):
+            raw = gather_weighted(self.table, corners, corner_weights(*(local - base).t().contiguous()))
+            return raw, raw.new_zeros(0, *raw.shape)
+        weights, rates = trilinear_tangents(local - base, velocities / float(self.cell))
+        raw = gather_weighted(self.table, corners, weights)
+        return raw, torch.stack([gather_weighted(self.table, corners, rate) for rate in rates])
+
+    def density_rates(
+        self, raw: Float[Tensor, "samples channels"], raw_rates: Float[Tensor, "m samples channels"]
+    ) -> Float[Tensor, "m samples"]:
+        """Density's derivatives where table rows change at ``raw_rates``."""
+        slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / float(self.cell))
+        return slope * raw_rates[..., 0]
 
     def density(self, raw: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples"]:
         """Density sigma, per object radius, of table rows."""
@@ -238,14 +254,27 @@ class GridField(RadianceField):
         self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """See the base class; each sample is found, interpolated and composited once, wave by wave."""
+        return self.trace_as(self.decode, self.head is not None, rays, termination, span, skip_empty)
+
+    @torch.no_grad()
+    def trace_as(
+        self,
+        decode: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        directed: bool,
+        rays: Rays,
+        termination: float,
+        span: Span | None,
+        skip_empty: bool,
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        """``trace`` with density and colour of table rows by ``decode``; ``directed``: it wants samples' directions."""
         colour = rays.origins.new_zeros(len(rays.origins), 3)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
 
         def visit(wave: Wave) -> Tensor:
             directions = rays.directions
-            if self.head is not None:
+            if directed:
                 directions = directions.index_select(0, wave.ray.index_select(0, wave.row))
-            sigma, rgb = self.decode(self._raw_of(wave), directions)
+            sigma, rgb = decode(self._raw_of(wave), directions)
             optical = sigma * self.step
             depth, reached, alive = extinction.enter(wave, optical)
             weights = torch.exp(-depth) * -torch.expm1(-optical) * reached
@@ -263,25 +292,6 @@ class GridField(RadianceField):
         """Table rows at a wave's samples, without derivatives."""
         corners = self.corners.index_select(0, wave.cell)
         return gather_weighted(self.table, corners, corner_weights(*wave.fraction))
-
-
-def _interpolate_from(
-    local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
-) -> Float[Tensor, "vertices channels"]:
-    """Values of an old table at grid vertices, each from whichever of its eight neighbouring cells is occupied."""
-    result = table.new_zeros(len(local), table.shape[1])
-    missing = torch.arange(len(local), device=local.device)
-    for corner in CORNERS:
-        nudge = (corner.to(local) - 0.5) * 1e-2
-        here = local.index_select(0, missing)
-        cell = lookup(here + nudge, occupancy)
-        found = (cell >= 0).nonzero()[:, 0]
-        base = (here + nudge).floor().index_select(0, found)
-        weights = corner_weights(*(here.index_select(0, found) - base).t().contiguous())
-        rows = corners.index_select(0, cell.index_select(0, found))
-        result.index_copy_(0, missing.index_select(0, found), gather_weighted(table, rows, weights))
-        missing = missing[cell < 0]
-    return result
 
 
 def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:

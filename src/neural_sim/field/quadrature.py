@@ -57,13 +57,14 @@ def composite_with_tangents(
     sigma: Float[Tensor, "samples"],
     rgb: Float[Tensor, "samples 3"],
     sigma_rates: Float[Tensor, "m samples"],
-    rgb_rates: Float[Tensor, "m samples 3"],
+    rgb_rates: Float[Tensor, "n samples 3"],
     samples: PackedSamples,
-) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """``composite`` as RGBA, and its derivatives where densities and colours change at the given rates.
 
-    With tau = sigma delta and D its exclusive sum along the ray, the weight T alpha changes at
-    T (exp(-tau) tau' - alpha D'). Distances and widths are constants.
+    Beyond the m rates of densities only colours change, and opacity's derivative is exactly 0. With tau = sigma delta
+    and D its exclusive sum along the ray, the weight T alpha changes at T (exp(-tau) tau' - alpha D'). Distances and
+    widths are constants.
     """
     passed = transmittance(sigma, samples)
     alpha = alpha_from_sigma(sigma, samples.width)
@@ -71,13 +72,16 @@ def composite_with_tangents(
     depth = sigma * samples.width
     held = passed * torch.exp(-depth)
     parts = [weights[:, None] * rgb, weights[:, None]]
-    for sigma_rate, rgb_rate in zip(sigma_rates, rgb_rates, strict=True):
+    for sigma_rate, rgb_rate in zip(sigma_rates, rgb_rates[: len(sigma_rates)], strict=True):
         depth_rate = sigma_rate * samples.width
         counted = depth_rate.masked_fill(depth > OPAQUE_DEPTH, 0.0)
         rate = held * depth_rate - weights * _exclusive(counted, samples)
         parts += [torch.addcmul(rate[:, None] * rgb, weights[:, None], rgb_rate), rate[:, None]]
-    pixels = sum_rays(torch.cat(parts, -1), samples).unflatten(-1, (-1, 4))
-    return pixels[:, 0], pixels[:, 1:].movedim(1, 0)
+    parts += [weights[:, None] * rgb_rate for rgb_rate in rgb_rates[len(sigma_rates) :]]
+    pixels = sum_rays(torch.cat(parts, -1), samples)
+    moved, lit = pixels.split([4 * (1 + len(sigma_rates)), 3 * (len(rgb_rates) - len(sigma_rates))], -1)
+    moved, lit = moved.unflatten(-1, (-1, 4)), torch.nn.functional.pad(lit.unflatten(-1, (-1, 3)), (0, 1))
+    return moved[:, 0], torch.cat([moved[:, 1:], lit], 1).movedim(1, 0)
 
 
 def _exclusive(values: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:

@@ -51,8 +51,10 @@ def render_with_tangents(
     rates: Rays,
     termination: float,
     samples_at_once: int = SAMPLES_AT_ONCE,
-) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
+
+    Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
 
     One pass over the samples gives both, about ``samples_at_once`` at a time: a sample at distance t moves at
     o' + t d'. A ray has six numbers; of more
@@ -61,7 +63,8 @@ def render_with_tangents(
     if len(rates.origins) > RAY_NUMBERS:
         pixels, by_number = render_with_tangents(field, rays, _unit_rates(rays), termination, samples_at_once)
         numbers = torch.cat([rates.origins, rates.directions], -1)
-        return pixels, torch.einsum("mrk,krc->mrc", numbers, by_number)
+        moved = torch.einsum("mrk,krc->mrc", numbers, by_number[:RAY_NUMBERS])
+        return pixels, torch.cat([moved, by_number[RAY_NUMBERS:]])
     samples = field.sample(rays, termination)
     # Pieces of about as many samples need the same memory wherever in an image their rays lie.
     cuts = torch.arange(0, len(samples), samples_at_once, device=samples.starts.device)[1:]
@@ -80,7 +83,7 @@ def _rows(rays: Rays, first: int, last: int) -> Rays:
 
 def _with_tangents(
     field: RadianceField, rays: Rays, rates: Rays, samples: PackedSamples
-) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "m rays 4"]]:
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     positions, directions = sample_points(rays, samples)
     turns = rates.directions.index_select(1, samples.ray)
     velocities = torch.addcmul(rates.origins.index_select(1, samples.ray), turns, samples.distance[:, None])

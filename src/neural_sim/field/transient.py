@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neural_sim.field.base import PackedSamples
 from neural_sim.field.objective import Rendering, expected_errors
 from neural_sim.field.quadrature import composite, render_weights, sum_rays
+from neural_sim.field.samples import PackedSamples
 
 FREQUENCIES = 5
 SMALLEST_BETA = 0.03  # as in the paper

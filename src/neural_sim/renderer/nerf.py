@@ -105,25 +105,25 @@ class NerfRenderer:
         camera_to_world: Float[Tensor, "views 4 4"],
         rates: Float[Tensor, "m views 4 4"],
     ) -> tuple[Maps, list[Maps]]:
-        """What ``render`` gives, and its m >= 1 derivatives where the cameras move at ``rates``.
+        """What ``render`` gives, and its m derivatives where the cameras move at ``rates`` (then a moving light's).
 
         The derivatives ride along with the render; memory beyond the maps is that of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)
-        tangents = camera_to_world.new_zeros(len(rates), *shape)
+        tangents = camera_to_world.new_zeros(len(rates) + field.light_rates, *shape)
         for seen in seen_pixels(field, camera, camera_to_world, self.rays_per_chunk, self.cull):
+            rays = pixel_rays(camera, camera_to_world, seen.pixel)
             # Rays are linear in the pose, so that the rays of a pose's rate are the rays' rates.
             moving = [pixel_rays(camera, rate, seen.pixel) for rate in rates]
             ray_rates = Rays(
-                torch.stack([rays.origins for rays in moving]),
-                torch.stack([rays.directions for rays in moving]),
+                torch.cat([rays.origins[None][:0], *(rate.origins[None] for rate in moving)]),
+                torch.cat([rays.directions[None][:0], *(rate.directions[None] for rate in moving)]),
             )
-            rays = pixel_rays(camera, camera_to_world, seen.pixel)
             samples_at_once = min(SAMPLES_AT_ONCE, 4 * self.rays_per_chunk)
             pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination, samples_at_once)
             value.view(-1, 4).index_copy_(0, seen.pixel, pixels)
-            tangents.view(len(rates), -1, 4).index_copy_(1, seen.pixel, moved)
+            tangents.view(len(tangents), -1, 4).index_copy_(1, seen.pixel, moved)
         return _maps(value), [_maps(tangent) for tangent in tangents]
 
     def render_rays(

@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim import cameras
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
-from neural_sim.field.quadrature import composite, composite_with_tangents, render_weights, sum_rays
-from neural_sim.field.rendering import render_views, sample_points
-from neural_sim.renderer.nerf import NerfRenderer, check_rays, flat_rays, split_maps, split_rays
+from neural_sim.field.quadrature import composite
+from neural_sim.field.rendering import sample_points
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import Maps, PinholeCamera, Rays
 
 
@@ -33,16 +32,16 @@ class NerfWRenderer(NerfRenderer):
         exact: bool = False,
         weights: Float[Tensor, "views k"] | None = None,
     ) -> tuple[Float[Tensor, "views height width 3"], Float[Tensor, "views height width"]]:
-        """Premultiplied colour and opacity; ``exact`` leaves no sample out behind opaque surfaces."""
+        """Premultiplied colour and opacity; ``exact`` leaves out nothing, at the field's own step."""
         field, weights = _checked(field, weights, len(camera_to_world))
-        termination = 0.0 if exact else self.termination
-        shape = (len(camera_to_world), camera.height, camera.width, 4)
-        image = camera_to_world.new_empty(shape)
+        shape = (len(camera_to_world), camera.height, camera.width)
+        rgb, opacity = camera_to_world.new_empty(*shape, 3), camera_to_world.new_empty(shape)
         for light, views in _groups(weights):
             lit = field.lit(light @ field.anchors)
-            poses = camera_to_world.index_select(0, views)
-            image[views] = render_views(lit, camera, poses, termination, self.rays_per_chunk)
-        return image[..., :3], image[..., 3]
+            rgb[views], opacity[views] = super().render(
+                lit, camera, camera_to_world.index_select(0, views), exact
+            )
+        return rgb, opacity
 
     @torch.no_grad()
     def render_with_tangents(
@@ -56,50 +55,26 @@ class NerfWRenderer(NerfRenderer):
     ) -> tuple[Maps, list[Maps]]:
         """What ``render`` gives, its m derivatives where cameras move at ``rates``, then q where weights do.
 
-        m or q may be 0, not both. Opacity's derivatives by weights are exactly 0.
+        m or q may be 0. Opacity's derivatives by weights are exactly 0.
         """
-        views = len(camera_to_world)
-        field, weights = _checked(field, weights, views)
+        field, weights = _checked(field, weights, len(camera_to_world))
         if weight_rates is None:
             weight_rates = weights.new_zeros(0, *weights.shape)
-        turned = torch.cat([weights[None], weight_rates]).movedim(0, 1).flatten(1)
-        shape = (1 + len(rates) + len(weight_rates), views, camera.height, camera.width, 4)
-        maps = camera_to_world.new_empty(shape)
-        for row, here in _groups(turned):
-            light, *light_rates = row.view(-1, weights.shape[1])
-            gain = field.gain(light @ field.anchors)
-            moved = torch.stack(light_rates) if light_rates else weights.new_zeros(0, weights.shape[1])
-            gain_rates = (moved @ field.anchors) @ field.code.weight.t()
-            bundle = flat_rays(cameras.rays(camera, camera_to_world.index_select(0, here)))
-            bundle_rates = flat_rays(cameras.rays(camera, rates.index_select(1, here)))
-            parts = [
-                self._rays_with_tangents(field, rays, ray_rates, gain, gain_rates)
-                for rays, ray_rates in zip(
-                    split_rays(bundle, self.rays_per_chunk),
-                    split_rays(bundle_rates, self.rays_per_chunk),
-                    strict=True,
-                )
-            ]
-            maps[:, here] = torch.cat(parts, 1).view(-1, len(here), *shape[2:])
-        value, *tangents = map(split_maps, maps)
+        shape = (len(camera_to_world), camera.height, camera.width, 4)
+        maps = camera_to_world.new_empty(1 + len(rates) + len(weight_rates), *shape)
+        together = torch.cat([weights[None], weight_rates.to(weights)]).movedim(0, 1)
+        for row, views in _groups(together.flatten(1)):
+            codes = row.view(-1, weights.shape[1]) @ field.anchors
+            value, moved = super().render_with_tangents(
+                field.lit(codes[0], codes[1:]),
+                camera,
+                camera_to_world.index_select(0, views),
+                rates.index_select(1, views),
+            )
+            for number, made in enumerate([value, *moved]):
+                maps[number, views] = torch.cat([made.rgb, made.opacity[..., None]], -1)
+        value, *tangents = (Maps(image[..., :3], image[..., 3]) for image in maps)
         return value, tangents
-
-    def _rays_with_tangents(
-        self, field: AppearanceField, rays: Rays, rates: Rays, gain: Tensor, gain_rates: Tensor
-    ) -> Float[Tensor, "maps rays 4"]:
-        samples = field.sample(rays, self.termination)
-        positions, directions = sample_points(rays, samples)
-        turns = rates.directions.index_select(1, samples.ray)
-        velocities = torch.addcmul(
-            rates.origins.index_select(1, samples.ray), turns, samples.distance[:, None]
-        )
-        sigma, rgb, sigma_rates, rgb_rates, lit_rates = field.query_with_tangents_of_code(
-            positions, directions, velocities, turns, gain, gain_rates
-        )
-        value, moved = composite_with_tangents(sigma, rgb, sigma_rates, rgb_rates, samples)
-        shown = render_weights(sigma, samples)[:, None] * lit_rates.flatten(1)
-        lit = sum_rays(shown, samples).unflatten(1, (-1, 3)).movedim(1, 0)
-        return torch.cat([value[None], moved, torch.nn.functional.pad(lit, (0, 1))])
 
     def render_rays(
         self, field: RadianceField, rays: Rays, weights: Tensor | None = None
@@ -109,20 +84,15 @@ class NerfWRenderer(NerfRenderer):
         ``weights`` are those of all rays (k) or one row a ray (rays, k). Differentiable in origins, directions and
         weights, in reverse and forward mode.
         """
-        check_rays(rays)
-        per_ray = weights is not None and weights.ndim == 2
-        field, rows = _checked(
-            field, weights if per_ray else _row(weights), len(rays.origins) if per_ray else 1
-        )
+        if weights is None or weights.ndim == 1:
+            field, row = _checked(field, None if weights is None else weights[None], 1)
+            return super().render_rays(field.lit(row[0] @ field.anchors), rays)
+        field, weights = _checked(field, weights, len(rays.origins))
+        field = field.with_step(self.step)
         samples = field.sample(rays, self.termination)
         positions, directions = sample_points(rays, samples)
-        gain = field.gain(rows @ field.anchors)
-        gain = gain.index_select(0, samples.ray) if per_ray else gain[0]
+        gain = field.gain(weights @ field.anchors).index_select(0, samples.ray)
         return composite(*field.decode(field.grid.raw(positions), directions, gain), samples)
-
-
-def _row(weights: Float[Tensor, "k"] | None) -> Float[Tensor, "1 k"] | None:
-    return None if weights is None else weights[None]
 
 
 def _checked(
