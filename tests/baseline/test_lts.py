@@ -9,10 +9,17 @@ from neural_sim.baseline.lts import LearningToSimulate, score
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
+from neural_sim.types import SceneDraw
 
 DOUBLE = torch.float64
 SCENE = SceneDistribution.of([Pose(bins=3, floor=0.01), Zoom(bins=2, floor=0.0)])
 PSI = torch.tensor([0.3, -0.2, 0.1, 0.5, -0.4], dtype=DOUBLE)
+
+
+def drawn(bins):
+    """A draw of which only the bins matter."""
+    still = torch.zeros(len(bins))
+    return SceneDraw(still, still, still, bins)
 
 
 def reward(bins):
@@ -25,16 +32,16 @@ def test_the_score_of_a_training_set_gives_the_exact_gradient_of_the_mean_reward
     mean, leaf, total = torch.zeros_like(PSI), PSI.clone().requires_grad_(), 0.0
     for pair in itertools.product(cells, repeat=2):
         bins = torch.stack(pair)
-        p = SCENE.log_prob(leaf, bins).sum().exp()
+        p = SCENE.log_prob(leaf, drawn(bins)).sum().exp()
         total = total + p * reward(bins)
-        mean += p.detach() * reward(bins) * score(SCENE, PSI, bins)
+        mean += p.detach() * reward(bins) * score(SCENE, PSI, drawn(bins))
     torch.testing.assert_close(mean, torch.autograd.grad(total, leaf)[0])
 
 
 def run(rewards, **settings):
     """Steps of a policy over two objects that always draws the same bins."""
     policy = LearningToSimulate(**settings).begin(SCENE, PSI.repeat(2, 1), torch.Generator())
-    draws, path = [torch.zeros(4, 2, dtype=torch.long)] * 2, [policy.psi]
+    draws, path = [drawn(torch.zeros(4, 2, dtype=torch.long))] * 2, [policy.psi]
     for value in rewards:
         assert torch.equal(policy.ask(), policy.psi)
         policy.tell(value, draws)
@@ -57,13 +64,13 @@ def test_steps_do_not_depend_on_the_rewards_unit_or_offset():
 
 def test_the_advantage_against_the_moving_averages_written_out():
     path = run([1.0, 2.0, 4.0], learning_rate=0.1, decay=0.5, max_step=100.0)
-    slope = score(SCENE, path[1][0], torch.zeros(4, 2, dtype=torch.long)) / 2.0
+    slope = score(SCENE, path[1][0], drawn(torch.zeros(4, 2, dtype=torch.long))) / 2.0
     first = SCENE.split(0.1 * 1.0 * slope)  # the only difference is its own measure
     moved = SCENE.join({name: part - part.mean() for name, part in first.items()})
     torch.testing.assert_close(path[2][0], path[1][0] + moved)
     # b = 1.5 after two rewards, the variance 0.5 (1 + 0.5 * 2.5^2) after the third
     advantage = 2.5 / (0.5 * (1.0 + 0.5 * 2.5**2)) ** 0.5
-    slope = score(SCENE, path[2][0], torch.zeros(4, 2, dtype=torch.long)) / 2.0
+    slope = score(SCENE, path[2][0], drawn(torch.zeros(4, 2, dtype=torch.long))) / 2.0
     second = SCENE.split(0.1 * advantage * slope)
     moved = SCENE.join({name: part - part.mean() for name, part in second.items()})
     torch.testing.assert_close(path[3][0], path[2][0] + moved)

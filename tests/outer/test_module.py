@@ -23,7 +23,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import RelaxedDraws, join
+from neural_sim.synthesis.scene import HARD, RelaxedDraws, join
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
@@ -164,7 +164,7 @@ def test_straight_through_images_are_those_of_hard_draws(scene):
     psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
     hard, through = (
         scene.draw(1, psi, 4, torch.Generator().manual_seed(2), how)
-        for how in (None, RelaxedDraws("straight_through", tangents=True))
+        for how in (HARD, RelaxedDraws("straight_through", tangents=True))
     )
     torch.testing.assert_close(through.images.images, hard.images.images, rtol=0.0, atol=1e-5)
     assert torch.equal(through.images.boxes, hard.images.boxes)

@@ -8,9 +8,16 @@ import torch
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution, Unlearned
 from neural_sim.parameter.zoom import Zoom
+from neural_sim.types import SceneDraw
 
 PEAKED = {"mug": {"initial": {"dominant": 2}, "target": {"dominant": 4}}}
 JOINT = SceneDistribution.of([Pose(bins=6, floor=0.0), Zoom(floor=0.0, biased=PEAKED)])
+
+
+def drawn(bins):
+    """A draw of which only the bins matter."""
+    still = torch.zeros(len(bins))
+    return SceneDraw(still, still, still, bins)
 
 
 def test_psi_holds_the_factors_one_after_the_other():
@@ -36,10 +43,10 @@ def test_factors_are_drawn_independently_and_by_their_own_p(generator):
 def test_log_prob_is_that_of_the_cell():
     psi = torch.linspace(-1.0, 1.0, 10, dtype=torch.float64)
     cells = torch.cartesian_prod(torch.arange(6), torch.arange(4))
-    assert JOINT.log_prob(psi, cells).exp().sum().item() == pytest.approx(1.0)
+    assert JOINT.log_prob(psi, drawn(cells)).exp().sum().item() == pytest.approx(1.0)
     parts = JOINT.probabilities(psi)
     expected = (parts["pose"][:, None] * parts["zoom"]).log().flatten()
-    torch.testing.assert_close(JOINT.log_prob(psi, cells), expected)
+    torch.testing.assert_close(JOINT.log_prob(psi, drawn(cells)), expected)
 
 
 def test_a_stratum_holds_one_factor_and_draws_the_others(generator):

@@ -26,7 +26,11 @@ class Sphere:
         self.calls: list[int] = []
 
     def render(
-        self, mesh: trimesh.Trimesh, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"]
+        self,
+        mesh: trimesh.Trimesh,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "n 4 4"],
+        lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
         self.calls.append(len(camera_to_world))
         distance = camera_to_world[:, :3, 3].norm(dim=-1).float()
