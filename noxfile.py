@@ -54,5 +54,5 @@ def types(session: nox.Session) -> None:
 def bench(session: nox.Session) -> None:
     """The benchmarks: tables on the screen, JSON under outputs/benchmarks."""
     _install(session)
-    for name in session.posargs or ["field", "render"]:
+    for name in session.posargs or ["field", "render", "hypergradient", "outer", "left_out"]:
         session.run("python", f"benchmarks/{name}.py")

@@ -11,10 +11,10 @@ from neural_sim.main import UserError, build, conf_directory
 
 CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
-PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]")
+PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]", "[pose,zoom,illumination]")
 EXPERIMENTS = sorted(
     {path.stem for path in (CONF / "experiment").glob("*.yaml") if not path.stem.endswith("_ycb")}
-    - {"stress", "compare"}
+    - {"stress", "compare", "illumination_interpolation"}
 )
 
 
@@ -25,7 +25,8 @@ def experiment(*overrides):
 
 @pytest.mark.parametrize(("baseline", "parameter"), itertools.product(BASELINES, PARAMETERS))
 def test_every_baseline_takes_every_parameter(baseline, parameter):
-    made = experiment(f"baseline={baseline}", f"parameter={parameter}")
+    lights = ["renderer=nerf_w"] if "illumination" in parameter else []
+    made = experiment(f"baseline={baseline}", f"parameter={parameter}", *lights)
     assert made.baseline.name == ("neural_sim" if baseline == "none" else baseline)
     assert ",".join(made.distribution.names) == parameter.strip("[]")
 
@@ -54,6 +55,19 @@ def test_auto_sim_differs_from_neural_sim_by_its_estimator_alone():
     )
     for group in ("outer", "solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
+
+
+def test_lights_want_a_renderer_that_knows_them():
+    with pytest.raises(UserError, match="renderer=nerf_w with 6 anchors, got one fixed light"):
+        experiment("parameter=[illumination]")
+    with pytest.raises(UserError, match="got 4 anchor lights"):
+        experiment("parameter=[illumination]", "renderer=nerf_w", "views.lights.rig.anchors=4")
+
+
+def test_the_pathwise_gradient_does_not_zoom_by_focal_length():
+    with pytest.raises(UserError, match=r"parameter\.zoom\.by"):
+        experiment("parameter=[zoom]", "parameter.zoom.by=focal_length", "gradient=pathwise")
+    assert experiment("parameter=[zoom]", "parameter.zoom.by=focal_length").distribution.names == ("zoom",)
 
 
 def test_what_is_fixed_says_which_distribution():

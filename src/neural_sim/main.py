@@ -222,8 +222,13 @@ def _task(config: DictConfig) -> float | None:
         if "compare" in config:
             return _compare(config, folder)
         experiment = build(config)
-        from neural_sim.pipeline import run
+        from neural_sim.pipeline import interpolate_lights, run
 
+        if "interpolation" in config:
+            interpolate_lights(
+                experiment, _instantiate(_plain(config)["interpolation"], "interpolation"), folder
+            )
+            return None
         return run(experiment, folder)
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:

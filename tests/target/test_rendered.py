@@ -8,6 +8,7 @@ from torch import Tensor
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.lighting import Lighting
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target

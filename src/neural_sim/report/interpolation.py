@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from neural_sim.cameras import orbit
 from neural_sim.field.base import RadianceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.report.figures import INK, MUTED
@@ -26,6 +28,54 @@ class Way:
 
     images: Float[Tensor, "steps height width 3"]
     opacity_change: float
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """``+experiment=illumination_interpolation``: every object from one camera, from one anchor light to another.
+
+    Args:
+        ends: numbers of the two anchor lights, from 1.
+        steps: images on the way, the ends included.
+        image_size: in pixels.
+        phi_deg, rho_deg, distance: the camera's place; degrees and object radii.
+
+    Raises:
+        ValueError: ends that are not two different lights, fewer than two steps or one pixel.
+    """
+
+    ends: tuple[int, int] = (1, 6)
+    steps: int = 7
+    image_size: int = 128
+    phi_deg: float = 75.0
+    rho_deg: float = 30.0
+    distance: float = 3.0
+
+    def __post_init__(self) -> None:
+        if len(self.ends) != 2 or self.ends[0] == self.ends[1] or min(self.ends) < 1:
+            raise ValueError(f"interpolation.ends: want two different lights from 1, got {list(self.ends)}")
+        if self.steps < 2 or self.image_size < 1:
+            raise ValueError(
+                f"interpolation: want 2 steps and a pixel or more, got {self.steps} and {self.image_size}"
+            )
+
+    def ways(
+        self,
+        fields: Mapping[str, RadianceField],
+        renderer: NerfWRenderer,
+        camera: PinholeCamera,
+        anchors: int,
+    ) -> dict[str, Way]:
+        """Every object's way. Raises ``ValueError`` for a light that there is not."""
+        if max(self.ends) > anchors:
+            raise ValueError(f"interpolation.ends: there are {anchors} anchor lights, got {list(self.ends)}")
+        place = [math.radians(self.phi_deg), math.radians(self.rho_deg), self.distance]
+        pose = orbit(*(torch.tensor(value) for value in place))
+        one, other = (torch.eye(anchors)[end - 1] for end in self.ends)
+        return {
+            name: interpolate(field, renderer, camera, pose, (one, other), self.steps)
+            for name, field in fields.items()
+        }
 
 
 def interpolate(

@@ -1,0 +1,190 @@
+"""What each omission saves, and the error that it costs: `python benchmarks/left_out.py`.
+
+Everything that `results.json` lists under `left_out` and that is no mere look-up, undone one at a time on `pose_gap` at
+`scale=quick`: in fitting a field, in rendering it, in one hypergradient. Errors of images are against a render with
+nothing left out, of fields the held-out PSNR, of hypergradients |g - g_all| beside the probes' standard error |s|.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from machine import machine
+from render import measure as measure_render
+from render import variants
+from tolerance import State, state
+from torch import Tensor
+from worlds import draw_bins
+
+from neural_sim import codec
+from neural_sim.artifacts import Artifacts
+from neural_sim.field.pool import build_pool
+from neural_sim.field.training import field_from_state
+from neural_sim.gradient.mixed import scores
+from neural_sim.main import build, conf_directory
+from neural_sim.outer.probing import ProbeSet
+from neural_sim.solver.flatten import unflatten
+from neural_sim.solver.hvp import HessianOperator
+from neural_sim.synthesis.pool import ImagePool
+
+Row = dict[str, Any]
+
+
+def clocked(work: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
+    """Median seconds, and the last result."""
+    spent, found = [], None
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        found = work()
+        spent.append(time.perf_counter() - begun)
+    return statistics.median(spent), found
+
+
+def fields(made: Artifacts, name: str) -> list[Row]:
+    """A field of one object as configured, with rays from every pixel, and with a colour head that sees directions."""
+    views = codec.unpack_views(made.views(name))
+    recipe, held_out, device = made.x.field, made.x.views.held_out, torch.device("cpu")
+
+    def fit(changed: Any) -> dict[str, float]:
+        return changed.fit(views, held_out, device)[1][-1]
+
+    def with_head() -> Any:
+        field = recipe.field()
+        return type(field)(**{**field.settings(), "features": 8, "head_width": 16})
+
+    plain = fit(recipe)
+    headed = fit(dataclasses.replace(recipe, field=with_head))
+    generator = torch.Generator().manual_seed(0)
+    near, every = (len(build_pool(views, border, generator)) for border in (2, None))
+    return [
+        {"omission": "as configured", "seconds": plain["seconds"], "error": f"{plain['psnr']:.2f} dB"},
+        {"omission": "view-dependent colour, undone", "seconds": headed["seconds"],
+         "error": f"{headed['psnr']:.2f} dB"},
+        {"omission": "rays far from silhouettes", "share": 1.0 - near / every, "error": "none"},
+    ]  # fmt: skip
+
+
+def renders(made: Artifacts, name: str) -> list[Row]:
+    """The final quality with each omission undone, and the lower qualities."""
+    field, views = field_from_state(made.field(name)["field"]), codec.unpack_views(made.views(name))
+    rows = []
+    for label, renderer in variants(["final", "normal", "draft"], True).items():
+        found = measure_render(field, renderer, views, made.x.training.image_size, 3)
+        error = f"opacity {found['opacity_error']:.1e}, colour {found['colour_psnr']:.1f} dB"
+        rows.append({"omission": label, "seconds": found["milliseconds"] / 1e3, "error": error})
+    return rows
+
+
+def loops(made: Artifacts) -> list[Row]:
+    """One hypergradient with each omission of the loop put in, against one without any."""
+    at, outer, random = state(made, "initial", 0), made.x.outer, torch.Generator().manual_seed(1)
+    damping = made.x.solver.damping
+    count = len(at.inner.weights)
+
+    def solve(subset: Tensor | None, residual: float) -> Tensor:
+        operator = HessianOperator(at.inner.terms(subset), at.inner.params, retain_graph=True)
+        value = damping.choose(operator, at.b, random).value
+        for steps in (8, 12, 16, 20, 30, 40):
+            search = at.krylov(subset, steps).search(value)
+            if search is not None and float(search.residual.norm() / at.b.norm()) <= residual:
+                return search.value
+        raise ValueError(f"left_out: 40 products do not reach a residual of {residual}")
+
+    whole, v = clocked(lambda: solve(None, 1e-3), 1)
+    truth, error = at.derivative(v)
+    few = torch.randperm(count, generator=random)[: outer.curvature_images]
+    part, v_few = clocked(lambda: solve(few, 1e-3), 1)
+    early, v_early = clocked(lambda: solve(None, made.x.solver.rtol), 1)
+    rows = [
+        {"omission": "nothing", "seconds": whole, "error": "0"},
+        {"omission": f"{count - len(few)} of {count} curvature images", "seconds": part,
+         "error": beside(at.derivative(v_few)[0], truth, error)},
+        {"omission": f"products beyond a residual of {made.x.solver.rtol:g}", "seconds": early,
+         "error": beside(at.derivative(v_early)[0], truth, error)},
+    ]  # fmt: skip
+    return rows + probes(made, at, v, truth, error)
+
+
+def probes(made: Artifacts, at: State, v: Tensor, truth: Tensor, error: Tensor) -> list[Row]:
+    """Scores by central differences, and probes from a pool of rendered bins in place of fresh renders."""
+    per_bin, vector = made.x.gradient.probes_per_bin, unflatten(v, at.inner.params)
+    index = torch.cat([probe.index for probe in at.probes])
+    rows = []
+    for mode in ("forward", "central_difference"):
+        spent, found = clocked(
+            lambda mode=mode: scores(at.probe_set.losses, at.inner.params, vector, index, 64, mode)
+        )
+        rows.append((spent, found))
+    relative = float((rows[1][1] - rows[0][1]).norm() / rows[0][1].norm())
+    pool_seconds, pool = clocked(
+        lambda: ImagePool.render(made.scene, made.x.outer.pool_per_bin, torch.Generator().manual_seed(2)), 1
+    )
+    world = at.world
+    fresh, _ = clocked(lambda: draw_bins(world, per_bin, torch.Generator().manual_seed(3)), 1)
+    pooled, held = clocked(
+        lambda: ProbeSet.draw(
+            pool, made.scene, world.detector, world.backbone, per_bin, world.psi,
+            torch.Generator().manual_seed(3), range(len(made.names)),
+        ), 1,
+    )  # fmt: skip
+    changed = dataclasses.replace(
+        at, probes=[next(iter(p.values())) for p in held.probes], probe_set=held.cached
+    )
+    moved, own = changed.derivative(v)
+    both = (error.square() + own.square()).sqrt()
+    return [
+        {"omission": "forward-mode scores", "seconds": rows[0][0], "error": "0"},
+        {"omission": "for central differences", "seconds": rows[1][0], "error": f"{relative:.0e} of the scores"},
+        {"omission": f"fresh renders of probes (pool: {pool_seconds:.1f} s once)", "seconds": pooled,
+         "error": f"{beside(moved, truth, both)} of both; fresh take {fresh:.2f} s"},
+    ]  # fmt: skip
+
+
+def beside(found: Tensor, truth: Tensor, error: Tensor) -> str:
+    """|g - g_all| by |s|."""
+    return f"{float((found - truth).norm() / error.norm()):.2f} standard errors"
+
+
+def table(title: str, rows: list[Row]) -> str:
+    lines = [f"{title:<58}{'seconds':>9}  error"]
+    for row in rows:
+        spent = f"{row['seconds']:9.3f}" if "seconds" in row else f"{row['share']:8.0%} "
+        lines.append(f"  {row['omission']:<56}{spent}  {row['error']}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
+    parser.add_argument("--name", default="pitcher", help="the object whose field is fitted and rendered")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/left_out.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        overrides = ["+experiment=pose_gap", "scale=quick", "progress=false", *arguments.overrides]
+        made = Artifacts(build(compose("config", overrides)))
+    parts = {
+        "one field": fields(made, arguments.name),
+        "an image": renders(made, arguments.name),
+        "one hypergradient": loops(made),
+    }
+    for title, rows in parts.items():
+        print(table(title, rows), flush=True)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps({"machine": machine(), "parts": parts}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

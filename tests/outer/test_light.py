@@ -1,0 +1,138 @@
+"""The derivative by the weights of lights, through the loop's own binding, against central differences."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector
+from neural_sim.field.appearance import AppearanceField
+from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.mixed import scores
+from neural_sim.outer.binding import bound_losses, image_losses, object_images
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.parameter.illumination import Illumination, ProjectedGradient
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.update import Mirror
+from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.settings import Outer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import HARD, Scene, join
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+ANCHORS, DOUBLE = 3, torch.float64
+DETECTOR = {"anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8, "head_convs": 1}
+
+
+def _field(seed, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    field = AppearanceField(learned=ANCHORS, anchors=ANCHORS).eval()
+    field.grid.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.copy_(0.7 * torch.randn(parameter.shape, generator=generator))
+        field.grid.table[:, 0] += 1.0
+    field.reset_codes(torch.eye(ANCHORS), generator)
+    return field.to(dtype).requires_grad_(False)
+
+
+def _scene(dtype=torch.float32, parameters=None):
+    parameters = [Illumination(anchors=ANCHORS)] if parameters is None else parameters
+    fields = tuple(_field(seed, dtype) for seed in (1, 2))
+    camera = PinholeCamera(32, 32, math.radians(40.0))
+    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+    return Scene(("a", "b"), fields, NerfWRenderer(), camera, synthesizer, SceneDistribution.of(parameters))
+
+
+@pytest.mark.parametrize(
+    "estimator", [StratifiedEstimator(), PathwiseEstimator()], ids=lambda e: type(e).__name__
+)
+def test_the_derivative_by_weights_against_central_differences(estimator):
+    scene, generator = _scene(DOUBLE), torch.Generator().manual_seed(0)
+    detector = Detector(2, 32, **DETECTOR)
+    params = {name: value.double() for name, value in detector.init(generator).items()}
+    backbone, trainable = detector.split(params)
+    vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
+    psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
+    rendered = scene.training_set(psi, 3, generator, estimator.draws)
+    images = join(rendered)
+    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)
+    weights = torch.full((6,), 1.0 / 6, dtype=DOUBLE)
+    held = object_images(scene, rendered, psi, weights)
+    targets = detector.assign(images.boxes, images.labels)
+
+    def objective(label, light):
+        """sum_i w_i <dl_i / dtheta, v> of one object's images under another light, all else replayed."""
+        part = rendered[label]
+        draw = dataclasses.replace(part.draw, weights=light.expand(3, -1))
+        maps = scene._maps(label, draw)
+        pixels = scene.synthesizer.compose(
+            maps.rgb, maps.opacity, part.nuisance, label, part.images.bins
+        ).images
+        index = torch.arange(3 * label, 3 * label + 3)
+        loss = image_losses(detector, backbone, targets, images.labels)
+        along = scores(lambda p, rows: loss(p, pixels[rows - 3 * label], rows), trainable, vector, index, 3)
+        return float(along @ weights[index])
+
+    for label, name in enumerate(scene.names):
+        found = estimator.estimate(losses, trainable, vector, held[name], {}).value
+        for i in range(ANCHORS):
+            step = torch.zeros(ANCHORS, dtype=DOUBLE)
+            step[i] = 1e-5
+            slope = (objective(label, psi[label] + step) - objective(label, psi[label] - step)) / 2e-5
+            assert float(found[i]) == pytest.approx(slope, rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [StratifiedEstimator(2), PathwiseEstimator(), PathwiseEstimator("reverse"), ReinforceEstimator()],
+    ids=lambda e: type(e).__name__ + getattr(e, "mode", ""),
+)  # fmt: skip
+def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator):
+    scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
+    generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"]).float()
+    detector = Detector(2, 32, **DETECTOR)
+    validation = join(scene.training_set(start, 3, generator, HARD))
+    light_update = ProjectedGradient(shrink=False)
+    settings = Outer(Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update)
+    inner = InnerLoop(
+        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
+    )
+    assert inner.pool is None  # a light that moves makes stored images stale
+    learned = learn_psi(SimulatorModule(inner, start, estimator, AdjointSolver(max_steps=4)), progress=False)
+    parts = scene.distribution.split(learned.last)
+    assert (parts["pose"].abs().amax(-1) > 0.0).all()
+    weights = parts["illumination"]
+    torch.testing.assert_close(weights.sum(-1), torch.ones(2, dtype=DOUBLE), rtol=0.0, atol=1e-12)
+    assert (weights >= 0.0).all() and ((weights - 1 / 3).abs().amax(-1) > 0.0).any()
+
+
+def test_opacity_does_not_know_the_light():
+    scene = _scene()
+    draw = scene.distribution.hard(
+        torch.ones(ANCHORS) / ANCHORS, scene.distribution.draw_noise(4, torch.Generator())
+    )
+    lights = [dataclasses.replace(draw, weights=light.expand(4, -1)) for light in torch.eye(ANCHORS)]
+    maps = [scene._maps(0, lit) for lit in lights]
+    assert all(torch.equal(other.opacity, maps[0].opacity) for other in maps[1:])
+    assert not torch.equal(maps[0].rgb, maps[1].rgb)
+
+
+def test_explored_lights_differ_and_carry_their_density():
+    scene, generator = _scene(), torch.Generator().manual_seed(0)
+    psi = scene.distribution.psi("initial", ["a"])[0].float()
+    part = scene.draw(0, psi, 4, generator, ReinforceEstimator.draws)
+    assert part.draw.explored is not None and part.draw.weights is not None
+    assert len(part.draw.weights.unique(dim=0)) == 4
+    density = torch.distributions.Normal(psi, 0.1).log_prob(part.draw.explored).sum(-1)
+    torch.testing.assert_close(scene.distribution.log_prob(psi, part.draw), density)
+    still = scene.draw(0, psi, 2, generator)
+    with pytest.raises(ValueError, match="no density"):
+        scene.distribution.log_prob(psi, still.draw)

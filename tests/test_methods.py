@@ -1,0 +1,83 @@
+"""Every method on every parameter at smoke scale through the command line, on one shared store; then the comparison."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BASELINES = ("none", "ns", "oracle", "lts", "auto_sim", "random_search", "bayes_opt")
+RUNS = {
+    "pose": ["+experiment=pose_gap", "objects.names=[pitcher,drill]"],
+    "both_angles": ["+experiment=pose_gap", "objects.names=[pitcher,drill]", "parameter.pose.axis=both"],
+    "zoom": ["+experiment=zoom_gap", "objects.names=[can,flat_box,mug]"],
+    "focal_length": ["+experiment=zoom_gap", "objects.names=[can,flat_box,mug]", "parameter.zoom.by=focal_length",
+                     "parameter.zoom.range=[0.3,1.2]"],
+    "illumination": ["+experiment=illumination_gap", "objects.names=[drill,mug]"],
+    "joint": ["+experiment=illumination_gap", "objects.names=[drill,mug]", "parameter=[pose,zoom,illumination]"],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("methods")
+
+
+def _run(folder, *arguments):
+    paths = [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}", "progress=false"]
+    command = [sys.executable, "-m", "src.main", *arguments, *paths]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", RUNS)
+def test_every_method_learns_every_parameter(folder, what):
+    sweep = folder / what
+    _run(
+        folder, "-m", *RUNS[what], f"name={what}", "scale=smoke", f"baseline={','.join(BASELINES)}", "score_at=[1]",
+        f"hydra.sweep.dir={sweep}", "hydra.sweep.subdir=${hydra.job.num}",
+    )  # fmt: skip
+    found = [json.loads(path.read_text()) for path in sorted(sweep.glob("*/results.json"))]
+    assert {run["method"] for run in found} == {*BASELINES, "neural_sim"} - {"none"}
+    for run in found:
+        factors = next(iter(run["psi"].values()))
+        assert ("illumination" in factors) == (what in ("illumination", "joint"))
+        moved = any(psi["learned"] != psi["initial"] for held in run["psi"].values() for psi in held.values())
+        if run["method"] not in (
+            "random_search",
+            "bayes_opt",
+        ):  # which may find nothing better than the start
+            assert moved == (run["method"] != "ns")
+        spent = run["curve"][-1]
+        assert (spent["images"] > 0) == (run["method"] not in ("ns", "oracle"))
+        assert (spent["products"] > 0) == (run["method"] in ("neural_sim", "auto_sim"))
+
+
+@pytest.mark.slow
+def test_the_comparison_reads_the_sweep_back(folder):
+    if not (folder / "pose").is_dir():
+        pytest.skip("the sweep over poses did not run")
+    _run(
+        folder,
+        "+experiment=compare",
+        "compare.experiments=[pose]",
+        "compare.draws=20",
+        f"hydra.run.dir={folder / 'compare'}",
+    )
+    (comparison,) = json.loads((folder / "compare" / "compare.json").read_text())
+    assert comparison["methods"][0] == "neural_sim" and {"lts", "auto_sim"} <= set(comparison["methods"])
+    assert (folder / "compare" / "figures" / "pose.png").stat().st_size > 5000
+    assert "of the gap won back" in (folder / "compare" / "compare.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_way_between_two_lights_leaves_opacity_alone(folder):
+    arguments = ["+experiment=illumination_interpolation", "scale=smoke", "objects.names=[drill,mug]"]
+    _run(folder, *arguments, f"hydra.run.dir={folder / 'way'}")
+    held = json.loads((folder / "way" / "interpolation.json").read_text())
+    assert max(held["opacity_change"].values()) <= 1e-6
+    assert (folder / "way" / "figures" / "interpolation.png").stat().st_size > 5000
