@@ -12,6 +12,7 @@ def _install(session: nox.Session, editable: bool = True) -> None:
     session.install("-r", "requirements.lock")
     session.install("--no-deps", *(["-e"] if editable else []), ".")
     session.env["OMP_WAIT_POLICY"] = "PASSIVE"
+    session.env["GOMP_SPINCOUNT"] = "20000"
 
 
 @nox.session
