@@ -7,8 +7,8 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "cameras", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver",
-         "gradient", "settings", "baseline", "outer", "stress", "store", "codec", "report", "experiment", "plan",
-         "artifacts", "pipeline", "main")  # fmt: skip
+         "gradient", "settings", "baseline", "outer", "stress", "store", "codec", "report", "experiment",
+         "plan", "methods", "artifacts", "pipeline", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 

@@ -31,6 +31,11 @@ def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
     )
 
 
+def test_a_loop_on_drafts_is_said_to_be_one():
+    assert "fine renders in the loop" in left_out("outer.quality=draft")
+    assert "fine renders in the loop" not in left_out("outer.quality=final")
+
+
 def test_objects_whose_psi_is_fixed_are_left_out():
     found = left_out("outer.learned=[mug,can]")
     assert found["probes and second derivatives"].share == pytest.approx(4 / 6)

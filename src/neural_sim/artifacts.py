@@ -11,21 +11,19 @@ import torch
 from torch import Tensor
 
 from neural_sim import codec
-from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
+from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
 from neural_sim.experiment import Account, Experiment
 from neural_sim.field.base import RadianceField
 from neural_sim.field.training import field_from_state, field_state
+from neural_sim.methods import outer_loop
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.loop import OuterLoop, learn_psi
-from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.rewarded import RewardLoop
+from neural_sim.outer.loop import learn_psi
 from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.store import Store, code_version, digest, tensor_digest
-from neural_sim.synthesis.scene import HardDraws, RenderedObject, Scene, join
+from neural_sim.synthesis.scene import RenderedObject, Scene, join
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
@@ -142,7 +140,9 @@ class Artifacts:
 
     def _scene_key(self) -> dict[str, Any]:
         parts = self._config("renderer", "parameter", "unlearned", "synthesis", "training")
-        version = code_version("field", "renderer/nerf", *DISTRIBUTIONS, "synthesis", "detector", "cameras")
+        version = code_version(
+            "field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synthesis", "detector", "cameras"
+        )
         return {
             "fields": [self._field_key(n) for n in self.names],
             "names": self.names,
@@ -238,7 +238,11 @@ class Artifacts:
             return {"trajectory": self.psi(method.which)[None], "records": []}
 
         def make() -> Any:
-            found = learn_psi(self._loop(method), self.x.progress)
+            loop = outer_loop(
+                self.x, self.scene, self.detector, self.warm_start(), self.psi("initial"), self.targets["val"],
+                self._generator(2),
+            )  # fmt: skip
+            found = learn_psi(loop, self.x.progress)
             records = [dataclasses.asdict(record) for record in found.records]
             return {"trajectory": found.trajectory, "records": records}
 
@@ -246,19 +250,9 @@ class Artifacts:
         groups += ["gradient", "solver"] if isinstance(method, HypergradientLoop) else ["baseline"]
         key = {
             "warm_start": self._trained_key(self.psi("initial")), **self._config(*groups),
-            "code": code_version("outer", "gradient", "solver", "baseline", "parameter/update"),
+            "code": code_version("outer", "gradient", "solver", "baseline", "methods", "parameter/update"),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
-
-    def _loop(self, method: HypergradientLoop | RewardMethod) -> OuterLoop:
-        training, searched = self.x.training, not isinstance(method, HypergradientLoop)
-        inner = InnerLoop(
-            self.scene, self.detector, self.warm_start(), self.targets["val"], self.x.outer, training.batch_size,
-            training.weight_decay, self._generator(2), HardDraws(explore=True) if searched else self.x.gradient.draws,
-        )  # fmt: skip
-        if isinstance(method, HypergradientLoop):
-            return SimulatorModule(inner, self.psi("initial"), self.x.gradient, self.x.solver)
-        return RewardLoop(inner, self.psi("initial"), method)
 
     def training_images(self, psi: Tensor) -> list[RenderedObject]:
         """The images that the scored detector trained on, drawn again from the same seed."""

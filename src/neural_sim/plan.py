@@ -48,6 +48,10 @@ def _loop(x: Experiment, objects: int) -> Iterator[Omission]:
         and x.distribution.light is None
     ):
         yield _pooled(x, method, searched)
+    if outer.quality not in (None, x.renderer.quality):
+        yield Omission(
+            "psi", "fine renders in the loop", f"outer.quality={outer.quality}; the scored images are fine"
+        )
     if outer.epochs > 1:
         what, why = "backbone passes of the loop's training", "a frozen backbone's features are kept"
         yield Omission("psi", what, why, 1.0 - 1.0 / outer.epochs)

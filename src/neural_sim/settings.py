@@ -13,6 +13,7 @@ from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.illumination import ProjectedGradient
 from neural_sim.parameter.update import Update
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.nerf import Quality
 from neural_sim.renderer.rig import LightRig, VariedLight
 from neural_sim.renderer.views import render_views
 from neural_sim.types import PinholeCamera, PosedViews
@@ -140,11 +141,12 @@ class Outer:
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
     estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
-    anew; the others keep their images, and what other factors of p_psi gave them. ``learned`` names the objects whose
-    psi moves (None: all); for the others no probe is drawn and no second derivative taken. ``on_untrusted`` is what
-    happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one object's gradient, in turn, is
-    compared with finite differences of a problem retrained on ``certify_per_bin`` images of every bin: 2 k - 1
-    trainings to stationarity.
+    anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
+    renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
+    objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
+    ``on_untrusted`` is what happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one
+    object's gradient, in turn, is compared with finite differences of a problem retrained on ``certify_per_bin`` images
+    of every bin: 2 k - 1 trainings to stationarity.
     """
 
     update: Update
@@ -157,6 +159,7 @@ class Outer:
     curvature_images: int = 64
     pool_per_bin: int = 24
     refresh: float = 1.0
+    quality: Quality | None = None
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"
     learned: tuple[str, ...] | None = None
@@ -169,6 +172,10 @@ class Outer:
         _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
         _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         _at_least("outer", 0, certify_every=self.certify_every)
+        if self.quality is not None and self.quality not in get_args(Quality):
+            raise ValueError(
+                f"outer.quality must be one of {', '.join(get_args(Quality))} or null, got {self.quality!r}"
+            )
         if not 0.0 < self.refresh <= 1.0:
             raise ValueError(f"outer.refresh must lie in (0, 1], got {self.refresh}")
         _at_least("outer", 1, certify_per_bin=self.certify_per_bin)

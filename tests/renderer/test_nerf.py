@@ -203,3 +203,12 @@ def test_wrong_shapes_and_settings_are_refused(field: GridField) -> None:
         NerfRenderer(step=0.0)
     with pytest.raises(ValueError, match="quality"):
         NerfRenderer("best")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_same_renderer_at_another_quality_keeps_the_rest():
+    renderer = NerfRenderer("final", rays_per_chunk=512, cull=False).at("draft")
+    wanted = NerfRenderer("draft")
+    assert (renderer.termination, renderer.step) == (wanted.termination, wanted.step)
+    assert renderer.rays_per_chunk == 512 and not renderer.cull
+    with pytest.raises(ValueError, match="quality"):
+        renderer.at("sketch")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -78,6 +78,10 @@ class NerfRenderer:
             raise ValueError(f"NerfRenderer: rays_per_chunk must be at least 1, got {rays_per_chunk}")
         self.rays_per_chunk = rays_per_chunk
         self.cull, self.skip_empty = cull, skip_empty
+
+    def at(self, quality: Quality) -> Self:
+        """This renderer at another quality. Raises ``ValueError`` for one that there is not."""
+        return type(self)(quality, self.rays_per_chunk, cull=self.cull, skip_empty=self.skip_empty)
 
     @torch.no_grad()
     def render(
