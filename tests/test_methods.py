@@ -33,24 +33,29 @@ def _run(folder, *arguments):
     return done
 
 
+def _sweep(folder, what):
+    """The folder of a sweep over all methods, which is made once."""
+    sweep = folder / what
+    if not sweep.is_dir():
+        _run(
+            folder, "-m", *RUNS[what], f"name={what}", "scale=smoke", f"baseline={','.join(BASELINES)}",
+            "score_at=[1]", f"hydra.sweep.dir={sweep}", "hydra.sweep.subdir=${hydra.job.num}",
+        )  # fmt: skip
+    return sweep
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("what", RUNS)
 def test_every_method_learns_every_parameter(folder, what):
-    sweep = folder / what
-    _run(
-        folder, "-m", *RUNS[what], f"name={what}", "scale=smoke", f"baseline={','.join(BASELINES)}", "score_at=[1]",
-        f"hydra.sweep.dir={sweep}", "hydra.sweep.subdir=${hydra.job.num}",
-    )  # fmt: skip
+    sweep = _sweep(folder, what)
     found = [json.loads(path.read_text()) for path in sorted(sweep.glob("*/results.json"))]
     assert {run["method"] for run in found} == {*BASELINES, "neural_sim"} - {"none"}
     for run in found:
         factors = next(iter(run["psi"].values()))
         assert ("illumination" in factors) == (what in ("illumination", "joint"))
         moved = any(psi["learned"] != psi["initial"] for held in run["psi"].values() for psi in held.values())
-        if run["method"] not in (
-            "random_search",
-            "bayes_opt",
-        ):  # which may find nothing better than the start
+        # Searches may find nothing better than the start.
+        if run["method"] not in ("random_search", "bayes_opt"):
             assert moved == (run["method"] != "ns")
         spent = run["curve"][-1]
         assert (spent["images"] > 0) == (run["method"] not in ("ns", "oracle"))
@@ -59,8 +64,7 @@ def test_every_method_learns_every_parameter(folder, what):
 
 @pytest.mark.slow
 def test_the_comparison_reads_the_sweep_back(folder):
-    if not (folder / "pose").is_dir():
-        pytest.skip("the sweep over poses did not run")
+    _sweep(folder, "pose")
     _run(
         folder,
         "+experiment=compare",

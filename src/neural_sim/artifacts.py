@@ -254,6 +254,11 @@ class Artifacts:
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
 
+    @property
+    def learned_psi(self) -> Tensor:
+        """What the method reports."""
+        return self.learned()["trajectory"][-1]
+
     def training_images(self, psi: Tensor) -> list[RenderedObject]:
         """The images that the scored detector trained on, drawn again from the same seed."""
         return self.scene.training_set(psi, self.x.training.images_per_object, self._generator(1))
@@ -275,7 +280,7 @@ class Artifacts:
         """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
         return {
             "ns": self.psi("initial"),
-            "learned": self.learned()["trajectory"][-1],
+            "learned": self.learned_psi,
             "matched": self.psi("target"),
         }
 

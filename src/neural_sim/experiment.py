@@ -16,6 +16,7 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import Outer, Training, Views
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.store import Entry
+from neural_sim.synthesis.scene import Draws, HardDraws
 from neural_sim.synthesis.training_set import Synthesizer
 
 
@@ -45,6 +46,13 @@ class Experiment:
     gradient: Estimator
     baseline: Fixed | HypergradientLoop | RewardMethod
     config: dict[str, Any]
+
+    @property
+    def draws(self) -> Draws:
+        """How the method wants its images drawn: as its estimator does, or so that they have a density."""
+        return (
+            self.gradient.draws if isinstance(self.baseline, HypergradientLoop) else HardDraws(explore=True)
+        )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.rewarded import RewardLoop
-from neural_sim.synthesis.scene import HardDraws, Scene
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 
@@ -38,19 +38,10 @@ def outer_loop(
         raise ValueError(f"baseline={method.name} has no outer loop")
     if outer.quality is not None:
         scene = replace(scene, renderer=scene.renderer.at(outer.quality))
-    hypergradients = isinstance(method, HypergradientLoop)
-    draws = experiment.gradient.draws if hypergradients else HardDraws(explore=True)
     inner = InnerLoop(
-        scene,
-        detector,
-        warm_start,
-        validation,
-        outer,
-        training.batch_size,
-        training.weight_decay,
-        generator,
-        draws,
-    )
+        scene, detector, warm_start, validation, outer, training.batch_size, training.weight_decay, generator,
+        experiment.draws,
+    )  # fmt: skip
     if isinstance(method, HypergradientLoop):
         return SimulatorModule(inner, psi, experiment.gradient, experiment.solver)
     return RewardLoop(inner, psi, method)

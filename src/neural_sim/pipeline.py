@@ -66,10 +66,9 @@ class Pipeline:
 
     def results(self) -> RunResults:
         """What there is to report: a run without evaluation has no AP."""
-        learned = self.made.learned()
         psi = {
             "initial": self.made.psi("initial"),
-            "learned": learned["trajectory"][-1],
+            "learned": self.made.learned_psi,
             "target": self.made.psi("target"),
         }
         evaluated = "evaluate" in self.x.stages
@@ -85,7 +84,7 @@ class Pipeline:
             names=self.made.names,
             biased=self.x.distribution.biased,
             probabilities={which: self.x.distribution.probabilities(value) for which, value in psi.items()},
-            records=learned["records"],
+            records=self.made.learned()["records"],
             ap=scores,
             fields={name: self.made.field(name)["history"] for name in self.made.names},
             seconds=dict(self.made.account.seconds),
@@ -98,8 +97,7 @@ class Pipeline:
 
     def curve(self) -> list[dict[str, Any]]:
         """What the method had spent, and what its psi was worth, at its start, on the way as asked, and at its end."""
-        learned = self.made.learned()
-        records = learned["records"]
+        records = self.made.learned()["records"]
         points = []
         for iteration, psi in self.made.scored_iterations().items():
             spent = {
@@ -114,13 +112,9 @@ class Pipeline:
     def report(self, folder: Path) -> None:
         """Figures, the final training set, results.json, MLflow."""
         results = self.results()
-        drawn = self.made.training_images(self.made.learned()["trajectory"][-1])
+        drawn = self.made.training_images(self.made.learned_psi)
         test = self.made.targets["test"]
-        detections = (
-            self.made.scores(self.made.learned()["trajectory"][-1], "learned")["detections"]
-            if results.ap
-            else []
-        )
+        detections = self.made.scores(self.made.learned_psi, "learned")["detections"] if results.ap else []
         write_figures(results, join(drawn), test, detections, folder / "figures")
         write_training_set(drawn, self.made.names, folder / "training_set")
         if results.ap:
@@ -174,4 +168,4 @@ def run(experiment: Experiment, folder: Path) -> float | None:
             pipeline.report(folder)
     if "evaluate" not in experiment.stages:
         return None
-    return pipeline.made.scores(pipeline.made.learned()["trajectory"][-1], "learned")["ap"]["ap"]
+    return pipeline.made.scores(pipeline.made.learned_psi, "learned")["ap"]["ap"]

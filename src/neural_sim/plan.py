@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
 from neural_sim.experiment import Experiment, Omission
 from neural_sim.field.grid import GridField
+from neural_sim.outer.inner import pooled
+from neural_sim.synthesis.pool import pool_cells
 from neural_sim.synthesis.scene import HardDraws
 
 
@@ -42,11 +45,7 @@ def _loop(x: Experiment, objects: int) -> Iterator[Omission]:
         yield Omission("psi", "hypergradients", f"baseline={method.name} sees rewards only", 1.0)
     else:
         yield from _hypergradient(x, objects)
-    if (
-        outer.pool_per_bin
-        and (searched or isinstance(x.gradient.draws, HardDraws))
-        and x.distribution.light is None
-    ):
+    if pooled(outer, x.draws, x.distribution):
         yield _pooled(x, method, searched)
     if outer.quality not in (None, x.renderer.quality):
         yield Omission(
@@ -81,10 +80,7 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
 def _pooled(x: Experiment, method: HypergradientLoop | RewardMethod, searched: bool) -> Omission:
     """Renders that a pool of every bin spares, of all that the loop's images would take."""
     factors = x.distribution.binned
-    cells, finest = 1, max(factor.bins for factor in factors)
-    for factor in factors:
-        cells *= factor.bins
-    rendered = -(-x.outer.pool_per_bin * finest // cells) * cells
+    rendered = math.prod(pool_cells(factors, x.outer.pool_per_bin))
     rounds = getattr(method, "rounds", 1) * x.outer.iterations
     probes = 0.0
     if not searched:

@@ -1,7 +1,5 @@
 """The loop of reward methods: rounds, what is counted, and that psi is the method's."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -49,10 +47,3 @@ def test_the_best_psi_is_that_of_the_lowest_validation_loss(inner):
     p = learned.records[losses.index(min(losses))].probabilities["pose"]
     factor = SceneDistribution.of([Pose(bins=4)]).factors[0]
     torch.testing.assert_close(factor.log_probabilities(learned.last).exp(), torch.tensor(p).double())
-
-
-def test_psi_steps_do_not_touch_another_runs_settings(inner):
-    method = LearningToSimulate()
-    before = dataclasses.replace(method)
-    learn_psi(RewardLoop(inner(), torch.zeros(2, 4), method), progress=False)
-    assert method == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
 
 
-class Incumbent:
+class Incumbent(ABC):
     """The best psi told of so far; psi asked for is the initial one first, then what :meth:`propose` makes."""
 
     def __init__(self, psi: Float[Tensor, "objects K"]) -> None:
@@ -34,9 +35,9 @@ class Incumbent:
         if reward > self._reward:
             self._best, self._reward = self._asked, reward
 
+    @abstractmethod
     def propose(self) -> Float[Tensor, "objects K"]:
         """The next psi to try."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.settings import Outer
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import HARD, Draws, HardDraws, RenderedObject, Scene
@@ -26,6 +27,11 @@ def timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
     begin = time.perf_counter()
     yield
     seconds[phase] = seconds.get(phase, 0.0) + time.perf_counter() - begin
+
+
+def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
+    """Whether images come from a pool: where none is differentiated and the light does not move."""
+    return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and distribution.light is None
 
 
 class InnerLoop:
@@ -56,8 +62,7 @@ class InnerLoop:
         self.draws = draws
         self.pool: ImagePool | None = None
         begun = time.perf_counter()
-        fixed_light = scene.distribution.light is None
-        if settings.pool_per_bin and isinstance(draws, HardDraws) and fixed_light:
+        if pooled(settings, draws, scene.distribution):
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self.pool_seconds = time.perf_counter() - begun
         self._start = params if settings.start == "warm" else {**detector.init(generator), **self.backbone}

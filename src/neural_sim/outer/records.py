@@ -44,9 +44,3 @@ class LearnedPsi:
     def last(self) -> Float[Tensor, "objects K"]:
         """What the method reports."""
         return self.trajectory[-1]
-
-    @property
-    def best(self) -> Float[Tensor, "objects K"]:
-        """The psi whose images trained the detector of lowest validation loss."""
-        losses = [record.validation_loss for record in self.records]
-        return self.trajectory[losses.index(min(losses))] if losses else self.trajectory[0]

@@ -8,14 +8,22 @@ each draw. Not for estimators that replay exact draws from psi (the pathwise one
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.synthesis.scene import RenderedObject, Scene
 from neural_sim.types import SceneDraw
+
+
+def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
+    """Combinations of the factors' bins, and the maps of each that give every bin at least ``per_bin``."""
+    cells = math.prod(factor.bins for factor in factors)
+    return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
 
 
 @dataclass(frozen=True)
@@ -47,8 +55,7 @@ class ImagePool:
         if scene.distribution.light is not None:
             raise ValueError("outer.pool_per_bin: images under a light that moves are no pool's, want 0")
         factors = scene.distribution.binned
-        cells = math.prod(factor.bins for factor in factors)
-        per_cell = math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
+        cells, per_cell = pool_cells(factors, per_bin)
         every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
         bins = every.repeat_interleave(per_cell, 0)
         named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
