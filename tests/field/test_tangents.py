@@ -7,8 +7,10 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
 from neural_sim.field.interpolation import gather_weighted, interpolate, trilinear_tangents, trilinear_weights
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.quadrature import composite, composite_with_tangents
+from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
+from neural_sim.field.rendering import render_samples, render_with_tangents
 from neural_sim.field.samples import PackedSamples
+from neural_sim.types import Rays
 
 DOUBLE = torch.float64
 
@@ -69,6 +71,32 @@ def test_a_query_with_tangents_is_the_query_and_its_derivatives(
     assert float(rgb_rates.abs().max()) > 0.1
 
 
+@pytest.mark.parametrize("kind", ["grid", "grid with a head", "network"])
+def test_many_rates_of_rays_equal_forward_mode(kind: str, generator: torch.Generator) -> None:
+    """Rates enough to be taken through a ray's six numbers, in pieces of a few rays."""
+    field: RadianceField
+    if kind == "network":
+        field = MLPField(width=16, depth=2, position_frequencies=3).double().eval().requires_grad_(False)
+    else:
+        field = grid(generator, 8 if "head" in kind else 0)
+    directions = torch.nn.functional.normalize(normal(generator, 40, 3), dim=-1)
+    rays = Rays(0.3 * normal(generator, 40, 3) - 2.5 * directions, directions)
+    rates = Rays(normal(generator, 4, 40, 3), normal(generator, 4, 40, 3))
+    pixels, moved = render_with_tangents(field, rays, rates, 0.0, samples_at_once=60)
+    samples = field.sample(rays, 0.0)
+
+    def rgba(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        colour, opacity = render_samples(field, Rays(origins, directions), samples)
+        return torch.cat([colour, opacity[:, None]], -1)
+
+    torch.testing.assert_close(pixels, rgba(rays.origins, directions), rtol=0.0, atol=1e-12)
+    for m in range(4):
+        ways = (rates.origins[m], rates.directions[m])
+        _, generic = torch.func.jvp(rgba, (rays.origins, directions), ways)
+        torch.testing.assert_close(moved[m], generic, rtol=1e-9, atol=1e-10)
+        assert float(generic.abs().max()) > 0.1
+
+
 @pytest.mark.parametrize("scale", [0.5, 8.0, 500.0])
 def test_the_quadratures_tangents(scale: float, generator: torch.Generator) -> None:
     counts = torch.tensor([0, 5, 1, 0, 7, 0])
@@ -89,3 +117,19 @@ def test_the_quadratures_tangents(scale: float, generator: torch.Generator) -> N
     for m in range(3):
         _, generic = torch.func.jvp(rgba, (sigma, rgb), (sigma_rates[m], rgb_rates[m]))
         torch.testing.assert_close(rates[m], generic, rtol=1e-12, atol=1e-13)
+    # In space: the same rates for all samples, and in proportion to their distances.
+    distance = 1.0 + torch.rand(13, generator=generator, dtype=DOUBLE)
+    along = PackedSamples(ray, distance, width, starts)
+    more = normal(generator, 2, 13, 3)
+    again, by_origin, by_direction, of_colour = composite_with_gradient(
+        sigma, rgb, sigma_rates, torch.cat([rgb_rates, more]), along
+    )
+    torch.testing.assert_close(again, pixels, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(by_origin, rates, rtol=1e-12, atol=1e-12)
+    for m in range(3):
+        further = (distance * sigma_rates[m], distance[:, None] * rgb_rates[m])
+        _, generic = torch.func.jvp(rgba, (sigma, rgb), further)
+        torch.testing.assert_close(by_direction[m], generic, rtol=1e-12, atol=1e-12)
+    for rate, moved in zip(more, of_colour, strict=True):
+        _, generic = torch.func.jvp(rgba, (sigma, rgb), (torch.zeros_like(sigma), rate))
+        torch.testing.assert_close(moved, generic[:, :3], rtol=1e-12, atol=1e-12)

@@ -79,6 +79,15 @@ def test_no_pixel_changes_where_pixels_or_empty_space_are_left_out(
         torch.testing.assert_close(some, every, atol=1e-12, rtol=0.0)
 
 
+def test_blocks_of_a_large_image_miss_no_pixel(generator: torch.Generator) -> None:
+    """An occupied coarse cell covers some fifty pixels across here: pixels are looked at in blocks of six."""
+    field, large, pose = shell(generator), PinholeCamera(241, 180, math.radians(40.0)), poses()[:1]
+    pose[:, :3, 3] *= 2.0
+    every = render_views(field, large, pose, 0.0, 3000, cull=False)
+    torch.testing.assert_close(render_views(field, large, pose, 0.0, 3000), every, atol=1e-12, rtol=0.0)
+    assert sum(len(seen.pixel) for seen in seen_pixels(field, large, pose, 3000)) < 0.8 * 241 * 180
+
+
 def test_culling_leaves_out_pixels_and_bounds_every_sample(generator: torch.Generator) -> None:
     field, far_away = shell(generator), poses()
     far_away[:, :3, 3] *= 2.0

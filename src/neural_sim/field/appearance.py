@@ -53,7 +53,7 @@ class AppearanceField(RadianceField):
                 f"{head_width}, {code_size}, {learned}, {anchors}"
             )
         self.grid = GridField(features, 0, step_cells, initial_density, density_gain)
-        self.view_dependent = view_dependent
+        self.directed = view_dependent
         self.into = nn.Linear(features + 3 * view_dependent, head_width)
         self.code = nn.Linear(code_size, head_width, bias=False)
         self.out = nn.Linear(head_width, 3)
@@ -66,7 +66,7 @@ class AppearanceField(RadianceField):
             "features": self.grid.features,
             "head_width": self.out.in_features,
             "code_size": self.code.in_features,
-            "view_dependent": self.view_dependent,
+            "view_dependent": self.directed,
             "step_cells": self.grid.step_cells,
             "initial_density": self.grid.initial_density,
             "density_gain": self.grid.density_gain,
@@ -122,7 +122,7 @@ class AppearanceField(RadianceField):
 
     def seen(self, raw: Tensor, directions: Tensor) -> Float[Tensor, "*samples inputs"]:
         """What the head sees of table rows (or of their rates) and directions."""
-        return torch.cat([raw[..., 1:], directions], -1) if self.view_dependent else raw[..., 1:]
+        return torch.cat([raw[..., 1:], directions], -1) if self.directed else raw[..., 1:]
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
@@ -141,7 +141,7 @@ class LitField(RadianceField):
     ) -> None:
         super().__init__()
         self.field, self.gain, self.gain_rates = field, gain, gain_rates
-        self.light_rates = len(gain_rates)
+        self.light_rates, self.directed = len(gain_rates), field.directed
 
     def settings(self) -> dict[str, object]:
         raise TypeError("LitField: save the appearance field itself")
@@ -160,7 +160,7 @@ class LitField(RadianceField):
         self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         grid = self.field.grid
-        return grid.trace_as(self._decode, self.field.view_dependent, rays, termination, span, skip_empty)
+        return grid.trace_as(self._decode, self.directed, rays, termination, span, skip_empty)
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]

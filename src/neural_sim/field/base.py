@@ -16,6 +16,8 @@ from neural_sim.types import PinholeCamera, Rays
 class RadianceField(nn.Module, ABC):
     """Density and colour in the object's frame (unit sphere round the origin)."""
 
+    directed: bool = True
+    """Whether colour may depend on the direction that it is seen from."""
     light_rates: int = 0
     """How many derivatives of colour alone ``query_with_tangents`` adds to those that were asked for."""
 

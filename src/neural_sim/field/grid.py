@@ -59,7 +59,7 @@ class GridField(RadianceField):
             )
         self.features, self.head_width = features, head_width
         self.step_cells, self.initial_density = step_cells, initial_density
-        self.density_gain = density_gain
+        self.density_gain, self.directed = density_gain, head_width > 0
         self.head: nn.Module | None = None
         if head_width:
             self.head = nn.Sequential(
@@ -254,7 +254,7 @@ class GridField(RadianceField):
         self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """See the base class; each sample is found, interpolated and composited once, wave by wave."""
-        return self.trace_as(self.decode, self.head is not None, rays, termination, span, skip_empty)
+        return self.trace_as(self.decode, self.directed, rays, termination, span, skip_empty)
 
     @torch.no_grad()
     def trace_as(

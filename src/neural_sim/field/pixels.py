@@ -14,7 +14,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.samples import Span
 from neural_sim.types import PinholeCamera, Rays
 
-SMALLEST_STRIP, LARGEST_STRIP = 4096, 16384
+SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
 """Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one."""
 
 

@@ -84,6 +84,57 @@ def composite_with_tangents(
     return moved[:, 0], torch.cat([moved[:, 1:], lit], 1).movedim(1, 0)
 
 
+def composite_with_gradient(
+    sigma: Float[Tensor, "samples"],
+    rgb: Float[Tensor, "samples 3"],
+    sigma_rates: Float[Tensor, "m samples"],
+    rgb_rates: Float[Tensor, "n samples 3"],
+    samples: PackedSamples,
+) -> tuple[
+    Float[Tensor, "rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "q rays 3"]
+]:
+    """``composite`` as RGBA; its derivatives where all samples of a ray move along x, y or z, and where they move so
+    in proportion to their distances; and the colour's derivatives by the q = n - 3 rates that move colours only.
+
+    The first three rates are those in space, the others' densities are not looked at. A sample's density adds its
+    own colour, as far as light passes through it, and takes away all behind it: with tau = sigma delta the pixel C
+    changes by T exp(-tau) c - sum_{j behind} w_j c_j.
+    """
+    passed = transmittance(sigma, samples)
+    depth = sigma * samples.width
+    weights = (passed * alpha_from_sigma(sigma, samples.width))[:, None]
+    colour = torch.nn.functional.pad(rgb, (0, 1), value=1.0)
+    running = torch.nn.functional.pad((weights * colour).double().cumsum(0), (0, 0, 1, 0))
+    ends = running.index_select(0, samples.starts)
+    behind = (ends[1:].index_select(0, samples.ray) - running[1:]).to(sigma.dtype)
+    behind = behind.masked_fill((depth > OPAQUE_DEPTH)[:, None], 0.0)
+    by_depth = torch.addcmul(-behind, (passed * torch.exp(-depth))[:, None], colour) * samples.width[:, None]
+    gradient = sigma.new_empty(len(sigma), 3, 4)
+    for axis in range(3):
+        torch.mul(by_depth, sigma_rates[axis][:, None], out=gradient[:, axis])
+        gradient[:, axis, :3].addcmul_(weights, rgb_rates[axis])
+    gradient = gradient.flatten(1)
+    pixels = (ends[1:] - ends[:-1]).to(sigma.dtype)
+    summed = _segment_sum(gradient, samples), _segment_sum(gradient, samples, samples.distance)
+    by_origin, by_direction = (part.unflatten(1, (3, 4)).movedim(1, 0) for part in summed)
+    of_colour = pixels.new_zeros(len(rgb_rates) - 3, len(pixels), 3)
+    for out, rate in zip(of_colour, rgb_rates[3:], strict=True):
+        out.copy_(_segment_sum(rate, samples, weights[:, 0]))
+    return pixels, by_origin, by_direction, of_colour
+
+
+def _segment_sum(
+    values: Float[Tensor, "samples channels"],
+    samples: PackedSamples,
+    factors: Float[Tensor, "samples"] | None = None,
+) -> Float[Tensor, "rays channels"]:
+    """Each ray's sum, in the values' own type; no derivative passes."""
+    every = torch.arange(len(values), device=values.device)
+    return torch.nn.functional.embedding_bag(
+        every, values, samples.starts[:-1], per_sample_weights=factors, mode="sum"
+    )
+
+
 def _exclusive(values: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
     """Sum of the values before each sample along its ray."""
     wide = values.double()

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import pixel_rays, seen_pixels
-from neural_sim.field.quadrature import composite, composite_with_tangents
+from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
 from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PinholeCamera, Rays
 
-RAY_NUMBERS = 6
+FEW = 2
+"""Up to so many rates each is taken through the samples; of more, a ray's derivatives by its six numbers."""
 SAMPLES_AT_ONCE = 16_384
 """Samples asked for derivatives together: they keep to the cache."""
 
@@ -57,20 +58,15 @@ def render_with_tangents(
     Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
 
     One pass over the samples gives both, about ``samples_at_once`` at a time: a sample at distance t moves at
-    o' + t d'. A ray has six numbers; of more
-    rates than that, the derivatives by these six are taken and combined.
+    o' + t d'. Many rates cost what a few do (``_by_ray_numbers``).
     """
-    if len(rates.origins) > RAY_NUMBERS:
-        pixels, by_number = render_with_tangents(field, rays, _unit_rates(rays), termination, samples_at_once)
-        numbers = torch.cat([rates.origins, rates.directions], -1)
-        moved = torch.einsum("mrk,krc->mrc", numbers, by_number[:RAY_NUMBERS])
-        return pixels, torch.cat([moved, by_number[RAY_NUMBERS:]])
     samples = field.sample(rays, termination)
+    differentiate = _with_tangents if len(rates.origins) <= FEW else _by_ray_numbers
     # Pieces of about as many samples need the same memory wherever in an image their rays lie.
     cuts = torch.arange(0, len(samples), samples_at_once, device=samples.starts.device)[1:]
     edges = [0, *torch.searchsorted(samples.starts, cuts).tolist(), len(rays.origins)]
     parts = [
-        _with_tangents(field, _rows(rays, a, b), _rows(rates, a, b), samples.of_rays(a, b))
+        differentiate(field, _rows(rays, a, b), _rows(rates, a, b), samples.of_rays(a, b))
         for a, b in pairwise(edges)
         if a < b
     ]
@@ -91,11 +87,23 @@ def _with_tangents(
     return composite_with_tangents(*queried, samples)
 
 
-def _unit_rates(rays: Rays) -> Rays:
-    """Rays whose six numbers, origin and direction, change one at a time."""
-    unit = torch.eye(RAY_NUMBERS, dtype=rays.origins.dtype, device=rays.origins.device)
-    unit = unit[:, None].expand(-1, len(rays.origins), -1)
-    return Rays(unit[..., :3], unit[..., 3:])
+def _by_ray_numbers(
+    field: RadianceField, rays: Rays, rates: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
+    """As ``_with_tangents``, by the derivatives in space at each sample: their sums along a ray are the pixel's
+    derivatives by the ray's origin, and weighted by distance those by its direction."""
+    positions, directions = sample_points(rays, samples)
+    unit = torch.eye(3, dtype=positions.dtype, device=positions.device)[:, None].expand(-1, len(samples), -1)
+    still = torch.zeros_like(unit)
+    moves, turns = (torch.cat([unit, still]), torch.cat([still, unit])) if field.directed else (unit, still)
+    queried = field.query_with_tangents(positions, directions, moves, turns)
+    pixels, by_origin, by_direction, of_colour = composite_with_gradient(*queried, samples)
+    if field.directed:
+        by_turn, of_colour = of_colour.split([3, len(of_colour) - 3])
+        by_direction = by_direction + torch.nn.functional.pad(by_turn, (0, 1))
+    moved = torch.einsum("mri,irc->mrc", rates.origins, by_origin)
+    moved += torch.einsum("mri,irc->mrc", rates.directions, by_direction)
+    return pixels, torch.cat([moved, torch.nn.functional.pad(of_colour, (0, 1))])
 
 
 @torch.no_grad()

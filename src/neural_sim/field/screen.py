@@ -13,6 +13,9 @@ from neural_sim.field.base import Span
 from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.types import PinholeCamera
 
+BLOCKS = 4
+"""A ball covers at least so many blocks of pixels to each side: larger ones would let rays pass far from it."""
+
 
 def coarse_centres(occupancy: Occupancy) -> tuple[Float[Tensor, "3 cells"], float]:
     """Centres of the occupied coarse cells and the radius of a ball round each, in object radii."""
@@ -31,9 +34,10 @@ def screen_span(
 ) -> Span:
     """Distances between which the rays of the image's ``rows`` can meet balls of ``radius`` round ``centres``.
 
-    Never too short; near > far where a pixel sees none. Each ball is drawn as one pixel, its nearest and farthest
-    distance; all are widened together by as many pixels as the largest one covers. Where a ball touches the plane of
-    the camera nothing is known, and every pixel gets all distances.
+    Never too short; near > far where a pixel sees none. Each ball is drawn as one block of pixels, its nearest and
+    farthest distance; all are widened together by as many blocks as the largest one covers. Blocks grow with the
+    balls, so that a large image needs no more memory than a small one. Where a ball touches the plane of the camera
+    nothing is known, and every pixel gets all distances.
     """
     rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
     x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)
@@ -49,16 +53,21 @@ def screen_span(
         whole = x.new_zeros(size[0] * size[1])
         return Span(whole, whole + math.inf)
     reach = math.ceil(focal * largest + 0.5)
-    wide = (size[0] + 2 * reach, size[1] + 2 * reach)
-    column = (focal * across + (0.5 * camera.width + reach)).clamp(0, wide[1] - 1)
-    row = (focal * down + (0.5 * camera.height + reach - rows.start)).clamp(0, wide[0] - 1)
-    pixel = torch.add(column.long(), row.long(), alpha=wide[1])
+    block = max(1, reach // BLOCKS)
+    margin = math.ceil(reach / block)
+    high, wide = (math.ceil(pixels / block) + 2 * margin for pixels in size)
+    column = ((focal * across + 0.5 * camera.width) / block + margin).clamp(0, wide - 1)
+    row = ((focal * down + (0.5 * camera.height - rows.start)) / block + margin).clamp(0, high - 1)
+    cell = torch.add(column.long(), row.long(), alpha=wide)
     distance = torch.sqrt(x * x + y * y + z * z)
-    bounds = x.new_full((2, wide[0] * wide[1]), -math.inf)
-    bounds[0].scatter_reduce_(0, pixel, radius - distance, "amax")
-    bounds[1].scatter_reduce_(0, pixel, radius + distance, "amax")
-    pooled = _sliding_max(_sliding_max(bounds.view(2, *wide), 1, 2 * reach + 1), 2, 2 * reach + 1).flatten(1)
-    return Span(-pooled[0], pooled[1])
+    bounds = x.new_full((2, high * wide), -math.inf)
+    bounds[0].scatter_reduce_(0, cell, radius - distance, "amax")
+    bounds[1].scatter_reduce_(0, cell, radius + distance, "amax")
+    pooled = _sliding_max(_sliding_max(bounds.view(2, high, wide), 1, 2 * margin + 1), 2, 2 * margin + 1)
+    for axis, pixels in enumerate(size, start=1):
+        pooled = pooled.index_select(axis, torch.arange(pixels, device=x.device) // block)
+    near, far = pooled.flatten(1)
+    return Span(-near, far)
 
 
 def _sliding_max(values: Float[Tensor, "2 h w"], axis: int, width: int) -> Float[Tensor, "2 h2 w2"]:
