@@ -12,15 +12,14 @@ from dataclasses import dataclass, field
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from worlds import World, centred, draw_bins  # beside this file
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.binding import image_losses, object_images
+from neural_sim.outer.still import StillLoop, centred
 from neural_sim.parameter.update import told_from_noise
-from neural_sim.synthesis.scene import RenderedObject, join
+from neural_sim.synthesis.scene import join
 from neural_sim.types import SceneDraw
 
 COUNTS = (16, 32, 64, 128)
@@ -35,14 +34,10 @@ class Variant:
     bin_mean: str = "circular"
     label_gradient: str = "differentiable"
 
-    def of(self, world: World) -> World:
-        (factor,) = world.scene.distribution.factors
-        distribution = dataclasses.replace(
-            world.scene.distribution, factors=(dataclasses.replace(factor, bin_mean=self.bin_mean),)
-        )
-        synthesizer = dataclasses.replace(world.scene.synthesizer, label_gradient=self.label_gradient)
-        scene = dataclasses.replace(world.scene, distribution=distribution, synthesizer=synthesizer)
-        return dataclasses.replace(world, scene=scene)
+    def of(self, world: StillLoop) -> StillLoop:
+        moved = world.with_factor(dataclasses.replace(world.factor, bin_mean=self.bin_mean))
+        synthesizer = dataclasses.replace(moved.scene.synthesizer, label_gradient=self.label_gradient)
+        return dataclasses.replace(moved, scene=dataclasses.replace(moved.scene, synthesizer=synthesizer))
 
 
 RELAXED = "circular, boxes"
@@ -68,7 +63,7 @@ class Result:
 
 
 def run_pathwise(
-    world: World, estimator: PathwiseEstimator, units: int, seed: int
+    world: StillLoop, estimator: PathwiseEstimator, units: int, seed: int
 ) -> tuple[Float[Tensor, "units objects k"], float]:
     """Estimates from ``UNIT`` images each, and the seconds an image took, drawing and rendering included.
 
@@ -77,27 +72,12 @@ def run_pathwise(
     generator, found = torch.Generator().manual_seed(seed), []
     began = time.process_time()
     for _ in range(units):
-        rendered = world.scene.training_set(world.psi, UNIT, generator, estimator.draws)
-        found.append(centred(differentiate(world, estimator, rendered)))
+        found.append(centred(world.pathwise(estimator, UNIT, generator)))
     return torch.stack(found), (time.process_time() - began) / (units * UNIT * len(world.psi))
 
 
-def differentiate(
-    world: World, estimator: PathwiseEstimator, rendered: list[RenderedObject]
-) -> list[MixedDerivative]:
-    """The estimate of every object, through the psi loop's binding."""
-    images = join(rendered)
-    targets = world.detector.assign(images.boxes, images.labels)
-    from_images = image_losses(world.detector, world.backbone, targets, images.labels)
-
-    losses = Losses(unavailable, from_images)
-    weights = torch.full((len(images),), len(rendered) / len(images))  # every object's own sum to 1
-    held = object_images(world.scene, rendered, world.psi, weights)
-    return [estimator.estimate(losses, world.trainable, world.vector, part, {}) for part in held.values()]
-
-
 def score(
-    world: World,
+    world: StillLoop,
     estimator: StratifiedEstimator | ReinforceEstimator,
     cached: CachedSet,
     drawn: Probes,
@@ -131,9 +111,12 @@ def pathwise_result(units: Tensor, seconds: float) -> Result:
     return result
 
 
-def run_stratified(world: World, pool: int) -> dict[str, Result]:
+def run_stratified(world: StillLoop, pool: int) -> dict[str, Result]:
     """Disjoint parts of ``pool`` images of every bin; as it is, and shrunk by its noise as the psi update does it."""
-    probes, cached, seconds = draw_bins(world, pool, torch.Generator().manual_seed(31))
+    began = time.process_time()
+    probed = world.probes(pool, torch.Generator().manual_seed(31))
+    seconds = (time.process_time() - began) / len(probed.cached)
+    cached, probes = probed.cached, [part[world.factor.name] for part in probed.probes]
     bins, plain, shrunk = world.scene.distribution.size, Result(), Result()
     for count in COUNTS:
         per_bin, values, kept = count // bins, [], []
@@ -152,7 +135,7 @@ def run_stratified(world: World, pool: int) -> dict[str, Result]:
     return {"stratified": plain, "stratified, shrunk": shrunk}
 
 
-def run_reinforce(world: World, pool: int) -> Result:
+def run_reinforce(world: StillLoop, pool: int) -> Result:
     """Disjoint parts of ``pool`` hard draws of every object."""
     began = time.process_time()
     parts = world.scene.training_set(world.psi, pool, torch.Generator().manual_seed(41))

@@ -34,35 +34,36 @@ from jaxtyping import Float
 from machine import machine
 from section import replace_section
 from torch import Tensor
-from worlds import WORLDS, Truth, World, hard_truth, make_world
+from worlds import WORLDS, Truth, hard_truth, make_world
 
 from neural_sim.cameras import orbit
 from neural_sim.gradient.pathwise import contract, draw_cotangents
+from neural_sim.outer.still import StillLoop
 from neural_sim.synthesis.motion import pose_rates
 from neural_sim.types import Maps, PinholeCamera
 
 
-def compare(world: World, repeats: int, truth_images: int) -> dict[str, Any]:
+def compare(name: str, world: StillLoop, repeats: int, truth_images: int) -> dict[str, Any]:
     """Every estimator on one world, with both truths."""
     hard = hard_truth(world, truth_images // world.scene.distribution.size, seed=21)
     base = PATHWISE[RELAXED]
     found, _ = run_pathwise(base.of(world), base.estimator, truth_images // UNIT, seed=22)
     relaxed = Truth(found.mean(0), found.std(0) / len(found) ** 0.5)
     results: dict[str, Result] = {}
-    for name, variant in PATHWISE.items():
+    for label, variant in PATHWISE.items():
         # Equal seeds: variants that draw alike see the same images. Reverse mode's numbers are the linear row's.
         rounds = 1 if variant.estimator.mode == "reverse" else repeats
         units = rounds * COUNTS[-1] // UNIT
         found, seconds = run_pathwise(variant.of(world), variant.estimator, units, seed=100)
-        results[f"pathwise: {name}"] = pathwise_result(found, seconds)
-        print(f"{world.name}: {name}, {seconds * 1e3:.1f} ms an image", flush=True)
+        results[f"pathwise: {label}"] = pathwise_result(found, seconds)
+        print(f"{name}: {label}, {seconds * 1e3:.1f} ms an image", flush=True)
     results |= run_stratified(world, repeats * COUNTS[-1] // world.scene.distribution.size)
     results["reinforce"] = run_reinforce(world, repeats * COUNTS[-1])
     truths = {"hard": hard, "relaxed": relaxed}
     p = world.scene.distribution.probabilities(world.psi)["pose"].float()
-    rows = [summary(name, result, count, truths, p) for name, result in results.items() for count in COUNTS]
+    rows = [summary(label, result, count, truths, p) for label, result in results.items() for count in COUNTS]
     return {
-        "world": world.name,
+        "world": name,
         "objects": list(world.scene.names),
         "solve": world.solve,
         "ceiling": {which: truth.ceiling for which, truth in truths.items()},
@@ -105,7 +106,7 @@ def _by_p(derivative: Tensor, p: Tensor) -> Tensor:
     return ratio - ratio.mean(-1, keepdim=True)
 
 
-def compare_modes(world: World, size: int = 96, count: int = 8) -> list[dict[str, float | str]]:
+def compare_modes(world: StillLoop, size: int = 96, count: int = 8) -> list[dict[str, float | str]]:
     """Seconds an image of the render and its derivative by one number of V, and how far the modes are apart."""
     scene = dataclasses.replace(
         world.scene, camera=PinholeCamera(size, size, world.scene.camera.field_of_view)
@@ -261,16 +262,18 @@ def main() -> None:
     if arguments.ycb:
         asked["ycb"] = [*WORLDS["ycb"], f"objects.root={arguments.ycb}"]
     began = time.perf_counter()
-    worlds = [make_world(name, [*overrides, *arguments.overrides]) for name, overrides in asked.items()]
-    modes = compare_modes(worlds[0])
-    found = [compare(world, arguments.repeats, arguments.truth_images) for world in worlds]
+    worlds = {name: make_world([*overrides, *arguments.overrides]) for name, overrides in asked.items()}
+    modes = compare_modes(worlds["embedded"])
+    found = [
+        compare(name, world, arguments.repeats, arguments.truth_images) for name, world in worlds.items()
+    ]
     settings = machine() | {
         "command": " ".join(
             ["python benchmarks/estimators.py", *(["--ycb ../shared/ycb"] if arguments.ycb else [])]
         ),
-        "per_bin": arguments.truth_images // worlds[0].scene.distribution.size,
+        "per_bin": arguments.truth_images // worlds["embedded"].factor.bins,
         "truth_images": arguments.truth_images,
-        "temperature": worlds[0].scene.distribution.factors[0].temperature,
+        "temperature": worlds["embedded"].factor.temperature,
         "repeats": arguments.repeats,
         "total_seconds": time.perf_counter() - began,
     }

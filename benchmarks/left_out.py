@@ -24,7 +24,6 @@ from render import measure as measure_render
 from render import variants
 from tolerance import State, shortened, state
 from torch import Tensor
-from worlds import draw_bins
 
 from neural_sim import codec
 from neural_sim.artifacts import Artifacts
@@ -119,28 +118,26 @@ def loops(made: Artifacts) -> list[Row]:
 def probes(made: Artifacts, at: State, v: Tensor, truth: Tensor, error: Tensor) -> list[Row]:
     """Scores by central differences, and probes from a pool of rendered bins in place of fresh renders."""
     per_bin, vector = made.x.gradient.probes_per_bin, unflatten(v, at.inner.params)
-    index = torch.cat([probe.index for probe in at.probes])
+    index = torch.cat([probe.index for held in at.probed.probes for probe in held.values()])
     rows = []
     for mode in ("forward", "central_difference"):
         spent, found = clocked(
-            lambda mode=mode: scores(at.probe_set.losses, at.inner.params, vector, index, 64, mode)
+            lambda mode=mode: scores(at.probed.cached.losses, at.inner.params, vector, index, 64, mode)
         )
         rows.append((spent, found))
     relative = float((rows[1][1] - rows[0][1]).norm() / rows[0][1].norm())
     pool_seconds, pool = clocked(
         lambda: ImagePool.render(made.scene, made.x.outer.pool_per_bin, torch.Generator().manual_seed(2)), 1
     )
-    world = at.world
-    fresh, _ = clocked(lambda: draw_bins(world, per_bin, torch.Generator().manual_seed(3)), 1)
+    loop = at.loop
+    fresh, _ = clocked(lambda: loop.probes(per_bin, torch.Generator().manual_seed(3)), 1)
     pooled, held = clocked(
         lambda: ProbeSet.draw(
-            pool, made.scene, world.detector, world.backbone, per_bin, world.psi,
+            pool, made.scene, loop.detector, loop.backbone, per_bin, loop.psi,
             torch.Generator().manual_seed(3), range(len(made.names)),
         ), 1,
     )  # fmt: skip
-    changed = dataclasses.replace(
-        at, probes=[next(iter(p.values())) for p in held.probes], probe_set=held.cached
-    )
+    changed = dataclasses.replace(at, probed=held)
     moved, own = changed.derivative(v)
     both = (error.square() + own.square()).sqrt()
     return [

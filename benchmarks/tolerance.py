@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +19,14 @@ from jaxtyping import Float
 from machine import machine
 from section import replace_section
 from torch import Tensor
-from worlds import World, draw_bins
 
 from neural_sim.artifacts import Artifacts
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem
-from neural_sim.gradient.mixed import scores
-from neural_sim.gradient.stratified import stratified
 from neural_sim.main import build, conf_directory
+from neural_sim.outer.probing import ProbeSet
+from neural_sim.outer.still import StillLoop
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos
@@ -43,20 +42,13 @@ class State:
 
     inner: InnerProblem
     b: Float[Tensor, "m"]
-    world: World
-    probes: list[Any]
-    probe_set: CachedSet
+    loop: StillLoop
+    probed: ProbeSet
 
     def derivative(self, v: Float[Tensor, "m"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """d/dpsi <dL_train/dtheta, v> of all objects, and its standard errors over probes."""
-        vector = unflatten(v, self.inner.params)
-        found = [
-            stratified(
-                scores(self.probe_set.losses, self.inner.params, vector, probe.index, 64), probe.bins,
-                self.world.psi[label].float(), self.world.scene.distribution.factors[0].log_probabilities,
-            )
-            for label, probe in enumerate(self.probes)
-        ]  # fmt: skip
+        held = replace(self.loop, vector=unflatten(v, self.inner.params))
+        found = held.over_bins(self.probed)
         return torch.cat([part.value for part in found]), torch.cat([part.standard_error for part in found])
 
     def krylov(self, subset: Tensor | None, steps: int) -> Krylov:
@@ -80,10 +72,10 @@ def state(made: Artifacts, which: str, seed: int) -> State:
     )  # fmt: skip
     trainable = detector.split(theta)[1]
     validation = CachedSet.of(detector, backbone, made.targets["val"])
-    world = World(which, made.scene, detector, backbone, trainable, {}, psi, "")
-    probes, probe_set, _ = draw_bins(world, made.x.gradient.probes_per_bin, generator)
+    loop = StillLoop(made.scene, detector, backbone, trainable, {}, psi, "not solved")
+    probed = loop.probes(made.x.gradient.probes_per_bin, generator)
     inner = InnerProblem(trainable, cached.losses, torch.full((len(cached),), 1.0 / len(cached)))
-    return State(inner, gradient(validation.mean_terms(), trainable), world, probes, probe_set)
+    return State(inner, gradient(validation.mean_terms(), trainable), loop, probed)
 
 
 def shortened(krylov: Krylov, steps: int) -> Krylov:

@@ -8,7 +8,7 @@ import neural_sim
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "cameras", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver",
          "gradient", "settings", "baseline", "outer", "stress", "store", "codec", "report", "experiment",
-         "plan", "methods", "artifacts", "pipeline", "main")  # fmt: skip
+         "plan", "methods", "artifacts", "pipeline", "studies", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -39,7 +39,9 @@ def test_rooms_import_from_earlier_rooms_only():
 def test_heavy_libraries_stay_in_their_rooms():
     homes = {
         "pyrender": {"renderer/mesh.py"},
-        "matplotlib": {"report/figures.py", "report/curves.py", "report/interpolation.py"},
+        "matplotlib": {
+            f"report/{name}.py" for name in ("figures", "curves", "interpolation", "temperatures")
+        },
         "mlflow": {"report/tracking.py"},
         "optuna": {"baseline/search.py"},
         "hydra": {"main.py"},

@@ -85,3 +85,14 @@ def test_the_way_between_two_lights_leaves_opacity_alone(folder):
     held = json.loads((folder / "way" / "interpolation.json").read_text())
     assert max(held["opacity_change"].values()) <= 1e-6
     assert (folder / "way" / "figures" / "interpolation.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_every_temperature_is_held_against_the_truth(folder):
+    _run(folder, "+experiment=gumbel_temperature", "scale=smoke", f"hydra.run.dir={folder / 'temperatures'}")
+    held = json.loads((folder / "temperatures" / "temperatures.json").read_text())
+    assert [truth["object"] for truth in held["truths"]] == ["pitcher", "drill"]
+    assert len(held["rows"]) == 12 and all(row["images"] > 0 for row in held["rows"])
+    cold = held["rows"][0]
+    assert cold["temperature"] == 0.01 and cold["shares"][6] > 0.8
+    assert (folder / "temperatures" / "figures" / "temperatures.png").stat().st_size > 5000

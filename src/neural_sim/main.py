@@ -225,14 +225,13 @@ def _task(config: DictConfig) -> float | None:
         if "compare" in config:
             return _compare(config, folder)
         experiment = build(config)
-        from neural_sim.pipeline import interpolate_lights, run
+        from neural_sim.pipeline import run
+        from neural_sim.studies import STUDIES
 
-        if "interpolation" in config:
-            interpolate_lights(
-                experiment, _instantiate(_plain(config)["interpolation"], "interpolation"), folder
-            )
-            return None
-        return run(experiment, folder)
+        asked = STUDIES.keys() & set(config)
+        for key in asked:
+            STUDIES[key](experiment, _instantiate(_plain(config)[key], key), folder)
+        return None if asked else run(experiment, folder)
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import resource
 import time
@@ -17,8 +16,6 @@ from tqdm import tqdm
 from neural_sim.artifacts import Artifacts
 from neural_sim.experiment import Experiment
 from neural_sim.plan import plan
-from neural_sim.report import figures
-from neural_sim.report.interpolation import Interpolation, interpolation_figure
 from neural_sim.report.run import (
     RunResults,
     write_detections,
@@ -125,23 +122,6 @@ class Pipeline:
         track(results, uri, folder)
         print(results.summary())
         print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
-
-
-def interpolate_lights(experiment: Experiment, interpolation: Interpolation, folder: Path) -> Path:
-    """The figure of ``+experiment=illumination_interpolation``, and how little opacity changed, in ``folder``."""
-    made, rig = Artifacts(experiment), experiment.views.rig
-    if rig is None:
-        raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
-    fields = dict(zip(made.names, made.scene.fields, strict=True))
-    camera = experiment.views.camera(interpolation.image_size)
-    ways = interpolation.ways(fields, made.scene.lit_renderer, camera, rig.anchors)
-    first, last = interpolation.ends
-    title = f"From light {first} to light {last}"
-    path = figures.save(interpolation_figure(ways, title), folder / "figures" / "interpolation.png")
-    changes = {name: way.opacity_change for name, way in ways.items()}
-    (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))
-    print(f"largest change of opacity: {max(changes.values()):.1e}\nresults: {folder}")
-    return path
 
 
 def _iteration_seconds(record: dict[str, Any]) -> float:

@@ -1,0 +1,133 @@
+"""The psi loop held still at one psi, detector and v, where estimators can be held against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NoReturn
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.gradient.base import Losses, MixedDerivative
+from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.gradient.stratified import stratified
+from neural_sim.outer.binding import image_losses, object_images
+from neural_sim.outer.probing import ProbeSet
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.flatten import unflatten
+from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class StillLoop:
+    """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta, and
+    ``solve`` says how that ended."""
+
+    scene: Scene
+    detector: Detector
+    backbone: Parameters
+    trainable: Parameters
+    vector: Parameters
+    psi: Float[Tensor, "objects K"]
+    solve: str
+
+    @staticmethod
+    def at(
+        scene: Scene,
+        detector: Detector,
+        theta: Parameters,
+        psi: Float[Tensor, "objects K"],
+        validation: LabelledImages,
+        solver: AdjointSolver,
+        images_per_object: int,
+        generator: torch.Generator,
+    ) -> StillLoop:
+        """v for the inner problem of fresh images from ``psi``, at ``theta``."""
+        backbone, trainable = detector.split(theta)
+        images = join(scene.training_set(psi, images_per_object, generator))
+        weights = torch.full((len(images),), 1.0 / len(images))
+        inner = InnerProblem(trainable, CachedSet.of(detector, backbone, images).losses, weights)
+        terms = CachedSet.of(detector, backbone, validation).mean_terms()
+        found = hypergradient(inner, terms, {}, solver, generator)
+        solution = found.solution
+        solve = (
+            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {found.damping.value:.2g}"
+        )
+        vector = unflatten(solution.value, trainable)
+        return StillLoop(scene, detector, backbone, trainable, vector, psi, solve)
+
+    def with_factor(self, factor: BinnedFactor) -> StillLoop:
+        """The same moment of a distribution whose only factor is ``factor``, which has the same bins."""
+        distribution = replace(self.scene.distribution, factors=(factor,))
+        return replace(self, scene=replace(self.scene, distribution=distribution))
+
+    @property
+    def factor(self) -> BinnedFactor:
+        """The distribution's only factor. Raises ``ValueError`` where there are more, or where it has no bins."""
+        factors = self.scene.distribution.factors
+        if len(factors) != 1 or not isinstance(factors[0], BinnedFactor):
+            names = [factor.name for factor in factors]
+            raise ValueError(
+                f"parameter: want one parameter with bins to hold estimators against, got {names}"
+            )
+        return factors[0]
+
+    def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
+        """``per_bin`` images of every bin of every object."""
+        objects = range(len(self.scene.names))
+        return ProbeSet.draw(
+            self.scene, self.scene, self.detector, self.backbone, per_bin, self.psi, generator, objects
+        )
+
+    def truth(self, per_bin: int, generator: torch.Generator) -> list[MixedDerivative]:
+        """The derivative over hard bins of every object, from ``per_bin`` images of each."""
+        return self.over_bins(self.probes(per_bin, generator))
+
+    def over_bins(self, probed: ProbeSet) -> list[MixedDerivative]:
+        """Sum over bins of dp_b/dpsi times the mean score <dl/dtheta, v> of the probes in bin b."""
+        name = self.factor.name
+        return [
+            stratified(
+                scores(probed.cached.losses, self.trainable, self.vector, probes[name].index),
+                probes[name].bins,
+                self.psi[label].float(),
+                self.factor.log_probabilities,
+            )
+            for label, probes in enumerate(probed.probes)
+        ]
+
+    def pathwise(
+        self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
+    ) -> list[MixedDerivative]:
+        """Every object's estimate from ``count`` relaxed draws of each."""
+        return self.differentiate(
+            estimator, self.scene.training_set(self.psi, count, generator, estimator.draws)
+        )
+
+    def differentiate(
+        self, estimator: PathwiseEstimator, rendered: list[RenderedObject]
+    ) -> list[MixedDerivative]:
+        """Every object's estimate from given images, through the psi loop's own binding."""
+        images = join(rendered)
+        targets = self.detector.assign(images.boxes, images.labels)
+        losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets, images.labels))
+        weights = torch.full((len(images),), len(rendered) / len(images))  # every object's own sum to 1
+        held = object_images(self.scene, rendered, self.psi, weights)
+        return [estimator.estimate(losses, self.trainable, self.vector, part, {}) for part in held.values()]
+
+
+def centred(found: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
+    """Logits have a free constant: derivatives are compared without their mean."""
+    values = torch.stack([part.value for part in found])
+    return values - values.mean(-1, keepdim=True)
+
+
+def _unavailable(*_: object) -> NoReturn:
+    raise AssertionError("a pathwise estimator asked for losses from cached features")
