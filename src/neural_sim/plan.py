@@ -60,8 +60,8 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
     estimator = x.gradient
     name = type(estimator).__name__.removesuffix("Estimator").lower()
     if isinstance(estimator.draws, HardDraws):
-        what = "the renderer's derivative" if x.distribution.light is None else "the camera's derivative"
-        yield Omission("psi", what, f"gradient={name} scores images and differentiates none by pose", 1.0)
+        why = f"gradient={name} scores images and differentiates none"
+        yield Omission("psi", "the renderer's derivative", why, 1.0)
     elif x.synthesis.label_gradient == "ignored":
         yield Omission(
             "psi", "the boxes' derivative", "synthesis.label_gradient=ignored, as in the paper", 1.0

@@ -15,6 +15,7 @@ from neural_sim.outer.binding import bound_losses, image_losses, object_images
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.illumination import Illumination, ProjectedGradient
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
@@ -51,11 +52,8 @@ def _scene(dtype=torch.float32, parameters=None):
     return Scene(("a", "b"), fields, NerfWRenderer(), camera, synthesizer, SceneDistribution.of(parameters))
 
 
-@pytest.mark.parametrize(
-    "estimator", [StratifiedEstimator(), PathwiseEstimator()], ids=lambda e: type(e).__name__
-)
-def test_the_derivative_by_weights_against_central_differences(estimator):
-    scene, generator = _scene(DOUBLE), torch.Generator().manual_seed(0)
+def test_the_derivative_by_weights_against_central_differences():
+    scene, generator, estimator = _scene(DOUBLE), torch.Generator().manual_seed(0), PathwiseEstimator()
     detector = Detector(2, 32, **DETECTOR)
     params = {name: value.double() for name, value in detector.init(generator).items()}
     backbone, trainable = detector.split(params)
@@ -88,6 +86,50 @@ def test_the_derivative_by_weights_against_central_differences(estimator):
             step[i] = 1e-5
             slope = (objective(label, psi[label] + step) - objective(label, psi[label] - step)) / 2e-5
             assert float(found[i]) == pytest.approx(slope, rel=1e-5, abs=1e-9)
+
+
+def test_probes_are_the_same_scenes_under_one_light_after_the_other():
+    scene = _scene(DOUBLE, [Pose(bins=3), Illumination(anchors=ANCHORS)])
+    psi = scene.distribution.psi("initial", ["a"])[0]
+    part = scene.probes(0, "illumination", 5, psi, torch.Generator().manual_seed(0))
+    assert torch.equal(part.draw.weights, torch.eye(ANCHORS, dtype=DOUBLE).repeat_interleave(5, 0))
+    for values in (part.draw.phi, part.draw.bins[:, 0], part.opacity):
+        assert torch.equal(values[:5], values[5:10]) and len(values[:5].flatten().unique()) > 1
+    first, second = part.images.images[:5], part.images.images[5:10]
+    seen = (part.opacity[:5] > 0.0)[:, None].expand_as(first)
+    # Sensor noise and backgrounds are shared, so that only the object's own pixels differ.
+    assert torch.equal(first[~seen], second[~seen]) and not torch.equal(first[seen], second[seen])
+
+
+def test_the_derivative_across_lights_is_that_of_a_mixture():
+    """d/dw_i of sum_j w_j s_j, s_j the mean <dl/dtheta, v> of images under light j, against autograd of that sum."""
+    scene, generator = _scene(DOUBLE), torch.Generator().manual_seed(0)
+    detector = Detector(2, 32, **DETECTOR)
+    params = {name: value.double() for name, value in detector.init(generator).items()}
+    backbone, trainable = detector.split(params)
+    vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
+    psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
+    rendered = scene.training_set(psi, 3, generator)
+    probed = ProbeSet.draw(scene, scene, detector, backbone, 4, psi, generator, range(2))
+    cached = CachedSet.of(detector, backbone, join(rendered))
+    losses = bound_losses(cached, backbone, join(rendered).labels, probed.cached)
+    held = object_images(scene, rendered, psi, torch.full((6,), 1.0 / 6, dtype=DOUBLE))
+    estimator = StratifiedEstimator(4)
+    for label, name in enumerate(scene.names):
+        found = estimator.estimate(losses, trainable, vector, held[name], probed.probes[label])
+        index = probed.probes[label]["illumination"].index
+
+        def mixed(weights, index=index):
+            shares = weights.repeat_interleave(4) / 4
+            leaves = {key: value.detach().requires_grad_() for key, value in trainable.items()}
+            loss = (probed.cached.losses(leaves, index) * shares).sum()
+            slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
+            return sum((g * v).sum() for g, v in zip(slopes, vector.values(), strict=True))
+
+        weights = psi[label].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(mixed(weights), weights)
+        torch.testing.assert_close(found.value, 0.5 * (slope - slope.mean()), rtol=1e-9, atol=1e-12)
+        assert bool((found.standard_error > 0.0).all())
 
 
 @pytest.mark.parametrize(

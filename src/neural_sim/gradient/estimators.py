@@ -12,19 +12,21 @@ from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Para
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.stratified import stratified
+from neural_sim.gradient.stratified import across_lights, stratified
+from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.synthesis.scene import HardDraws
 
 
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Mean scores of every bin of every factor from images drawn from it on purpose, see :mod:`gradient.stratified`.
+    """Mean scores of every bin of every factor, and under every anchor light, from images drawn from it on purpose, see
+    :mod:`gradient.stratified`.
 
     An outer iteration pays one Jacobian-vector product over the predictor for its probes, taken as ``theta_mode`` says
     (see :func:`gradient.mixed.scores`).
     """
 
-    draws: ClassVar[HardDraws] = HardDraws(light_tangents=True)
+    draws: ClassVar[HardDraws] = HardDraws()
     probes_per_bin: int = 8
     chunk_size: int = 64
     theta_mode: ThetaMode = "forward"
@@ -47,42 +49,25 @@ class StratifiedEstimator:
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
         distribution = images.distribution
-        parts: dict[str, MixedDerivative] = {}
-        if distribution.binned:
-            parts |= self._binned(losses, params, vector, images, probes)
-        if distribution.light is not None:
-            # A light has no bins: its images carry their derivatives by its weights.
-            along = PathwiseEstimator(chunk_size=self.chunk_size).estimate(losses, params, vector, images, {})
-            values, errors = (distribution.split(x) for x in (along.value, along.standard_error))
-            name = distribution.light.name
-            parts[name] = MixedDerivative(values[name], errors[name])
+        if losses.probes is None or set(probes) != set(distribution.names):
+            raise ValueError(
+                f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
+            )
+        share, psi, parts = float(images.weights.sum()), distribution.split(images.psi), {}
+        for factor in distribution.factors:
+            held = probes[factor.name]
+            along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
+            along = along.to(images.psi.dtype)
+            if isinstance(factor, BinnedFactor):
+                parts[factor.name] = stratified(
+                    along, held.bins, psi[factor.name], factor.log_probabilities, share
+                )
+            else:
+                parts[factor.name] = across_lights(along, factor.size, share)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
         )
-
-    def _binned(
-        self,
-        losses: Losses,
-        params: Params,
-        vector: Params,
-        images: ObjectImages,
-        probes: Mapping[str, Probes],
-    ) -> dict[str, MixedDerivative]:
-        factors = images.distribution.binned
-        if losses.probes is None or set(probes) != {factor.name for factor in factors}:
-            raise ValueError(
-                f"stratified: wants probes of {[f.name for f in factors]}, which it scores, got {list(probes)}"
-            )
-        share, psi, parts = float(images.weights.sum()), images.distribution.split(images.psi), {}
-        for factor in factors:
-            held = probes[factor.name]
-            along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            along = along.to(images.psi.dtype)
-            parts[factor.name] = stratified(
-                along, held.bins, psi[factor.name], factor.log_probabilities, share
-            )
-        return parts
 
 
 @dataclass(frozen=True)

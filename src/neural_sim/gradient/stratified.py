@@ -85,6 +85,25 @@ def stratified(
     return MixedDerivative(share * (means @ slopes), share * spread.sum(0).sqrt())
 
 
+def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -> MixedDerivative:
+    """``share * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: the derivative by the weights of lights
+    read as the shares of the images under each, up to what is common to all, which the constraint takes back.
+
+    ``scores`` are those of the same scenes under one light after the other. Where one light is bent all the way into
+    another, the derivative by the blend of light in every image (``gradient=pathwise``) says little: a detector that
+    never saw the other light gains nothing from a trace of it. docs/numerics.md has both beside the truth.
+    """
+    if lights < 1 or scores.ndim != 1 or scores.numel() == 0 or scores.numel() % lights:
+        raise ValueError(
+            f"stratified: want equally many scores under each of {lights} lights, got shape {tuple(scores.shape)}"
+        )
+    table = scores.view(lights, -1)
+    apart = table - table.mean(0)
+    count = table.shape[1]
+    error = apart.std(1) / count**0.5 if count > 1 else torch.full_like(apart[:, 0], torch.inf)
+    return MixedDerivative(share * apart.mean(1), share * error)
+
+
 def _variance_of_means(residuals: Tensor, bins: Tensor, counts: Tensor) -> Float[Tensor, "k"]:
     squares = torch.zeros_like(counts).index_add_(0, bins, residuals.square())
     freedom = counts - 1.0

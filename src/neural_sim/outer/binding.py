@@ -40,20 +40,18 @@ def bound_losses(
 
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPath:
-    """How one object's images came from psi: the relaxed draw, or a hard one that psi's light still moves.
+    """How one object's images came from psi by a relaxed draw.
 
-    Raises ``ValueError`` for images that were not drawn afresh.
+    Raises ``ValueError`` for images that did not.
     """
     noise, relaxed = part.noise, part.relaxed
-    if noise is None:
-        raise ValueError("pathwise: these images were not drawn from psi afresh")
+    if noise is None or relaxed is None:
+        raise ValueError("pathwise: these images were not drawn from psi by a relaxed draw")
 
-    # All of an object's images are under psi's light, unless lights were explored, which nothing differentiates.
+    # All of an object's images are under psi's light.
     light = {} if part.draw.weights is None else {"weights": part.draw.weights[0]}
 
     def replay(psi: Tensor) -> SceneDraw:
-        if relaxed is None:
-            return scene.distribution.lit(part.draw, psi)
         return scene.distribution.relaxed(psi, noise, relaxed.relaxation)
 
     def compose(rgb: Tensor, opacity: Tensor) -> LabelledImages:
@@ -89,7 +87,7 @@ def object_images(
             index=index,
             weights=weights[index],
             draw=part.draw,
-            path=rendered_path(scene, label, part) if part.relaxed or part.tangents else None,
+            path=rendered_path(scene, label, part) if part.relaxed else None,
             group=part.relaxed.group if part.relaxed else 1,
         )
     return bound

@@ -156,7 +156,7 @@ class SimulatorModule(OuterLoop):
     def _draw_probes(self) -> None:
         """New probes, or a part of them, so that what is peculiar to some does not push psi the same way for ever."""
         every = self.estimator.probes_per_bin
-        if not every or not self.scene.distribution.binned:
+        if not every:
             return
         if self._probes is None:
             self._probes = self._every_bin(every, self.inner.generator, self._learned)

@@ -44,7 +44,7 @@ class Interpolation:
         ValueError: ends that are not two different lights, fewer than two steps or one pixel.
     """
 
-    ends: tuple[int, int] = (1, 6)
+    ends: tuple[int, int] = (1, 5)
     steps: int = 7
     image_size: int = 128
     phi_deg: float = 75.0

@@ -55,13 +55,8 @@ class RelaxedDraws:
 
 @dataclass(frozen=True)
 class HardDraws:
-    """How images are drawn whose bins are scored, not differentiated.
+    """Exact samples of p_psi. ``explore``: lights around psi's, for estimators that need a density."""
 
-    ``light_tangents``: where lights are weighed, the maps' derivatives by the weights ride along. ``explore``: lights
-    around psi's, for estimators that need a density.
-    """
-
-    light_tangents: bool = False
     explore: bool = False
 
 
@@ -136,7 +131,7 @@ class Scene:
         return self.renderer
 
     def _compose(
-        self, label: int, draw: SceneDraw, noise: SceneNoise, maps: Maps, nuisance: Nuisance
+        self, label: int, draw: SceneDraw, noise: SceneNoise | None, maps: Maps, nuisance: Nuisance
     ) -> RenderedObject:
         bins = self.distribution.label_of(draw)
         with torch.no_grad():
@@ -161,11 +156,7 @@ class Scene:
             return self._draw_relaxed(label, logits, count, generator, how)
         noise = self.distribution.draw_noise(count, generator, self.dtype(label), explore=how.explore)
         draw = self.distribution.hard(logits, noise)
-        if not how.light_tangents or self.distribution.light is None:
-            return self.render(label, draw, noise, generator)
-        maps, tangents = self._maps_with_tangents(label, draw, ())
-        nuisance = self.synthesizer.draw_nuisance(count, self.camera, generator)
-        return replace(self._compose(label, draw, noise, maps, nuisance), tangents=tangents)
+        return self.render(label, draw, noise, generator)
 
     def _maps_with_tangents(
         self, label: int, draw: SceneDraw, names: tuple[str, ...]
@@ -217,12 +208,27 @@ class Scene:
     def probes(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
-        """``per_bin`` images from every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
-        size = next(f.bins for f in self.distribution.binned if f.name == factor)
-        bins = torch.arange(size).repeat_interleave(per_bin)
-        noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
+        """``per_bin`` images from every bin of a factor on purpose, in the order of its bins; the rest from p_psi.
+
+        Of an illumination the anchor lights take the place of bins, and the same ``per_bin`` poses and backgrounds are
+        seen under each.
+        """
+        size = next(f.size for f in self.distribution.factors if f.name == factor)
+        bins, light = torch.arange(size).repeat_interleave(per_bin), self.distribution.light
         logits = psi.detach().to(self.dtype(label))
-        return self.render(label, self.distribution.stratum(factor, bins, logits, noise), noise, generator)
+        if light is None or factor != light.name:
+            noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
+            return self.render(
+                label, self.distribution.stratum(factor, bins, logits, noise), noise, generator
+            )
+        noise, again = (
+            self.distribution.draw_noise(per_bin, generator, self.dtype(label)),
+            torch.arange(per_bin).repeat(size),
+        )
+        draw = self.distribution.hard(logits, noise).select(again)
+        draw = replace(draw, weights=torch.eye(size, dtype=logits.dtype)[bins])
+        nuisance = self.synthesizer.draw_nuisance(per_bin, self.camera, generator).select(again)
+        return self._compose(label, draw, None, self._maps(label, draw), nuisance)
 
 
 def join(parts: Sequence[RenderedObject]) -> LabelledImages:
