@@ -35,7 +35,7 @@ class Variant:
     label_gradient: str = "differentiable"
 
     def of(self, world: StillLoop) -> StillLoop:
-        moved = world.with_factor(dataclasses.replace(world.factor, bin_mean=self.bin_mean))
+        moved = world.with_factor(dataclasses.replace(world.bins, bin_mean=self.bin_mean))
         synthesizer = dataclasses.replace(moved.scene.synthesizer, label_gradient=self.label_gradient)
         return dataclasses.replace(moved, scene=dataclasses.replace(moved.scene, synthesizer=synthesizer))
 

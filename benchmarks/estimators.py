@@ -271,9 +271,9 @@ def main() -> None:
         "command": " ".join(
             ["python benchmarks/estimators.py", *(["--ycb ../shared/ycb"] if arguments.ycb else [])]
         ),
-        "per_bin": arguments.truth_images // worlds["embedded"].factor.bins,
+        "per_bin": arguments.truth_images // worlds["embedded"].bins.bins,
         "truth_images": arguments.truth_images,
-        "temperature": worlds["embedded"].factor.temperature,
+        "temperature": worlds["embedded"].bins.temperature,
         "repeats": arguments.repeats,
         "total_seconds": time.perf_counter() - began,
     }

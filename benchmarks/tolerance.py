@@ -48,7 +48,7 @@ class State:
     def derivative(self, v: Float[Tensor, "m"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """d/dpsi <dL_train/dtheta, v> of all objects, and its standard errors over probes."""
         held = replace(self.loop, vector=unflatten(v, self.inner.params))
-        found = held.over_bins(self.probed)
+        found = held.over_strata(self.probed)
         return torch.cat([part.value for part in found]), torch.cat([part.standard_error for part in found])
 
     def krylov(self, subset: Tensor | None, steps: int) -> Krylov:

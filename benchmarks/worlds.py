@@ -12,6 +12,7 @@ from torch import Tensor
 from neural_sim.artifacts import Artifacts
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.still import StillLoop, centred
+from neural_sim.synthesis.scene import join
 
 SMALL = [
     "scale=quick", "progress=false", "training.image_size=64", "views.count=84",
@@ -28,10 +29,10 @@ def make_world(overrides: list[str]) -> StillLoop:
     """Fields and detector from the store, or made now; v by the configured solver."""
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         made = Artifacts(build(compose("config", [*SMALL, *overrides])))
-    return StillLoop.at(
-        made.scene, made.detector, made.warm_start(), made.psi("initial"), made.targets["val"], made.x.solver,
-        made.x.outer.images_per_object, torch.Generator().manual_seed(11),
-    )  # fmt: skip
+    psi, generator = made.psi("initial"), torch.Generator().manual_seed(11)
+    images = join(made.scene.training_set(psi, made.x.outer.images_per_object, generator))
+    theta, validation = made.warm_start(), made.targets["val"]
+    return StillLoop.at(made.scene, made.detector, theta, psi, images, validation, made.x.solver, generator)
 
 
 @dataclass(frozen=True)

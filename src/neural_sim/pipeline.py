@@ -99,7 +99,7 @@ class Pipeline:
         for iteration, psi in self.made.scored_iterations().items():
             spent = {
                 key: sum(record[key] for record in records[:iteration])
-                for key in ("images", "detector_steps", "products")
+                for key in ("images", "detector_steps", "products", "cpu_seconds")
             }
             seconds = sum(_iteration_seconds(record) for record in records[:iteration])
             ap = self.made.scores(psi, f"psi after {iteration} iterations")["ap"]

@@ -19,6 +19,7 @@ from neural_sim.report import figures
 from neural_sim.report.interpolation import Interpolation, interpolation_figure
 from neural_sim.report.temperatures import report_temperatures
 from neural_sim.report.tracking import tracking_uri
+from neural_sim.synthesis.scene import join
 
 
 def interpolate_lights(experiment: Experiment, interpolation: Interpolation, folder: Path) -> None:
@@ -43,10 +44,12 @@ def vary_temperature(experiment: Experiment, temperatures: Temperatures, folder:
     if not isinstance(experiment.gradient, PathwiseEstimator):
         raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
     begun, made, images = time.perf_counter(), Artifacts(experiment), experiment.outer.images_per_object
+    psi, generator = made.psi("initial"), torch.Generator().manual_seed(experiment.seed)
+    drawn = join(made.scene.training_set(psi, images, generator))
+    theta, validation = made.warm_start(), made.targets["val"]
     loop = StillLoop.at(
-        made.scene, made.detector, made.warm_start(), made.psi("initial"), made.targets["val"],
-        experiment.solver, images, torch.Generator().manual_seed(experiment.seed),
-    )  # fmt: skip
+        made.scene, made.detector, theta, psi, drawn, validation, experiment.solver, generator
+    )
     rows, truths = temperatures.measure(loop, experiment.gradient, images, experiment.seed)
     uri = tracking_uri(experiment.mlflow)
     report_temperatures(rows, truths, experiment.name, experiment.seed, experiment.config, uri, folder)

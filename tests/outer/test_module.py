@@ -70,6 +70,7 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     assert first.entropies["pose"] == pytest.approx([math.log(4)] * 2)
     assert math.isfinite(first.validation_loss) and first.certificate.damping > 0
     assert {"render", "train", "hypergradient", "hypergradient_solve"} <= set(first.seconds)
+    assert all(record.cpu_seconds > 0.0 for record in learned.records)
     assert torch.isfinite(learned.last).all() and (learned.last != 0).any()
     assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()
 

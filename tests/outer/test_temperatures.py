@@ -58,7 +58,8 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
     )
     theta, validation = detector.init(generator), join(scene.training_set(psi, 3, generator))
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
-    loop = StillLoop.at(scene, detector, theta, psi, validation, solver, 4, generator)
+    images = join(scene.training_set(psi, 4, generator))
+    loop = StillLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
     rows, truths = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100).measure(
         loop, PathwiseEstimator(), 4, seed=0
     )

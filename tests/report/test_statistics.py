@@ -20,9 +20,12 @@ def matches(share, seed=0):
 
 def run(method, seed, learned, seconds=(10.0, 100.0)):
     curve = [
-        {"seconds": s, "images": 10 * s, "detector_steps": 1, "products": 0, "ap": {"per_class": {"mug": ap}}}
+        {
+            "seconds": s, "cpu_seconds": 100.0 - s, "images": 10 * s, "detector_steps": 1, "products": 0,
+            "ap": {"per_class": {"mug": ap}},
+        }
         for s, ap in zip((0.0, *seconds), (0.2, 0.5 * (0.2 + learned), learned), strict=True)
-    ]
+    ]  # fmt: skip
     results = {
         "method": method, "seed": seed, "experiment": "gap", "gap": "disjoint", "biased": ["mug"], "curve": curve,
     }  # fmt: skip
@@ -73,4 +76,11 @@ def test_who_reaches_the_same_sooner_has_the_larger_area():
     found = compare(runs, "ours", draws=20)
     # Over two decades from 1 to 100 s: ours has 0.45 then 0.7, the other 0.2 then 0.45.
     assert found.area["other"].value == pytest.approx(0.25) and found.area["other"].certain
-    np.testing.assert_allclose(biased_ap(runs[0])[1], [0.2, 0.45, 0.7])
+    np.testing.assert_allclose(biased_ap(runs[0], "seconds")[1], [0.2, 0.45, 0.7])
+
+
+def test_processor_time_is_another_clock():
+    runs = [run("ours", 0, 0.7, (10.0, 90.0)), run("other", 0, 0.4, (10.0, 20.0))]
+    found = compare(runs, "ours", draws=5, clock="cpu_seconds")
+    assert found.spent["ours"]["cpu_seconds"] == 10.0 and "seconds" not in found.spent["ours"]
+    np.testing.assert_allclose(biased_ap(runs[1], "cpu_seconds")[0], [100.0, 90.0, 80.0])

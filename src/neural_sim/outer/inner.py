@@ -40,7 +40,8 @@ class InnerLoop:
     The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each time
     an iteration asks. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how
     the method wants images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all
-    others come from a pool of every bin. ``images`` and ``steps`` count labelled images made and optimiser steps.
+    others come from a pool of every bin. ``images`` and ``steps`` count labelled images made and optimiser steps;
+    ``cpu_begun`` is the processor time at which the pool was begun.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class InnerLoop:
         self.validation = CachedSet.of(detector, self.backbone, validation)
         self.draws = draws
         self.pool: ImagePool | None = None
-        begun = time.perf_counter()
+        begun, self.cpu_begun = time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self.pool_seconds = time.perf_counter() - begun

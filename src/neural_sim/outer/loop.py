@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 
 import lightning.pytorch as pl
@@ -32,7 +33,7 @@ class OuterLoop(pl.LightningModule):
         self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
         self.records: list[IterationRecord] = []
         self.trajectory = [self.psi.detach().clone()]
-        self._counted = (0, 0)
+        self._counted, self._cpu = (0, 0), inner.cpu_begun
 
     def configure_optimizers(self) -> None:
         return None
@@ -52,7 +53,7 @@ class OuterLoop(pl.LightningModule):
     ) -> IterationRecord:
         """Keep what an iteration did with images drawn from ``psi``, before any step."""
         p_by_factor = self.scene.distribution.probabilities(psi.detach())
-        done = (self.inner.images, self.inner.steps)
+        done, cpu = (self.inner.images, self.inner.steps), time.process_time()
         if not self.records:
             seconds = {"pool": self.inner.pool_seconds, **seconds}
         self.records.append(
@@ -70,9 +71,10 @@ class OuterLoop(pl.LightningModule):
                 products=products,
                 images_without_box=int((~images.present.any(-1)).sum()),
                 seconds=seconds,
+                cpu_seconds=cpu - self._cpu,
             )
         )
-        self._counted = done
+        self._counted, self._cpu = done, cpu
         number, last = len(self.records), self.records[-1]
         if certificate is None:
             logger.info("round %d/%d val %.4f", number, self.rounds, last.validation_loss)

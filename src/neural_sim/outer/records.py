@@ -16,7 +16,9 @@ class IterationRecord:
     the step.
 
     ``images`` are the labelled images made in it, probes included, ``detector_steps`` the optimiser steps and
-    ``products`` the Hessian products spent. ``certificate`` is None for methods without a hypergradient.
+    ``products`` the Hessian products spent. ``seconds`` are by phase and by the clock on the wall, ``cpu_seconds``
+    those that all processor cores together worked, which other processes on the machine disturb less.
+    ``certificate`` is None for methods without a hypergradient.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -30,6 +32,7 @@ class IterationRecord:
     products: int
     images_without_box: int
     seconds: dict[str, float]
+    cpu_seconds: float
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ from neural_sim.gradient.base import Losses, MixedDerivative
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.stratified import stratified
+from neural_sim.gradient.stratified import across_lights, stratified
 from neural_sim.outer.binding import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.product import Factor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.flatten import unflatten
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
@@ -44,14 +45,13 @@ class StillLoop:
         detector: Detector,
         theta: Parameters,
         psi: Float[Tensor, "objects K"],
+        images: LabelledImages,
         validation: LabelledImages,
         solver: AdjointSolver,
-        images_per_object: int,
         generator: torch.Generator,
     ) -> StillLoop:
-        """v for the inner problem of fresh images from ``psi``, at ``theta``."""
+        """v for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
         backbone, trainable = detector.split(theta)
-        images = join(scene.training_set(psi, images_per_object, generator))
         weights = torch.full((len(images),), 1.0 / len(images))
         inner = InnerProblem(trainable, CachedSet.of(detector, backbone, images).losses, weights)
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
@@ -69,15 +69,20 @@ class StillLoop:
         return replace(self, scene=replace(self.scene, distribution=distribution))
 
     @property
-    def factor(self) -> BinnedFactor:
-        """The distribution's only factor. Raises ``ValueError`` where there are more, or where it has no bins."""
+    def factor(self) -> Factor:
+        """The distribution's only factor. Raises ``ValueError`` where there are more."""
         factors = self.scene.distribution.factors
-        if len(factors) != 1 or not isinstance(factors[0], BinnedFactor):
+        if len(factors) != 1:
             names = [factor.name for factor in factors]
-            raise ValueError(
-                f"parameter: want one parameter with bins to hold estimators against, got {names}"
-            )
+            raise ValueError(f"parameter: want one parameter to hold estimators against, got {names}")
         return factors[0]
+
+    @property
+    def bins(self) -> BinnedFactor:
+        """The only factor, which must have bins. Raises ``ValueError`` for another."""
+        if not isinstance(self.factor, BinnedFactor):
+            raise ValueError(f"parameter: want one parameter with bins, got {self.factor.name}")
+        return self.factor
 
     def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
         """``per_bin`` images of every bin of every object."""
@@ -88,20 +93,19 @@ class StillLoop:
 
     def truth(self, per_bin: int, generator: torch.Generator) -> list[MixedDerivative]:
         """The derivative over hard bins of every object, from ``per_bin`` images of each."""
-        return self.over_bins(self.probes(per_bin, generator))
+        return self.over_strata(self.probes(per_bin, generator))
 
-    def over_bins(self, probed: ProbeSet) -> list[MixedDerivative]:
-        """Sum over bins of dp_b/dpsi times the mean score <dl/dtheta, v> of the probes in bin b."""
-        name = self.factor.name
-        return [
-            stratified(
-                scores(probed.cached.losses, self.trainable, self.vector, probes[name].index),
-                probes[name].bins,
-                self.psi[label].float(),
-                self.factor.log_probabilities,
-            )
-            for label, probes in enumerate(probed.probes)
-        ]
+    def over_strata(self, probed: ProbeSet) -> list[MixedDerivative]:
+        """Every object's stratified estimate, from the scores <dl/dtheta, v> of the probes in each bin or light."""
+        return [self._stratified(probed, label) for label in range(len(probed.probes))]
+
+    def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
+        factor = self.factor
+        held = probed.probes[label][factor.name]
+        along = scores(probed.cached.losses, self.trainable, self.vector, held.index)
+        if isinstance(factor, BinnedFactor):
+            return stratified(along, held.bins, self.psi[label].float(), factor.log_probabilities)
+        return across_lights(along, factor.size)
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator

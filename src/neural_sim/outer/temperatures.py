@@ -79,7 +79,7 @@ class Temperatures:
         self, loop: StillLoop, estimator: PathwiseEstimator, images: int, seed: int
     ) -> tuple[list[AtTemperature], list[Truth]]:
         """Every object at every temperature, estimates from ``images`` images each; and the truth."""
-        names, bins = loop.scene.names, loop.factor.bins
+        names, bins = loop.scene.names, loop.bins.bins
         hard = loop.truth(self.truth_per_bin, torch.Generator().manual_seed(seed))
         truth, errors = centred(hard), torch.stack([part.standard_error for part in hard])
         truths = [
@@ -88,19 +88,19 @@ class Temperatures:
                 float(truth[label].norm()),
                 float(errors[label].norm()),
                 float(errors[label].norm()) * math.sqrt(self.truth_per_bin * bins / images),
-                loop.factor.log_probabilities(loop.psi[label]).exp().tolist(),
+                loop.bins.log_probabilities(loop.psi[label]).exp().tolist(),
             )
             for label, name in enumerate(names)
         ]
         rows = []
         for value in self.values:
-            moved = loop.with_factor(replace(loop.factor, temperature=value))
+            moved = loop.with_factor(replace(loop.bins, temperature=value))
             generator = torch.Generator().manual_seed(seed + 1)  # the same noise at every temperature
             found = torch.stack(
                 [centred(moved.pathwise(estimator, images, generator)) for _ in range(self.rounds)]
             )
             for label, name in enumerate(names):
-                shares = bin_shares(moved.factor, moved.psi[label], self.draws, seed + 2)
+                shares = bin_shares(moved.bins, moved.psi[label], self.draws, seed + 2)
                 rows.append(
                     AtTemperature(
                         name, value, shares, *against(found[:, label], truth[label], errors[label]), images

@@ -7,12 +7,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from neural_sim.report import figures, tracking
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, finished_runs
-from neural_sim.report.statistics import BOUNDS, Comparison, Estimate, compare
+from neural_sim.report.statistics import BOUNDS, Clock, Comparison, Estimate, compare
 
 
 @dataclass(frozen=True)
@@ -23,26 +23,30 @@ class Compare:
         experiments: MLflow experiments whose runs are compared, each by itself and at each gap.
         reference: the method that the others are held against.
         draws: of the bootstrap.
+        clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
 
     Raises:
-        ValueError: no experiment, or fewer than two draws.
+        ValueError: no experiment, fewer than two draws, or another clock.
     """
 
     experiments: tuple[str, ...]
     reference: str = "neural_sim"
     draws: int = 300
+    clock: Clock = "seconds"
 
     def __post_init__(self) -> None:
         if not self.experiments or self.draws < 2:
             raise ValueError(
                 f"compare: want experiments and at least 2 draws, got {list(self.experiments)}, {self.draws}"
             )
+        if self.clock not in get_args(Clock):
+            raise ValueError(f"compare.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
     def run(self, uri: str, seed: int, config: Mapping[str, Any], folder: Path) -> list[Comparison]:
         """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow."""
         runs = finished_runs(uri, self.experiments)
         settings = {run.setting: [other for other in runs if other.setting == run.setting] for run in runs}
-        found = [compare(held, self.reference, self.draws, seed) for held in settings.values()]
+        found = [compare(held, self.reference, self.draws, seed, self.clock) for held in settings.values()]
         folder.mkdir(parents=True, exist_ok=True)
         document = [dataclasses.asdict(comparison) for comparison in found]
         (folder / "compare.json").write_text(json.dumps(document, indent=1))
@@ -76,7 +80,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
         + (" (one seed: over images alone)." if count == 1 else "."),
         "",
         f"| method | AP | of the gap won back | {c.reference} ahead by | area ahead by "
-        "| images | detector steps | seconds |",
+        "| images | detector steps | " + ("seconds" if c.clock == "seconds" else "CPU seconds") + " |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for bound in BOUNDS:
@@ -87,7 +91,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
         spent = c.spent[method]
         lines.append(
             f"| {method} | {points(c.ap[method])} | {points(c.won_back[method], '%')} | {ahead} | {area} "
-            f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent['seconds']:.0f} |"
+            f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent[c.clock]:.0f} |"
         )
     lines += ["", "Differences in bold exceed the spread: their interval leaves 0 out.", ""]
     lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]

@@ -40,7 +40,7 @@ class FinishedRun:
         return self.results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
 
     def spent(self, key: str) -> float:
-        """What the method needed in all: images, detector_steps, products or seconds."""
+        """What the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
         return float(self.results["curve"][-1][key])
 
 

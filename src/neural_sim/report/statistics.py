@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,8 @@ BOUNDS = ("ns", "matched")
 """Detectors that every run of a seed has, and that do not depend on its method. They stand for the methods ``ns`` and
 ``oracle``, whose own runs are not compared again."""
 FIXED = ("ns", "oracle")
+Clock = Literal["seconds", "cpu_seconds"]
+"""What a method has taken: by the clock on the wall, or of all processor cores together."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Comparison:
 
     ``ap`` is the biased objects' mean AP, ``won_back`` the share of the gap from ns to matched, ``ahead`` the
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
-    unit of log seconds. ``spent`` are means over seeds.
+    unit of log seconds, by ``clock``. ``spent`` are means over seeds.
     """
 
     setting: str
@@ -54,9 +57,12 @@ class Comparison:
     ahead: Mapping[str, Estimate]
     area: Mapping[str, Estimate]
     spent: Mapping[str, Mapping[str, float]]
+    clock: Clock = "seconds"
 
 
-def compare(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> Comparison:
+def compare(
+    runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0, clock: Clock = "seconds"
+) -> Comparison:
     """Compare the runs of one setting.
 
     Raises:
@@ -84,9 +90,9 @@ def compare(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int =
     ahead = _estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
-        dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed),
-        {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", "seconds")}
-         for m in methods},
+        dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
+        {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
+         for m in methods}, clock,
     )  # fmt: skip
 
 
@@ -110,11 +116,13 @@ def resampled(
     return np.asarray(rows)
 
 
-def biased_ap(run: FinishedRun) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]:
-    """Seconds spent, and the biased objects' mean AP, at every iteration that was scored."""
+def biased_ap(
+    run: FinishedRun, clock: Clock
+) -> tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]:
+    """Seconds spent by a clock, and the biased objects' mean AP, at every iteration that was scored."""
     curve, biased = run.results["curve"], run.results["biased"]
     ap = [_mean(point["ap"]["per_class"][name] for name in biased) for point in curve]
-    return np.asarray([point["seconds"] for point in curve]), np.asarray(ap)
+    return np.asarray([point[clock] for point in curve]), np.asarray(ap)
 
 
 def area_under(
@@ -132,8 +140,9 @@ def _areas(
     methods: Sequence[str],
     draws: int,
     seed: int,
+    clock: Clock,
 ) -> dict[str, Estimate]:
-    curves = {key: biased_ap(run) for key, run in table.items() if key[1] in seeds}
+    curves = {key: biased_ap(run, clock) for key, run in table.items() if key[1] in seeds}
     spent = [times[times > 0.0] for times, _ in curves.values()]
     starts, ends = [t.min() for t in spent if len(t)], [t.max() for t in spent if len(t)]
     if not starts or min(starts) >= max(ends):
