@@ -1,5 +1,6 @@
 """What a run leaves: results.json by the standard, figures, the training set, MLflow."""
 
+import dataclasses
 import json
 
 import pytest
@@ -75,7 +76,8 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
     uri = tracking.tracking_uri(str(tmp_path / "deep" / "mlflow.db"))
     (tmp_path / "run").mkdir()
     write_results(results, tmp_path / "run")
-    run = MlflowClient(uri).get_run(track(results, uri, tmp_path / "run"))
+    client = MlflowClient(uri)
+    run = client.get_run(track(results, uri, tmp_path / "run"))
     assert run.info.status == "FINISHED" and run.data.tags["method"] == "neural_sim"
     assert run.data.params["parameter.pose.bins"] == "4"
     assert run.data.metrics["evaluate/learned/ap"] == 0.5
@@ -83,6 +85,24 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
     steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/pose/bin_1")
     assert [point.step for point in steps] == [0, 1]
     assert [item.path for item in MlflowClient(uri).list_artifacts(run.info.run_id)] == ["results.json"]
+
+
+def test_what_was_reached_charts_by_what_was_spent(results, tmp_path):
+    scores = {"ap": 0.5, "per_class": {"a": 0.6, "b": 0.4}}
+    points = [
+        {"iteration": i, "images": 300 * i, "seconds": 2.6 * i, "ap": scores | {"ap": 0.1 * i}}
+        for i in (0, 4)
+    ]
+    uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
+    (tmp_path / "run").mkdir()
+    run = track(dataclasses.replace(results, curve=points), uri, tmp_path / "run")
+    for name, expected in (
+        ("ap_by_iteration", {0: 0.0, 4: 0.4}),
+        ("ap_by_images", {0: 0.0, 1200: 0.4}),
+        ("biased_ap_by_seconds", {0: 0.6, 10: 0.6}),
+    ):
+        history = MlflowClient(uri).get_metric_history(run, f"curve/{name}")
+        assert {metric.step: pytest.approx(metric.value) for metric in history} == expected
 
 
 def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 from neural_sim.report import tracking
@@ -23,8 +24,6 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
     for name, factors in results.total_variations().items():
         for factor, distances in factors.items():
             metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
-    for point in results.curve:
-        metrics[f"curve/ap_{point['iteration']}"] = point["ap"]["ap"]
     return tracking.log_run(
         uri,
         results.experiment,
@@ -38,7 +37,7 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
         },
         tracking.flatten(results.config),
         metrics,
-        _series(results),
+        _series(results) | _curve(results),
         folder,
     )
 
@@ -70,3 +69,16 @@ def _series(results: RunResults) -> dict[str, list[float]]:
         for key in ("psnr", "ssim"):
             series[f"field/{name}/{key}"] = [row[key] for row in history if key in row]
     return series
+
+
+def _curve(results: RunResults) -> dict[str, dict[int, float]]:
+    """AP of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by side."""
+    found: dict[str, dict[int, float]] = {}
+    for point in results.curve:
+        scores = {"ap": point["ap"]["ap"]}
+        if results.biased:
+            per_class = point["ap"]["per_class"]
+            scores["biased_ap"] = sum(per_class[name] for name in results.biased) / len(results.biased)
+        for by, (what, value) in itertools.product(("iteration", "images", "seconds"), scores.items()):
+            found.setdefault(f"curve/{what}_by_{by}", {})[round(point[by])] = value
+    return found

@@ -33,14 +33,14 @@ def log_run(
     tags: Mapping[str, str],
     parameters: Mapping[str, Any],
     metrics: Mapping[str, float],
-    series: Mapping[str, Sequence[float]],
+    series: Mapping[str, Sequence[float] | Mapping[int, float]],
     artifacts: Path,
 ) -> str:
     """Write one finished run and return its id.
 
-    ``series`` holds a value a step (``psi/pitcher/bin_3``), ``metrics`` final numbers (``evaluate/learned/ap``).
-    Non-finite values are left out, since MLflow's charts break on them. A new SQLite store is created once, under a
-    lock, so that sweep workers that start together do not race for its tables.
+    ``series`` holds a value a step (``psi/pitcher/bin_3``), or values by their steps, ``metrics`` final numbers
+    (``evaluate/learned/ap``). Non-finite values are left out, since MLflow's charts break on them. A new SQLite store is
+    created once, under a lock, so that sweep workers that start together do not race for its tables.
     """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     with warnings.catch_warnings():
@@ -57,7 +57,8 @@ def log_run(
         now = run.info.start_time
         rows = [Metric(k, float(v), now, 0) for k, v in metrics.items() if math.isfinite(v)]
         for key, values in series.items():
-            rows += [Metric(key, float(v), now, step) for step, v in enumerate(values) if math.isfinite(v)]
+            steps = values.items() if isinstance(values, Mapping) else enumerate(values)
+            rows += [Metric(key, float(v), now, step) for step, v in steps if math.isfinite(v)]
         pairs = [Param(k, str(v)[:6000]) for k, v in parameters.items()]
         for start in range(0, max(len(rows), len(pairs), 1), 100):
             window = slice(start, start + 100)
