@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from pretend_device import pretend_device, register
+
+register()
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +22,10 @@ def shared_data() -> Path:
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def pretend():
+    """``torch.device("pretend")`` and the ledger of its trips, see pretend_device.py."""
+    with pretend_device() as ledger:
+        yield ledger

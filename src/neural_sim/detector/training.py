@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from lightning.pytorch import Trainer
 from torch import Tensor
 
+from neural_sim.devices import trainer_on
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule
 from neural_sim.detector.retinanet import Detector, Parameters
@@ -104,16 +104,7 @@ def _fit(module: DetectorModule, batches: Batches, epochs: int, progress: bool, 
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="lightning")
-            trainer = Trainer(
-                max_epochs=epochs,
-                accelerator="cpu" if device.type == "cpu" else "gpu",
-                devices=1 if device.type == "cpu" else [device.index or 0],
-                logger=False,
-                enable_checkpointing=False,
-                enable_progress_bar=progress,
-                enable_model_summary=False,
-            )
-            trainer.fit(module, batches)
+            trainer_on(device, epochs, progress).fit(module, batches)
     finally:
         talker.setLevel(level)
 

@@ -88,12 +88,12 @@ class GridField(RadianceField):
 
     @property
     def occupancy(self) -> Occupancy:
-        return Occupancy(self.origin, float(self.cell), self.index, self.distance)
+        return Occupancy(self.origin, self.edge, self.index, self.distance)
 
     @property
     def step(self) -> float:
         """The quadrature's step in object radii."""
-        return self.step_cells * float(self.cell)
+        return self.step_cells * self.edge
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
         """Moves and casts like any module; refuses a type that cannot tell two places in a cell apart."""
@@ -125,13 +125,13 @@ class GridField(RadianceField):
         With ``refine`` the cells' edge is halved first, so that the margin of neighbours is thinner, and the table is
         interpolated.
         """
-        wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, float(self.cell)
+        wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, self.edge
         wanted[occupied] = cells
         if refine:
             wanted, occupied, cell = subdivide(wanted), subdivide(occupied), cell / 2.0
         occupied = occupied & (dilate(wanted.to(self.table.dtype)) > 0)
         occupied, origin = crop(occupied, self.origin, cell)
-        before, table, old_cell, old_origin = self.occupancy, self.table, float(self.cell), self.origin
+        before, table, old_cell, old_origin = self.occupancy, self.table, self.edge, self.origin
         corners = self.corners
         coordinates = self._set_cells(occupied, origin, cell)
         # New vertices lie on old cells' faces; nudged towards the inside of an occupied cell they find a row each.
@@ -146,7 +146,8 @@ class GridField(RadianceField):
         # The last row of corners points at the table's last row: empty space.
         self.corners = functional.pad(corners, (0, 0, 0, 1), value=len(coordinates))
         self.occupied, self.origin = occupied, occupancy.origin
-        self.cell = torch.tensor(cell, dtype=torch.float64)
+        # A number beside the buffer that is saved: reading that one would make the host wait for the device.
+        self.edge, self.cell = float(cell), torch.tensor(cell, dtype=torch.float64)
         self.index, self.distance = occupancy.index, occupancy.distance
         return coordinates
 
@@ -154,7 +155,7 @@ class GridField(RadianceField):
         self, positions: Float[Tensor, "samples 3"], cells: Int[Tensor, "samples"] | None = None
     ) -> Float[Tensor, "samples channels"]:
         """Interpolated table rows. ``cells`` may carry the positions' known cell numbers (-1: empty)."""
-        local = (positions - self.origin) / float(self.cell)
+        local = (positions - self.origin) / self.edge
         base = local.detach().floor()
         if cells is None:
             cells = lookup(base, self.occupancy)
@@ -189,14 +190,14 @@ class GridField(RadianceField):
         self, positions: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
     ) -> tuple[Float[Tensor, "samples channels"], Float[Tensor, "m samples channels"]]:
         """Table rows, and their m derivatives (none is allowed) where positions move at ``velocities``."""
-        local = (positions - self.origin) / float(self.cell)
+        local = (positions - self.origin) / self.edge
         base = local.floor()
         cells = lookup(base, self.occupancy)
         corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
         if not len(velocities):
             raw = gather_weighted(self.table, corners, corner_weights(*(local - base).t().contiguous()))
             return raw, raw.new_zeros(0, *raw.shape)
-        weights, rates = trilinear_tangents(local - base, velocities / float(self.cell))
+        weights, rates = trilinear_tangents(local - base, velocities / self.edge)
         raw = gather_weighted(self.table, corners, weights)
         return raw, torch.stack([gather_weighted(self.table, corners, rate) for rate in rates])
 
@@ -204,12 +205,12 @@ class GridField(RadianceField):
         self, raw: Float[Tensor, "samples channels"], raw_rates: Float[Tensor, "m samples channels"]
     ) -> Float[Tensor, "m samples"]:
         """Density's derivatives where table rows change at ``raw_rates``."""
-        slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / float(self.cell))
+        slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / self.edge)
         return slope * raw_rates[..., 0]
 
     def density(self, raw: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples"]:
         """Density sigma, per object radius, of table rows."""
-        return functional.softplus(self.density_gain * raw[:, 0]) / float(self.cell)
+        return functional.softplus(self.density_gain * raw[:, 0]) / self.edge
 
     def decode(
         self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 
+from neural_sim.devices import trainer_on
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
@@ -56,19 +56,8 @@ def fit_field(
         score_every,
         progress,
     )
-    device = views.images.device
-    trainer = lightning.Trainer(
-        accelerator="cpu" if device.type == "cpu" else "cuda",
-        devices=1,
-        max_epochs=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
-    trainer.fit(module)
-    field = module.field.eval().requires_grad_(False).to(device)
-    return field, module.history
+    trainer_on(views.images.device).fit(module)
+    return module.field.eval().requires_grad_(False), module.history
 
 
 def field_state(field: RadianceField) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from neural_sim.devices import trainer_on
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.records import IterationRecord, LearnedPsi
@@ -87,14 +88,6 @@ def learn_psi(module: OuterLoop, progress: bool) -> LearnedPsi:
     """Run the loop to its budget through a Lightning Trainer that writes nothing."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
-        trainer = pl.Trainer(
-            max_epochs=1,
-            accelerator="cpu" if module.psi.device.type == "cpu" else "gpu",
-            devices=1,
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=progress,
-            enable_model_summary=False,
-        )
-        trainer.fit(module)
+        # psi and its account are a few numbers: they stay on the CPU wherever images and detector are.
+        trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records)

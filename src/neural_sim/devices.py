@@ -1,0 +1,58 @@
+"""Where a run computes: the one place that names a torch device, and the trainers that run on it.
+
+Draws and psi, few numbers each, are made on the CPU by CPU generators, so that a seed draws the same scenes on every
+device. Fields, images, features and targets live on the run's device; what leaves a stage comes back to the CPU once.
+"""
+
+from __future__ import annotations
+
+import resource
+from typing import TypeVar
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.strategies import SingleDeviceStrategy
+
+DEVICES = {"cpu": "cpu", "gpu": "cuda"}
+"""torch's device type by ``trainer.accelerator``."""
+Tree = TypeVar("Tree", bound=dict)
+
+
+def device_of(accelerator: str) -> torch.device:
+    """The device of ``trainer.accelerator``. Raises ``ValueError`` for an unknown one, or one this machine lacks."""
+    if accelerator not in DEVICES:
+        raise ValueError(f"trainer.accelerator must be one of {', '.join(DEVICES)}, got {accelerator!r}")
+    kind = DEVICES[accelerator]
+    if kind == "cpu":
+        return torch.device(kind)
+    if not torch.get_device_module(kind).is_available():
+        raise ValueError(f"trainer={accelerator}: no {kind} device answers here; want trainer=cpu")
+    return torch.device(kind, 0)
+
+
+class Resident(SingleDeviceStrategy):
+    """One device, on which modules and optimisers stay: Lightning's own moves each tensor to the CPU after a fit."""
+
+    def teardown(self) -> None:
+        if self.accelerator is not None:
+            self.accelerator.teardown()
+
+
+def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False) -> Trainer:
+    """A Trainer for modules that lie on ``device``, with everything off that writes files or talks."""
+    on_cpu = device.type == "cpu"
+    return Trainer(
+        accelerator=device.type,
+        devices=1 if on_cpu else [device.index or 0],
+        strategy="auto" if on_cpu else Resident(device),
+        max_epochs=max_epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=progress,
+        enable_model_summary=False,
+    )
+
+
+def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:
+    """The same on ``device``; those that are there already are not copied."""
+    return {name: tensor.to(device) for name, tensor in tensors.items()}
