@@ -15,6 +15,7 @@ from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
+from neural_sim.devices import device_of, placed
 from neural_sim.experiment import Account, Experiment
 from neural_sim.field.base import RadianceField
 from neural_sim.field.training import field_from_state, field_state
@@ -53,7 +54,7 @@ class Artifacts:
         self.account = Account()
         self._held: dict[str, Any] = {}  # by kind and key, so that a result is read once
         self.names: list[str] = experiment.objects.names()
-        self.device = torch.device("cuda" if experiment.accelerator == "gpu" else "cpu")
+        self.device = device_of(experiment.accelerator)
         unknown = set(experiment.distribution.biased) - set(self.names)
         unknown |= set(experiment.outer.learned or ()) - set(self.names)
         if unknown:
@@ -209,11 +210,11 @@ class Artifacts:
         training = self.x.training
         images = join(self.scene.training_set(psi, training.images_per_object, generator))
         params, _ = train_detector(
-            self.detector, self.detector.init(generator), images, generator, epochs=epochs,
+            self.detector, placed(self.detector.init(generator), self.device), images, generator, epochs=epochs,
             batch_size=training.batch_size, learning_rate=training.learning_rate,
             weight_decay=training.weight_decay, progress=False,
         )  # fmt: skip
-        return params
+        return placed(params, torch.device("cpu"))
 
     def _trained_key(self, psi: Tensor) -> dict[str, Any]:
         return {
@@ -229,7 +230,8 @@ class Artifacts:
 
     def _detector(self, psi: Tensor, epochs: int, stage: str, what: str) -> Parameters:
         key = {**self._trained_key(psi), "epochs": epochs}
-        return self._fetch(stage, "detector", what, key, lambda: self._train_cold(psi, epochs))
+        found = self._fetch(stage, "detector", what, key, lambda: self._train_cold(psi, epochs))
+        return placed(found, self.device)
 
     def learned(self) -> dict[str, Any]:
         """psi before and after every iteration of the method (``trajectory``), and the iterations' records."""
@@ -260,8 +262,9 @@ class Artifacts:
         return self.learned()["trajectory"][-1]
 
     def training_images(self, psi: Tensor) -> list[RenderedObject]:
-        """The images that the scored detector trained on, drawn again from the same seed."""
-        return self.scene.training_set(psi, self.x.training.images_per_object, self._generator(1))
+        """The images that the scored detector trained on, drawn again from the same seed; on the CPU."""
+        drawn = self.scene.training_set(psi, self.x.training.images_per_object, self._generator(1))
+        return [dataclasses.replace(part, images=part.images.to("cpu")) for part in drawn]
 
     def scores(self, psi: Tensor, what: str) -> dict[str, Any]:
         """AP on the test set of a detector trained cold on images from ``psi``, and its detections."""

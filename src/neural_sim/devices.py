@@ -7,15 +7,14 @@ device. Fields, images, features and targets live on the run's device; what leav
 from __future__ import annotations
 
 import resource
-from typing import TypeVar
+from collections.abc import Sequence
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
 DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 """torch's device type by ``trainer.accelerator``."""
-Tree = TypeVar("Tree", bound=dict)
 
 
 def device_of(accelerator: str) -> torch.device:
@@ -51,6 +50,15 @@ def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False
         enable_progress_bar=progress,
         enable_model_summary=False,
     )
+
+
+def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[torch.Tensor]:
+    """Small tensors of one type on ``device``, in one copy."""
+    if all(tensor.device == torch.device(device) for tensor in tensors):
+        return list(tensors)
+    together = torch.cat([tensor.reshape(-1) for tensor in tensors]).to(device)
+    parts = together.split([tensor.numel() for tensor in tensors])
+    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:

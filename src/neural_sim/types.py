@@ -90,6 +90,10 @@ class LabelledImages:
     def select(self, index: Tensor | slice) -> LabelledImages:
         return LabelledImages(self.images[index], self.boxes[index], self.labels[index], self.bins[index])
 
+    def to(self, device: torch.device | str) -> LabelledImages:
+        """The same on ``device``."""
+        return LabelledImages(*(getattr(self, f.name).to(device) for f in fields(LabelledImages)))
+
     @property
     def present(self) -> Bool[Tensor, "images boxes"]:
         """Which rows of ``boxes`` are boxes rather than padding."""

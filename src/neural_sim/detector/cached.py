@@ -18,14 +18,15 @@ from neural_sim.types import LabelledImages
 def cached_features(
     detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
 ) -> tuple[Tensor, ...]:
-    """Feature maps of all images, computed batch by batch, without a graph.
+    """Feature maps of all images, computed batch by batch on the backbone's device, without a graph.
 
     Raises:
         ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
     """
     if len(images) == 0:
         raise ValueError("cached_features: got no images, want at least one")
-    parts = [detector.features(backbone, chunk) for chunk in images.split(batch_size)]
+    device = next(iter(backbone.values())).device
+    parts = [detector.features(backbone, chunk.to(device)) for chunk in images.split(batch_size)]
     return tuple(torch.cat(level) for level in zip(*parts, strict=True))
 
 
@@ -42,8 +43,17 @@ class CachedSet:
 
     @staticmethod
     def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
+        """The set under a backbone, on whose device it is kept; the images may be elsewhere."""
         features = cached_features(detector, backbone, images.images)
-        return CachedSet(detector, features, detector.assign(images.boxes, images.labels))
+        device = features[0].device
+        return CachedSet(
+            detector, features, detector.assign(images.boxes.to(device), images.labels.to(device))
+        )
+
+    @property
+    def device(self) -> torch.device:
+        """Of features and targets, and so of the rows that losses are asked for."""
+        return self.targets.labels.device
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
         """Losses of the images ``index``."""
@@ -59,12 +69,13 @@ class CachedSet:
 
     def select(self, index: Tensor) -> CachedSet:
         """The images ``index`` alone."""
+        index = index.to(self.device)
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
         """The same with ``others`` in the places ``index``."""
-        place = index.to(self.targets.labels.device)
+        place = index.to(self.device)
         features = tuple(
             level.index_copy(0, place, new) for level, new in zip(self.features, others.features, strict=True)
         )
@@ -82,5 +93,5 @@ class CachedSet:
         count = len(self.targets)
         return [
             lambda params, rows=rows: self.losses(params, rows).sum() / count
-            for rows in torch.arange(count).split(chunk_size)
+            for rows in torch.arange(count, device=self.device).split(chunk_size)
         ]

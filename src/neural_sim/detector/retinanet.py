@@ -212,20 +212,25 @@ class Detector:
     def predict(
         self, params: Parameters, images: Float[Tensor, "n 3 h w"], batch_size: int = 64
     ) -> list[dict[str, Tensor]]:
-        """Detections of each image, best first: boxes [d, 4] in pixels, scores [d], labels [d].
+        """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d].
 
         Per level, the ``max_candidates`` best scores above ``score_threshold``; then non-maximum suppression
         within each class at ``nms_iou``, and the best ``max_detections`` are kept.
         """
         backbone, trainable = self.split(params)
-        found = []
+        found, device = [], next(iter(trainable.values())).device
         for chunk in images.split(batch_size) if len(images) else ():
-            logits, deltas = self.outputs(trainable, self.features(backbone, chunk))
-            found += [self._detections(*image) for image in zip(logits.sigmoid(), deltas, strict=True)]
+            logits, deltas = self.outputs(trainable, self.features(backbone, chunk.to(device)))
+            anchors = self.anchors.to(deltas)
+            pairs = zip(logits.sigmoid(), deltas, strict=True)
+            found += _on_cpu([self._detections(*pair, anchors) for pair in pairs])
         return found
 
     def _detections(
-        self, scores: Float[Tensor, "anchors classes"], deltas: Float[Tensor, "anchors 4"]
+        self,
+        scores: Float[Tensor, "anchors classes"],
+        deltas: Float[Tensor, "anchors 4"],
+        anchors: Float[Tensor, "anchors 4"],
     ) -> dict[str, Tensor]:
         levels = []
         for level, first in zip(scores.split(self.anchors_per_level), self._first_anchors, strict=True):
@@ -234,7 +239,7 @@ class Detector:
             levels.append((best[keep], index[keep] + first * self.num_classes))
         best, index = (torch.cat(part) for part in zip(*levels, strict=True))
         anchor, labels = index // self.num_classes, index % self.num_classes
-        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas[anchor], self.anchors.to(deltas)[anchor])
+        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas[anchor], anchors[anchor])
         boxes = clip_boxes_to_image(boxes, self.image_size)
         keep = batched_nms(boxes, best, labels, self.nms_iou)[: self.max_detections]
         return {"boxes": boxes[keep], "scores": best[keep], "labels": labels[keep]}
@@ -242,6 +247,13 @@ class Detector:
     @property
     def _first_anchors(self) -> list[int]:
         return [sum(self.anchors_per_level[:level]) for level in range(len(self.anchors_per_level))]
+
+
+def _on_cpu(detections: list[dict[str, Tensor]]) -> list[dict[str, Tensor]]:
+    """Detections of many images, brought to the CPU together."""
+    counts = [len(image["labels"]) for image in detections]
+    parts = {key: torch.cat([image[key] for image in detections]).cpu().split(counts) for key in detections[0]}
+    return [{key: parts[key][i] for key in parts} for i in range(len(detections))]
 
 
 def _check(**conditions: tuple[object, bool, str]) -> None:

@@ -60,7 +60,7 @@ def train_detector(
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
     Args:
-        images: where they come as features, the backbone stays frozen: the pyramid and the head are trained.
+        images: on the device of ``params``; where they come as features, the backbone stays frozen: the pyramid and the head are trained.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
         proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
 

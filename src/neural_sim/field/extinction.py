@@ -34,13 +34,12 @@ class Extinction:
         thickness.view(-1).index_copy_(0, slot + 1, optical.clamp_max(OPAQUE_DEPTH))
         depth = thickness.cumsum(1)
         before = depth.view(-1).index_select(0, slot)
-        after = depth[:, -1].contiguous()
+        after = depth[:, -1]
         alive = after < self._deepest
-        ended = (~alive).nonzero()[:, 0]
-        # The sample that crosses the limit is the last to count.
-        last = depth.index_select(0, ended)
-        after.index_copy_(0, ended, last.masked_fill(last < self._deepest, math.inf).amin(1))
-        self._depth.index_copy_(0, wave.ray, after)
+        # The sample that crosses the limit is the last to count. Depth rises along a row, so a search finds it.
+        limit = torch.full_like(after, self._deepest)[:, None]
+        crossing = torch.searchsorted(depth, limit).clamp_max(wave.length)
+        self._depth.index_copy_(0, wave.ray, depth.gather(1, crossing)[:, 0])
         return before, before < self._deepest, alive
 
     def opacity(self) -> Float[Tensor, "rays"]:

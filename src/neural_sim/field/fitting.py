@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -87,10 +88,11 @@ class GridFitting(Fitting):
     ) -> list[tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]]:
         samples, cells = self.field.sample_cells(block.rays, self.termination, block.phase)
         batches = []
-        for first in range(0, len(block), size):
-            last = min(first + size, len(block))
-            part, own = samples.of_rays(first, last), slice(*samples.starts[[first, last]].tolist())
-            batches.append((block.select(slice(first, last)), part, cells[own]))
+        rays = [*range(0, len(block), size), len(block)]
+        places = [*samples.starts[:-1:size].tolist(), len(samples)]
+        for (first, begin), (last, end) in pairwise(zip(rays, places, strict=True)):
+            part = samples.of_rays(first, last, begin, end)
+            batches.append((block.select(slice(first, last)), part, cells[begin:end]))
         return batches
 
     def advance(self, step: int) -> bool:

@@ -58,22 +58,21 @@ class GridField(RadianceField):
                 f"GridField: want head_width >= 0 and step_cells in (0, 2], got {head_width} and {step_cells}"
             )
         self.features, self.head_width = features, head_width
-        self.step_cells, self.initial_density = step_cells, initial_density
-        self.density_gain, self.directed = density_gain, head_width > 0
-        self.head: nn.Module | None = None
-        if head_width:
-            self.head = nn.Sequential(
-                nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)
-            )
+        self.step_cells, self.initial_density, self.density_gain = step_cells, initial_density, density_gain
+        self.directed = head_width > 0
+        layers = (nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)) if head_width else ()
+        self.head = nn.Sequential(*layers) if head_width else None
         self.table = nn.Parameter(torch.zeros(1, 1 + features))
-        for name in ("occupied", "origin", "cell", "index", "distance", "corners"):
-            self.register_buffer(name, torch.empty(0), persistent=name in ("occupied", "origin", "cell"))
+        saved = ("occupied", "origin", "cell")
+        for name in (*saved, "index", "distance", "corners", "coarse"):
+            self.register_buffer(name, torch.empty(0), persistent=name in saved)
         self.occupied: Tensor
         self.origin: Tensor
         self.cell: Tensor
         self.index: Tensor
         self.distance: Tensor
         self.corners: Tensor
+        self.coarse: Tensor
         self.register_load_state_dict_pre_hook(_resize_to_state)
         self.reset(torch.ones(1, 1, 1, dtype=torch.bool), torch.full((3,), -1.0), 2.0)
 
@@ -149,6 +148,7 @@ class GridField(RadianceField):
         # A number beside the buffer that is saved: reading that one would make the host wait for the device.
         self.edge, self.cell = float(cell), torch.tensor(cell, dtype=torch.float64)
         self.index, self.distance = occupancy.index, occupancy.distance
+        self.coarse, self.coarse_radius = coarse_centres(occupancy)
         return coordinates
 
     def raw(
@@ -157,9 +157,7 @@ class GridField(RadianceField):
         """Interpolated table rows. ``cells`` may carry the positions' known cell numbers (-1: empty)."""
         local = (positions - self.origin) / self.edge
         base = local.detach().floor()
-        if cells is None:
-            cells = lookup(base, self.occupancy)
-        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
+        corners = self._corners_of(lookup(base, self.occupancy) if cells is None else cells)
         if self.training:
             weights = corner_weights(*(local - base).t().contiguous())
             return interpolate_for_training(self.table, corners, weights)
@@ -192,8 +190,7 @@ class GridField(RadianceField):
         """Table rows, and their m derivatives (none is allowed) where positions move at ``velocities``."""
         local = (positions - self.origin) / self.edge
         base = local.floor()
-        cells = lookup(base, self.occupancy)
-        corners = self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
+        corners = self._corners_of(lookup(base, self.occupancy))
         if not len(velocities):
             raw = gather_weighted(self.table, corners, corner_weights(*(local - base).t().contiguous()))
             return raw, raw.new_zeros(0, *raw.shape)
@@ -286,8 +283,10 @@ class GridField(RadianceField):
         return colour, extinction.opacity()
 
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
-        centres, radius = coarse_centres(self.occupancy)
-        return screen_span(centres, radius, camera, camera_to_world, rows)
+        return screen_span(self.coarse, self.coarse_radius, camera, camera_to_world, rows)
+
+    def _corners_of(self, cells: Int[Tensor, "samples"]) -> Int[Tensor, "samples 8"]:
+        return self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
 
     def _raw_of(self, wave: Wave) -> Float[Tensor, "k channels"]:
         """Table rows at a wave's samples, without derivatives."""

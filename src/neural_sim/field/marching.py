@@ -164,8 +164,8 @@ def _enter(
     # A direction component of exactly zero would divide by zero; the smallest slope has the same span.
     slope = rays.directions.t().contiguous()
     slope = torch.where(slope.abs() < 1e-9, torch.full_like(slope, 1e-9), slope)
-    size = torch.tensor(occupancy.index.shape, dtype=origin.dtype, device=origin.device)[:, None]
-    to_low, to_high = -origin / slope, (size - origin) / slope
+    beyond = torch.stack([size - axis for axis, size in zip(origin, occupancy.index.shape, strict=True)])
+    to_low, to_high = -origin / slope, beyond / slope
     near, far = torch.minimum(to_low, to_high).amax(0).clamp_min(0.0), torch.maximum(to_low, to_high).amin(0)
     unit = step / occupancy.cell
     if span is not None:
@@ -173,7 +173,7 @@ def _enter(
             torch.maximum(near, span.near / occupancy.cell),
             torch.minimum(far, span.far / occupancy.cell),
         )
-    phases = torch.as_tensor(phase, dtype=origin.dtype, device=origin.device).expand(len(near))
+    phases = phase.to(origin) if isinstance(phase, Tensor) else torch.full_like(near, phase)
     first, last = (near / unit - phases).ceil().clamp_min(0.0), (far / unit - phases).floor()
     ray = (first <= last).nonzero()[:, 0]
     limit = 0.5 / torch.finfo(origin.dtype).eps
@@ -224,7 +224,9 @@ class SampleCollector:
         if kept is not None:
             index = kept.nonzero()[:, 0]
             row, distance, cell = (part.index_select(0, index) for part in (row, distance, cell))
-            count = torch.bincount(row, minlength=len(wave.ray))
+            # Differences of a running count: the size of a histogram depends on its values.
+            ends = torch.nn.functional.pad(kept.cumsum(0), (1, 0)).index_select(0, wave.count.cumsum(0))
+            count = torch.diff(ends, prepend=ends.new_zeros(1))
         before = self._count.index_select(0, wave.ray)
         # Rows come in order: a sample's rank is its number less that of its row's first sample.
         first = before - (count.cumsum(0) - count)
@@ -238,6 +240,8 @@ class SampleCollector:
         ray, order, distance, cell = (torch.cat(parts) for parts in zip(*self._parts, strict=True))
         place = starts.index_select(0, ray) + order
         packed = [torch.empty_like(x).index_copy_(0, place, x) for x in (distance, cell)]
-        rays = torch.arange(len(self._count), device=ray.device).repeat_interleave(self._count)
+        rays = torch.arange(len(self._count), device=ray.device).repeat_interleave(
+            self._count, output_size=len(ray)
+        )
         widths = torch.full_like(packed[0], width)
         return PackedSamples(rays, packed[0], widths, starts), packed[1]

@@ -78,8 +78,9 @@ def crop(
 ) -> tuple[Bool[Tensor, "mx my mz"], Float[Tensor, "3"]]:
     """Cut away empty margins; returns the smaller grid and its origin."""
     where = occupied.nonzero()
-    low, high = where.min(0).values, where.max(0).values + 1
-    inside = occupied[low[0] : high[0], low[1] : high[1], low[2] : high[2]].contiguous()
+    low = where.min(0).values
+    (x, y, z), (u, v, w) = torch.stack([low, where.max(0).values + 1]).tolist()
+    inside = occupied[x:u, y:v, z:w].contiguous()
     return inside, origin + low.to(origin.dtype) * cell
 
 

@@ -64,10 +64,12 @@ def render_with_tangents(
     differentiate = _with_tangents if len(rates.origins) <= FEW else _by_ray_numbers
     # Pieces of about as many samples need the same memory wherever in an image their rays lie.
     cuts = torch.arange(0, len(samples), samples_at_once, device=samples.starts.device)[1:]
-    edges = [0, *torch.searchsorted(samples.starts, cuts).tolist(), len(rays.origins)]
+    first = torch.searchsorted(samples.starts, cuts)
+    inner = torch.stack([first, samples.starts.index_select(0, first)], -1).tolist()
+    edges = [(0, 0), *inner, (len(rays.origins), len(samples))]
     parts = [
-        differentiate(field, _rows(rays, a, b), _rows(rates, a, b), samples.of_rays(a, b))
-        for a, b in pairwise(edges)
+        differentiate(field, _rows(rays, a, b), _rows(rates, a, b), samples.of_rays(a, b, begin, end))
+        for (a, begin), (b, end) in pairwise(edges)
         if a < b
     ]
     return torch.cat([pixels for pixels, _ in parts]), torch.cat([moved for _, moved in parts], 1)

@@ -24,9 +24,12 @@ class PackedSamples:
     def __len__(self) -> int:
         return self.ray.shape[0]
 
-    def of_rays(self, first: int, last: int) -> PackedSamples:
-        """The samples of rays ``first`` to ``last`` - 1, numbered from 0."""
-        begin, end = int(self.starts[first]), int(self.starts[last])
+    def of_rays(self, first: int, last: int, begin: int, end: int) -> PackedSamples:
+        """The samples of rays ``first`` to ``last`` - 1, numbered from 0; they are those from ``begin`` to ``end`` - 1.
+
+        Both are ``starts`` of the rays. They are asked for, because reading them here would make the host wait for
+        the device once a batch.
+        """
         return PackedSamples(
             self.ray[begin:end] - first,
             self.distance[begin:end],

@@ -47,7 +47,8 @@ def screen_span(
     # A point of the ball lies at (x + u) / (-z + w), |u|, |w| <= radius: off the centre by at most this slope.
     across, down = x / -z, -y / -z
     slope = radius * (1.0 + torch.maximum(across.abs(), down.abs())) / (-z - radius)
-    largest = float(slope.amax()) if bool((-z > 1.01 * radius).all()) else math.inf
+    ahead, largest = torch.stack([(-z > 1.01 * radius).all().to(slope.dtype), slope.amax()]).tolist()
+    largest = largest if ahead else math.inf
     focal = focal_length(camera)
     if focal * largest > max(camera.width, camera.height):
         whole = x.new_zeros(size[0] * size[1])

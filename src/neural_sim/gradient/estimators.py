@@ -57,7 +57,7 @@ class StratifiedEstimator:
         for factor in distribution.factors:
             held = probes[factor.name]
             along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            along = along.to(images.psi.dtype)
+            along = along.to(images.psi)
             if isinstance(factor, BinnedFactor):
                 parts[factor.name] = stratified(
                     along, held.bins, psi[factor.name], factor.log_probabilities, share
@@ -93,7 +93,7 @@ class ReinforceEstimator:
         def log_prob(psi: Tensor) -> Tensor:
             return images.distribution.log_prob(psi, images.draw)
 
-        return reinforce(along.to(images.psi.dtype), log_prob, images.psi, share)
+        return reinforce(along.to(images.psi), log_prob, images.psi, share)
 
 
 Estimator = PathwiseEstimator | StratifiedEstimator | ReinforceEstimator

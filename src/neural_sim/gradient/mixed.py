@@ -40,6 +40,7 @@ def scores(
     along = _ALONG[mode]
     if not len(index):
         return next(iter(params.values())).new_zeros(0)
+    index = index.to(_device(params))
     parts = [along(lambda p, rows=rows: losses(p, rows), params, vector) for rows in index.split(chunk_size)]
     return torch.cat(parts).detach()
 
@@ -77,6 +78,7 @@ def input_cotangents(
     along = _ALONG[mode]
     if not len(index):
         return tuple(torch.zeros_like(values) for values in inputs)
+    index, weights = index.to(_device(params)), weights.to(_device(params))
     parts = []
     for rows, weight, *chunk in zip(
         *(values.split(chunk_size) for values in (index, weights, *inputs)), strict=True
@@ -125,6 +127,11 @@ _ALONG = {
     "reverse": _reverse_scores,
     "central_difference": _differenced_scores,
 }
+
+
+def _device(params: Params) -> torch.device:
+    """Where losses are computed: rows and weights, made on the CPU, are taken there once."""
+    return next(iter(params.values())).device
 
 
 def _check(mode: str, chunk_size: int) -> None:

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim import cameras
+from neural_sim.devices import moved
 from neural_sim.gradient.base import (
     Losses,
     MixedDerivative,
@@ -115,6 +116,8 @@ class PathwiseEstimator:
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
             # Light's derivatives, a few numbers, ride along in any mode; those of the camera only in forward mode.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
+        # From here on a few numbers an image, on the CPU as psi and the draws are.
+        along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
         return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
 
 
@@ -155,9 +158,10 @@ def draw_cotangents(
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
-    total = {name: torch.zeros_like(getattr(draw, name)) for name in RIGID}
+    numbers = dict(zip(RIGID, moved([getattr(draw, name).detach() for name in RIGID], rgb.device), strict=True))
+    total = {name: torch.zeros_like(number) for name, number in numbers.items()}
     for pixels in live.split(patch_size) if len(live) else ():
-        leaves = {name: getattr(draw, name).detach().requires_grad_() for name in RIGID}
+        leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}
         with torch.enable_grad():
             rendered = render_rays(patch_rays(camera, cameras.orbit(**leaves), pixels))
         parts = torch.autograd.grad(

@@ -14,6 +14,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
+from neural_sim.devices import placed
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.settings import Outer
 from neural_sim.synthesis.pool import ImagePool
@@ -38,7 +39,7 @@ class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
     The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each time
-    an iteration asks. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how
+    an iteration asks, on the device of ``params``, where the scene's fields are too. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how
     the method wants images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all
     others come from a pool of every bin. ``images`` and ``steps`` count labelled images made and optimiser steps;
     ``cpu_begun`` is the processor time at which the pool was begun.
@@ -66,7 +67,10 @@ class InnerLoop:
         if pooled(settings, draws, scene.distribution):
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         self.pool_seconds = time.perf_counter() - begun
-        self._start = params if settings.start == "warm" else {**detector.init(generator), **self.backbone}
+        self.device = self.validation.device
+        self._start = params
+        if settings.start != "warm":
+            self._start = {**placed(detector.init(generator), self.device), **self.backbone}
         self.images = self.steps = 0
 
     @property

@@ -116,9 +116,11 @@ class SimulatorModule(OuterLoop):
         subset = (
             torch.randperm(count, generator=self.inner.generator)[:wanted] if 0 < wanted < count else None
         )
+        device = self.inner.device
         inner = InnerProblem(
-            trainable, SplitLoss(cached.outputs, cached.losses_of), weights,
-            proximal=self.inner.detector.proximal, anchor=self.inner.warm_start, subset=subset,
+            trainable, SplitLoss(cached.outputs, cached.losses_of), weights.to(device),
+            proximal=self.inner.detector.proximal, anchor=self.inner.warm_start,
+            subset=None if subset is None else subset.to(device),
         )  # fmt: skip
         probed = self._probes
         losses = bound_losses(cached, self.inner.backbone, images.labels, probed.cached if probed else None)

@@ -54,7 +54,8 @@ class BinnedProblem:
     def at(self, psi: Float[Tensor, "objects k"], params: Params) -> InnerProblem:
         """The inner problem of these logits, at the parameters ``params``."""
         anchor = self.anchor if self.proximal > 0.0 else None
-        return InnerProblem(params, self.losses, self.weights(psi), self.chunk_size, self.proximal, anchor)
+        weights = self.weights(psi).to(next(iter(params.values())).device)
+        return InnerProblem(params, self.losses, weights, self.chunk_size, self.proximal, anchor)
 
     def retrain(self, psi: Float[Tensor, "objects k"], start: Params, tolerance: float) -> Minimum:
         """The minimiser reached from ``start``, its gradient's norm at most ``tolerance`` if it says converged."""
@@ -67,7 +68,7 @@ class BinnedProblem:
         part = self.probes[label]
 
         def exact(vector: Params) -> MixedDerivative:
-            along = scores(self.losses, params, vector, part.index, self.chunk_size)
+            along = scores(self.losses, params, vector, part.index, self.chunk_size).to(psi)
             leaf = psi[label].detach().requires_grad_()
             with torch.enable_grad():
                 p = self.log_probabilities(leaf).exp()

@@ -36,7 +36,7 @@ class NerfWRenderer(NerfRenderer):
         field, weights = _checked(field, weights, len(camera_to_world))
         shape = (len(camera_to_world), camera.height, camera.width)
         rgb, opacity = camera_to_world.new_empty(*shape, 3), camera_to_world.new_empty(shape)
-        for light, views in _groups(weights):
+        for light, views in _groups(weights, rgb.device):
             lit = field.lit(light @ field.anchors)
             rgb[views], opacity[views] = super().render(
                 lit, camera, camera_to_world.index_select(0, views), exact
@@ -63,7 +63,7 @@ class NerfWRenderer(NerfRenderer):
         shape = (len(camera_to_world), camera.height, camera.width, 4)
         maps = camera_to_world.new_empty(1 + len(rates) + len(weight_rates), *shape)
         together = torch.cat([weights[None], weight_rates.to(weights)]).movedim(0, 1)
-        for row, views in _groups(together.flatten(1)):
+        for row, views in _groups(together.flatten(1), maps.device):
             codes = row.view(-1, weights.shape[1]) @ field.anchors
             value, moved = super().render_with_tangents(
                 field.lit(codes[0], codes[1:]),
@@ -86,33 +86,36 @@ class NerfWRenderer(NerfRenderer):
         """
         if weights is None or weights.ndim == 1:
             field, row = _checked(field, None if weights is None else weights[None], 1)
-            return super().render_rays(field.lit(row[0] @ field.anchors), rays)
+            return super().render_rays(field.lit(row[0].to(rays.origins.device) @ field.anchors), rays)
         field, weights = _checked(field, weights, len(rays.origins))
         field = field.with_step(self.step)
         samples = field.sample(rays, self.termination)
         positions, directions = sample_points(rays, samples)
-        gain = field.gain(weights @ field.anchors).index_select(0, samples.ray)
+        gain = field.gain(weights.to(positions) @ field.anchors).index_select(0, samples.ray)
         return composite(*field.decode(field.grid.raw(positions), directions, gain), samples)
 
 
 def _checked(
     field: RadianceField, weights: Float[Tensor, "n k"] | None, count: int
 ) -> tuple[AppearanceField, Float[Tensor, "n k"]]:
-    """The field with codes that this renderer wants, and weights for ``count`` views or rays, in its type."""
+    """The field with codes that this renderer wants, and weights for ``count`` views or rays, in its type, where they
+    are: draws are on the CPU."""
     if not isinstance(field, AppearanceField):
         raise ValueError(
             f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"
         )
     anchors = len(field.mixing)
     if weights is None:
-        return field, field.codes.new_full((count, anchors), 1.0 / anchors)
+        return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.codes.dtype)
     if weights.shape != (count, anchors):
         raise ValueError(f"nerf_w: want weights of shape ({count}, {anchors}), got {tuple(weights.shape)}")
-    return field, weights.to(field.codes)
+    return field, weights.to(field.codes.dtype)
 
 
-def _groups(rows: Float[Tensor, "views c"]) -> Iterator[tuple[Float[Tensor, "c"], Int[Tensor, "some"]]]:
-    """The different rows, and which views have each."""
-    different, number = rows.unique(dim=0, return_inverse=True)
-    for place, row in enumerate(different):
-        yield row, (number == place).nonzero()[:, 0]
+def _groups(
+    rows: Float[Tensor, "views c"], device: torch.device
+) -> Iterator[tuple[Float[Tensor, "c"], Int[Tensor, "some"]]]:
+    """The different rows, and which views have each, on ``device``; told apart on the CPU."""
+    different, number = rows.cpu().unique(dim=0, return_inverse=True)
+    for place, row in enumerate(different.to(device)):
+        yield row, (number == place).nonzero()[:, 0].to(device)

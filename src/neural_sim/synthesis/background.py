@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -13,16 +14,23 @@ from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from neural_sim.devices import moved
+
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 # Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
 CHUNK = 16
 
 
 class Background(Protocol):
-    """A source of backgrounds, sRGB in [0, 1]; equal generators give equal images."""
+    """A source of backgrounds on a device, sRGB in [0, 1]; equal CPU generators give equal images on any device."""
 
     def draw(
-        self, n: int, height: int, width: int, generator: torch.Generator
+        self,
+        n: int,
+        height: int,
+        width: int,
+        generator: torch.Generator,
+        device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]: ...
 
 
@@ -60,34 +68,52 @@ class ProceduralClutter:
         self.distractors, self.grain = distractors, grain
 
     def draw(
-        self, n: int, height: int, width: int, generator: torch.Generator
+        self,
+        n: int,
+        height: int,
+        width: int,
+        generator: torch.Generator,
+        device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """``n`` images, float32 on the CPU."""
-        images = torch.empty(n, 3, height, width)
+        """``n`` images, float32; what is random is drawn on the CPU, all else is done on ``device``."""
+        images = torch.empty(n, 3, height, width, device=device)
         for start in range(0, n, CHUNK):
             part = images[start : start + CHUNK]
-            part.copy_(self._chunk(len(part), height, width, generator))
+            part.copy_(self._chunk(len(part), height, width, generator, device))
         return images
 
-    def _chunk(self, n: int, height: int, width: int, generator: torch.Generator) -> Tensor:
-        images = self._wall(n, height, width, generator)
+    def _chunk(
+        self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str
+    ) -> Tensor:
+        uniform = [torch.rand(shape, generator=generator) for shape in self._numbers(n)]
+        grain = torch.randn((n, 3, height, width), generator=generator).to(device)
+        held = moved(uniform, device)
+        wall, shapes = held[: 2 + 2 * self.octaves], held[2 + 2 * self.octaves :]
+        images = self._wall(wall, height, width)
         for depth in range(self.shapes):
             # Far shapes are large, near ones small, so that none hides all the others.
             size = 0.45 * 0.5 ** (2.0 * depth / max(self.shapes - 1, 1))
-            cover, level, colour = self._shape(n, height, width, size, generator)
+            cover, level = self._shape(shapes[2 * depth], height, width, size)
+            colour = self._colour(shapes[2 * depth + 1])
             images += cover[:, None] * (colour * level[:, None] - images)
-        images += self.grain * torch.randn(images.shape, generator=generator)
+        images += self.grain * grain
         return images.clamp_(0.0, 1.0)
 
-    def _wall(self, n: int, height: int, width: int, generator: torch.Generator) -> Tensor:
-        """A random colour with noise of every scale, mostly grey in hue."""
-        base = 0.2 + 0.6 * torch.rand((n, 1, 1, 1), generator=generator)
-        tint = 0.25 * (torch.rand((n, 3, 1, 1), generator=generator) - 0.5)
-        images = (base + tint).expand(n, 3, height, width).clone()
+    def _numbers(self, n: int) -> Iterator[tuple[int, ...]]:
+        """Shapes of the uniform numbers of n images, in the order in which they are drawn."""
+        yield from ((n, 1, 1, 1), (n, 3, 1, 1))
         for octave in range(self.octaves):
             cells = 2 ** (octave + 1) + 1
-            grey = torch.rand((n, 1, cells, cells), generator=generator)
-            hue = torch.rand((n, 3, cells, cells), generator=generator)
+            yield from ((n, 1, cells, cells), (n, 3, cells, cells))
+        for _ in range(self.shapes):
+            yield from ((12, n, 1, 1), (5, n))
+
+    def _wall(self, numbers: Sequence[Tensor], height: int, width: int) -> Tensor:
+        """A random colour with noise of every scale, mostly grey in hue."""
+        base, tint = 0.2 + 0.6 * numbers[0], 0.25 * (numbers[1] - 0.5)
+        images = (base + tint).expand(-1, -1, height, width).clone()
+        for octave in range(self.octaves):
+            grey, hue = numbers[2 + 2 * octave : 4 + 2 * octave]
             noise = (0.7 * grey + 0.3 * hue - 0.5) * (2.0 * self.contrast * 0.65**octave)
             images += torch.nn.functional.interpolate(
                 noise, (height, width), mode="bilinear", align_corners=True
@@ -95,14 +121,13 @@ class ProceduralClutter:
         return images
 
     def _shape(
-        self, n: int, height: int, width: int, size: float, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Coverage and brightness [n, h, w] and colour [n, 3, 1, 1] of one textured shape an image."""
-        u = torch.rand((12, n, 1, 1), generator=generator)
+        self, u: Float[Tensor, "12 n 1 1"], height: int, width: int, size: float
+    ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
+        """Coverage and brightness of one textured shape an image."""
         extent = float(min(height, width))
         angle = math.pi * torch.where(u[0] < 0.5, 0.08 * (u[1] - 0.5), u[1])  # half of them nearly upright
-        x = torch.arange(width) + 0.5 - width * (1.2 * u[2] - 0.1)
-        y = (torch.arange(height) + 0.5)[:, None] - height * (1.2 * u[3] - 0.1)
+        x = torch.arange(width, device=u.device) + 0.5 - width * (1.2 * u[2] - 0.1)
+        y = (torch.arange(height, device=u.device) + 0.5)[:, None] - height * (1.2 * u[3] - 0.1)
         along, across = angle.cos() * x + angle.sin() * y, angle.cos() * y - angle.sin() * x
         half_x, half_y = (extent * size * (0.3 + 0.9 * u[i]) for i in (4, 5))
         box = torch.maximum(along.abs() - half_x, across.abs() - half_y)
@@ -111,20 +136,19 @@ class ProceduralClutter:
         cover = (0.5 - distance).clamp_(0.0, 1.0)
         period = extent * (0.04 + 0.2 * u[7])
         stripes = (2.0 * math.pi / period * along + 6.28 * u[8]).sin_().mul_(4.0).clamp_(-1.0, 1.0)
-        checks = stripes * torch.where(u[9] < 0.5, across.sign(), torch.ones(()))
-        texture = torch.where(u[9] < 0.7, 0.25 * u[10], torch.zeros(()))  # three in ten are plain
+        checks = stripes * torch.where(u[9] < 0.5, across.sign(), 1.0)
+        texture = torch.where(u[9] < 0.7, 0.25 * u[10], 0.0)  # three in ten are plain
         level = 0.85 + texture * checks + 0.3 * (u[11] - 0.5) * across / half_y
-        return cover, level, self._colour(n, generator)
+        return cover, level
 
-    def _colour(self, n: int, generator: torch.Generator) -> Float[Tensor, "n 3 1 1"]:
+    def _colour(self, u: Float[Tensor, "5 n"]) -> Float[Tensor, "n 3 1 1"]:
         """Any hue, mostly dull; a ``distractors`` share is saturated, near red or near blue."""
-        u = torch.rand((5, n), generator=generator)
         strong = u[0] < self.distractors
-        centre = torch.where(u[1] < 0.5, 0.0, 0.61)
+        centre = torch.where(u[1] < 0.5, torch.zeros_like(u[1]), 0.61)
         hue = torch.where(strong, centre + 0.1 * (u[2] - 0.5), u[2])
         saturation = torch.where(strong, 0.5 + 0.5 * u[3], 0.6 * u[3].square())
         value = 0.25 + 0.7 * u[4]
-        wheel = (hue[:, None] + torch.tensor([0.0, 2 / 3, 1 / 3])) % 1.0
+        wheel = torch.stack([hue, hue + 2 / 3, hue + 1 / 3], 1) % 1.0
         pure = ((6.0 * wheel - 3.0).abs() - 1.0).clamp(0.0, 1.0)
         return (value[:, None] * (1.0 - saturation[:, None] * (1.0 - pure)))[..., None, None]
 
@@ -149,9 +173,14 @@ class PhotoFolder:
             )
 
     def draw(
-        self, n: int, height: int, width: int, generator: torch.Generator
+        self,
+        n: int,
+        height: int,
+        width: int,
+        generator: torch.Generator,
+        device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """``n`` crops, float32 on the CPU. Raises ``ValueError`` naming a file that cannot be read."""
+        """``n`` crops, float32. Raises ``ValueError`` naming a file that cannot be read."""
         chosen = torch.randint(len(self.files), (n,), generator=generator).tolist()
         uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
         images = torch.empty(n, 3, height, width)
@@ -159,7 +188,7 @@ class PhotoFolder:
             photo = _read(self.files[file])
             for index in (i for i, other in enumerate(chosen) if other == file):
                 images[index] = self._crop(photo, height, width, *uniform[index])
-        return images
+        return images.to(device)
 
     def digest(self) -> str:
         """SHA-256 of the photographs' names and sizes in bytes, for store keys."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
 import torch
@@ -69,5 +68,4 @@ class LabelledDataModule(LightningDataModule):
         self, batch: LabelledImages, device: torch.device, dataloader_idx: int
     ) -> LabelledImages:
         # Lightning's own way assigns to the fields, which a frozen dataclass refuses.
-        moved = {f.name: getattr(batch, f.name).to(device) for f in dataclasses.fields(batch)}
-        return LabelledImages(**moved)
+        return batch.to(device)

@@ -97,6 +97,6 @@ class ImagePool:
         index = cell * pool.per_cell + within
         maps = pool.maps[index.to(pool.maps.device)].float() / 255
         rgb, opacity = maps[..., :3], maps[..., 3]
-        nuisance = scene.synthesizer.draw_nuisance(len(bins), scene.camera, generator)
+        nuisance = scene.synthesizer.draw_nuisance(len(bins), scene.camera, generator, maps.device)
         images = scene.synthesizer.compose(rgb, opacity, nuisance, label, bins[:, 0])
         return RenderedObject(images, None, pool.draw.select(index), nuisance, rgb, opacity)

@@ -98,13 +98,13 @@ class Scene:
     ) -> RenderedObject:
         """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
         maps = self._maps(label, draw)
-        nuisance = self.synthesizer.draw_nuisance(len(draw), self.camera, generator)
+        nuisance = self._nuisance(label, len(draw), generator)
         return self._compose(label, draw, noise, maps, nuisance)
 
     @torch.no_grad()
     def _maps(self, label: int, draw: SceneDraw) -> Maps:
         """Premultiplied colour and opacity at given scene parameters."""
-        poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
+        poses = self._poses(label, draw)
         if draw.magnification is None:
             return Maps(*self._render(label, self.camera, poses, draw.weights))
         each = []  # every image has a camera of its own
@@ -142,6 +142,16 @@ class Scene:
         """That of an object's field, in which its images are made."""
         return next(self.fields[label].parameters()).dtype
 
+    def device(self, label: int) -> torch.device:
+        """That of an object's field, on which its images are made; draws are on the CPU."""
+        return next(self.fields[label].parameters()).device
+
+    def _poses(self, label: int, draw: SceneDraw) -> Float[Tensor, "n 4 4"]:
+        return orbit(draw.phi, draw.rho, draw.distance).to(self.device(label), self.dtype(label))
+
+    def _nuisance(self, label: int, count: int, generator: torch.Generator) -> Nuisance:
+        return self.synthesizer.draw_nuisance(count, self.camera, generator, self.device(label))
+
     def draw(
         self,
         label: int,
@@ -162,8 +172,8 @@ class Scene:
         self, label: int, draw: SceneDraw, names: tuple[str, ...]
     ) -> tuple[Maps, dict[str, Maps]]:
         """The maps, and their derivatives by the named numbers of the draw and by every weight of a light."""
-        poses = orbit(draw.phi, draw.rho, draw.distance).to(self.dtype(label))
-        rates = pose_rates(draw, names) if names else poses.new_zeros(0, *poses.shape)
+        poses = self._poses(label, draw)
+        rates = pose_rates(draw, names).to(poses) if names else poses.new_zeros(0, *poses.shape)
         if draw.weights is None:
             maps, moved = self.renderer.render_with_tangents(self.fields[label], self.camera, poses, rates)
             return maps, dict(zip(names, moved, strict=True))
@@ -190,8 +200,9 @@ class Scene:
             self._maps_with_tangents(label, draw, names) if names or lit else (self._maps(label, draw), None)
         )
         shared = 2 if relaxed.common_backgrounds else 1
-        nuisance = self.synthesizer.draw_nuisance(count // shared, self.camera, generator)
-        nuisance = nuisance.select(torch.arange(count) // shared)
+        nuisance = self._nuisance(label, count // shared, generator)
+        if shared > 1:
+            nuisance = nuisance.select(torch.arange(count) // shared)
         made = self._compose(label, draw, noise, maps, nuisance)
         return replace(made, relaxed=relaxed, tangents=tangents)
 

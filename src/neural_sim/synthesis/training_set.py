@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Nuisance:
-    """What varies between images and is not learned. ``shifts`` are (right, down) in pixels."""
+    """What varies between images and is not learned. ``shifts`` are (right, down) in pixels, on the CPU."""
 
     backgrounds: Float[Tensor, "n 3 h w"]
     shifts: Int[Tensor, "n 2"]
@@ -68,9 +68,11 @@ class Synthesizer:
                 f"synthesis.label_gradient must be ignored or differentiable, got {self.label_gradient!r}"
             )
 
-    def draw_nuisance(self, n: int, camera: PinholeCamera, generator: torch.Generator) -> Nuisance:
-        """Backgrounds and shifts of n images; independent of the scene parameters."""
-        backgrounds = self.background.draw(n, camera.height, camera.width, generator)
+    def draw_nuisance(
+        self, n: int, camera: PinholeCamera, generator: torch.Generator, device: torch.device | str = "cpu"
+    ) -> Nuisance:
+        """Backgrounds, on ``device``, and shifts of n images; independent of the scene parameters."""
+        backgrounds = self.background.draw(n, camera.height, camera.width, generator, device)
         return Nuisance(backgrounds, draw_shift(n, self.shift, camera.height, camera.width, generator))
 
     def compose(
@@ -93,8 +95,8 @@ class Synthesizer:
         boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
         labels = torch.where(present, label, -1)[:, None]
         made = LabelledImages(images, boxes, labels, bins.to(rgb.device))
-        missing = images_without_boxes(made)
-        if missing:
+        if _log.isEnabledFor(logging.DEBUG):  # counting makes the host wait for the device
+            missing = images_without_boxes(made)
             _log.debug("class %d: %d of %d images without a box", label, missing, len(made))
         return made
 
