@@ -116,6 +116,7 @@ def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, gen
     )
     assert added == pytest.approx(1.5 * sum(value.numel() for value in start.values()) * 0.01, rel=1e-4)
     module.on_train_epoch_end()
+    module.on_train_end()
     assert module.epoch_losses == [pytest.approx(float(detector.loss(start, features, targets)), rel=1e-6)]
 
 

@@ -58,6 +58,7 @@ class DetectorModule(pl.LightningModule):
         self.steps_done = 0
         self._losses: list[Tensor] = []
         self._sizes: list[int] = []
+        self._epochs: list[int] = []
 
     def parameters_by_name(self) -> Parameters:
         """The learned parameters as they are now, detached copies."""
@@ -82,11 +83,15 @@ class DetectorModule(pl.LightningModule):
         return tuple(x.to(device) for x in inputs), moved
 
     def on_train_epoch_end(self) -> None:
-        sizes = torch.tensor(self._sizes, dtype=torch.float64)
-        losses = torch.stack(self._losses).double().cpu()
-        self.epoch_losses.append(float((losses * sizes).sum() / sizes.sum()))
-        self.steps_done += len(self._sizes)
-        self._losses, self._sizes = [], []
+        self._epochs.append(len(self._sizes) - self.steps_done)
+        self.steps_done = len(self._sizes)
+
+    def on_train_end(self) -> None:
+        # All losses come to the host once, here: a trip in each epoch would let the device run dry.
+        losses = torch.stack(self._losses).cpu().double().split(self._epochs)
+        sizes = torch.tensor(self._sizes, dtype=torch.float64).split(self._epochs)
+        pairs = zip(losses, sizes, strict=True)
+        self.epoch_losses = [float((loss * size).sum() / size.sum()) for loss, size in pairs]
 
     def configure_optimizers(self) -> dict:
         decayed = [value for value in self._values if value.ndim > 1]

@@ -23,10 +23,14 @@ class NormalisedBackbone(nn.Module):
         self.backbone = backbone
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        mean = images.new_tensor(IMAGENET_MEAN).view(3, 1, 1)
-        std = images.new_tensor(IMAGENET_STD).view(3, 1, 1)
+        mean, std = (_channels(values, images) for values in (IMAGENET_MEAN, IMAGENET_STD))
         # A third faster on a CPU than the default layout, in both directions.
         return self.backbone(((images - mean) / std).contiguous(memory_format=torch.channels_last))
+
+
+def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
+    """A number for each channel, made where ``like`` is instead of copied there."""
+    return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 
 class Predictor(nn.Module):

@@ -221,25 +221,28 @@ class Detector:
         found, device = [], next(iter(trainable.values())).device
         for chunk in images.split(batch_size) if len(images) else ():
             logits, deltas = self.outputs(trainable, self.features(backbone, chunk.to(device)))
-            anchors = self.anchors.to(deltas)
-            pairs = zip(logits.sigmoid(), deltas, strict=True)
-            found += _on_cpu([self._detections(*pair, anchors) for pair in pairs])
+            found += self._detections(logits.sigmoid(), deltas)
         return found
 
     def _detections(
-        self,
-        scores: Float[Tensor, "anchors classes"],
-        deltas: Float[Tensor, "anchors 4"],
-        anchors: Float[Tensor, "anchors 4"],
-    ) -> dict[str, Tensor]:
+        self, scores: Float[Tensor, "n anchors classes"], deltas: Float[Tensor, "n anchors 4"]
+    ) -> list[dict[str, Tensor]]:
+        """The candidates of all images are chosen together and taken to the CPU, where each image has its own few."""
         levels = []
-        for level, first in zip(scores.split(self.anchors_per_level), self._first_anchors, strict=True):
-            best, index = level.flatten().topk(min(self.max_candidates, level.numel()))
-            keep = best > self.score_threshold
-            levels.append((best[keep], index[keep] + first * self.num_classes))
-        best, index = (torch.cat(part) for part in zip(*levels, strict=True))
+        for level, first in zip(scores.split(self.anchors_per_level, 1), self._first_anchors, strict=True):
+            best, index = level.flatten(1).topk(min(self.max_candidates, level[0].numel()))
+            levels.append((best, index + first * self.num_classes))
+        best, index = (torch.cat(part, 1) for part in zip(*levels, strict=True))
         anchor, labels = index // self.num_classes, index % self.num_classes
-        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas[anchor], anchors[anchor])
+        moves = deltas.gather(1, anchor[..., None].expand(-1, -1, 4))
+        chosen = (part.cpu() for part in (best, anchor, labels, moves))
+        return [self._suppressed(*image) for image in zip(*chosen, strict=True)]
+
+    def _suppressed(self, best: Tensor, anchor: Tensor, labels: Tensor, moves: Tensor) -> dict[str, Tensor]:
+        """One image's detections of its candidates."""
+        keep = best > self.score_threshold
+        best, anchor, labels, moves = (part[keep] for part in (best, anchor, labels, moves))
+        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(moves, self.anchors.to(moves)[anchor])
         boxes = clip_boxes_to_image(boxes, self.image_size)
         keep = batched_nms(boxes, best, labels, self.nms_iou)[: self.max_detections]
         return {"boxes": boxes[keep], "scores": best[keep], "labels": labels[keep]}
@@ -247,13 +250,6 @@ class Detector:
     @property
     def _first_anchors(self) -> list[int]:
         return [sum(self.anchors_per_level[:level]) for level in range(len(self.anchors_per_level))]
-
-
-def _on_cpu(detections: list[dict[str, Tensor]]) -> list[dict[str, Tensor]]:
-    """Detections of many images, brought to the CPU together."""
-    counts = [len(image["labels"]) for image in detections]
-    parts = {key: torch.cat([image[key] for image in detections]).cpu().split(counts) for key in detections[0]}
-    return [{key: parts[key][i] for key in parts} for i in range(len(detections))]
 
 
 def _check(**conditions: tuple[object, bool, str]) -> None:

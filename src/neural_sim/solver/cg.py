@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
-from neural_sim.solver.operator import Matvec, dot, norm
+from neural_sim.solver.operator import Matvec, dot, in_range, norm, numbers, plain_dot, plain_norm
 from neural_sim.solver.solution import Status
 
 
@@ -43,16 +43,18 @@ def conjugate_gradients(system: System, restart_gain: float, precondition: Matve
     direction = conditioned if begun is None else begun
     energy = dot(residual, conditioned)
     for step in range(1, system.max_steps + 1):
-        product = operator(direction)
-        curvature = dot(direction, product)
+        product = operator.measured(direction)
         # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich), so one
         # below machine epsilon is curvature that rounding cannot tell from zero.
-        if curvature <= torch.finfo(rhs.dtype).eps * norm(direction) * norm(product):
+        if product.energy <= torch.finfo(rhs.dtype).eps * product.size * product.length:
             return Iterate(best, Status.NEGATIVE_CURVATURE, step)
-        alpha = energy / curvature
+        alpha = energy / product.energy
         value = value + alpha * direction
-        residual = residual - alpha * product
-        size = norm(residual)
+        residual = residual - alpha * product.value
+        conditioned = residual if precondition is None else precondition(residual)
+        before = energy
+        size, energy = numbers(plain_norm(residual), plain_dot(residual, conditioned))
+        size = in_range(size, residual)
         if size < best_norm:
             best, best_norm = value, size
         restart = size <= tolerance
@@ -65,7 +67,7 @@ def conjugate_gradients(system: System, restart_gain: float, precondition: Matve
                 return Iterate(value, Status.STAGNATED, step, true)
             confirmed = best_norm = true
             best = value
-        conditioned = residual if precondition is None else precondition(residual)
-        before, energy = energy, dot(residual, conditioned)
+            conditioned = residual if precondition is None else precondition(residual)
+            energy = dot(residual, conditioned)
         direction = conditioned if restart else conditioned + (energy / before) * direction
     return Iterate(best, Status.MAX_STEPS, system.max_steps)

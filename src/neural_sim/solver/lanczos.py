@@ -10,7 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.base import Search
-from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
+from neural_sim.solver.operator import (
+    Matvec,
+    NonFiniteProduct,
+    Watched,
+    in_range,
+    norm,
+    numbers,
+    plain_norm,
+)
 
 
 @dataclass(frozen=True)
@@ -45,9 +53,7 @@ class Krylov:
         residual = -float(weights[-1, 0]) * self.beyond
         direction = residual + norm(self.beyond) ** 2 * float(weights[-1, 0]) * last
         found = Search(value, residual, direction)
-        return (
-            found if all(bool(torch.isfinite(part).all()) for part in (value, residual, direction)) else None
-        )
+        return found if bool(torch.isfinite(torch.stack([value, residual, direction])).all()) else None
 
 
 @dataclass(frozen=True)
@@ -99,18 +105,19 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
     finite = True
     for step in range(steps):
         try:
-            product = operator(basis[step])
+            made = operator.measured(basis[step])
         except NonFiniteProduct:
             finite = False
             break
-        reach = norm(product)
+        product, reach = made.value, made.length
         columns = basis[: step + 1]
         overlaps = columns @ product
         product = product - columns.T @ overlaps
         correction = columns @ product  # twice is enough (Parlett and Kahan)
         product = product - columns.T @ correction
-        alphas.append(float(overlaps[-1] + correction[-1]))
-        betas.append(norm(product))
+        alpha, beta = numbers(overlaps[-1] + correction[-1], plain_norm(product))
+        alphas.append(alpha)
+        betas.append(in_range(beta, product))
         beyond = product
         if betas[-1] <= 10.0 * torch.finfo(start.dtype).eps * reach:
             betas[-1] = 0.0  # an invariant subspace: its Ritz values are eigenvalues

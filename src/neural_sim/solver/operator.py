@@ -28,9 +28,28 @@ class Shifted:
         return self.matvec(vector) + self.shift * vector
 
 
+def numbers(*scalars: Float[Tensor, ""]) -> list[float]:
+    """Several scalars as numbers, in one trip: the host waits for the device once instead of for each."""
+    return torch.stack([scalar.double() for scalar in scalars]).tolist()
+
+
+def plain_norm(vector: Tensor) -> Float[Tensor, ""]:
+    """Euclidean norm accumulated in float64, where squares stay in its range; still on the device."""
+    return torch.linalg.vector_norm(vector, dtype=torch.float64)
+
+
+def plain_dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Inner product accumulated in float64, still on the device."""
+    return left.double() @ right.double()
+
+
 def norm(vector: Tensor) -> float:
     """Euclidean norm accumulated in float64, of float32 entries up to 1e38 and float64 entries of any size."""
-    size = float(torch.linalg.vector_norm(vector, dtype=torch.float64))
+    return in_range(float(plain_norm(vector)), vector)
+
+
+def in_range(size: float, vector: Tensor) -> float:
+    """``norm`` of a vector whose ``plain_norm`` is ``size``: measured again only where that left float64's range."""
     if 1e-140 < size < 1e150 or not bool(torch.isfinite(vector).all()):
         return size
     # Squares leave the range of float64: the same after scaling by a power of two, which is exact.
@@ -41,7 +60,17 @@ def norm(vector: Tensor) -> float:
 
 def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
     """Inner product accumulated in float64."""
-    return float(left.double() @ right.double())
+    return float(plain_dot(left, right))
+
+
+@dataclass(frozen=True)
+class Product:
+    """A product A v: its ``value``, ``energy`` v^T A v, ``size`` |v| and ``length`` |A v|."""
+
+    value: Float[Tensor, "n"]
+    energy: float
+    size: float
+    length: float
 
 
 class Watched:
@@ -62,19 +91,26 @@ class Watched:
         return self._matvec.shift if isinstance(self._matvec, Shifted) else 0.0
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        return self.measured(vector).value
+
+    def measured(self, vector: Float[Tensor, "n"]) -> Product:
+        """The product with what a solver wants to know of it, all of which comes to the host in one trip."""
         product = self._matvec(vector)
         if product.shape != vector.shape:
             raise ValueError(
                 f"operator: got a product of shape {tuple(product.shape)}, want {tuple(vector.shape)}"
             )
         self.products += 1
-        if not bool(torch.isfinite(product).all()):
+        finite, energy, size, length = numbers(
+            torch.isfinite(product).all(), plain_dot(vector, product), plain_norm(vector), plain_norm(product)
+        )
+        if not finite:
             raise NonFiniteProduct(f"product {self.products} of the operator is not finite")
-        size = norm(vector)
+        size, length = in_range(size, vector), in_range(length, product)
         if size > 0.0:
-            quotient = dot(vector, product) / size / size
+            quotient = energy / size / size
             self.observe(quotient, quotient)
-        return product
+        return Product(product, energy, size, length)
 
     def dense(self, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
         """The operator's matrix, by its own ``dense`` where it has one; counted as a product a column."""
