@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from torch.utils import _pytree as pytree
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
@@ -129,10 +130,14 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if goes_there or there:
         _check(func, name, args, kwargs.get("output_size"), there, here, goes_there)
     known = {id(x.raw): x for x in there}
+    asked = args
     args, kwargs = pytree.tree_map_only(PretendTensor, lambda x: x.raw, (args, kwargs))
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     made = func(*args, **kwargs)
+    if there and torch.Tag.inplace_view in func.tags:  # squeeze_ and its like: the wrapper takes the new shape too
+        with no_dispatch():
+            func(*asked, **kwargs)
     if name == "copy_":
         return known.get(id(made), made)
     if name == "_to_copy" and there and not goes_there and made is not None:

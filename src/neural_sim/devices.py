@@ -15,6 +15,8 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 
 DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 """torch's device type by ``trainer.accelerator``."""
+CACHES = 32
+"""How many times the work that fits a CPU's cache is handed to any other device at once."""
 
 
 def device_of(accelerator: str) -> torch.device:
@@ -52,6 +54,11 @@ def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False
     )
 
 
+def at_once(cacheful: int, device: torch.device) -> int:
+    """How much to work on at a time: what fits a CPU's cache, more where each launch and each wait costs."""
+    return cacheful if device.type == "cpu" else CACHES * cacheful
+
+
 def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[torch.Tensor]:
     """Small tensors of one type on ``device``, in one copy."""
     if all(tensor.device == torch.device(device) for tensor in tensors):
@@ -59,6 +66,14 @@ def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[t
     together = torch.cat([tensor.reshape(-1) for tensor in tensors]).to(device)
     parts = together.split([tensor.numel() for tensor in tensors])
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
+
+
+def peak_memory_mb(device: torch.device) -> dict[str, float]:
+    """Most memory so far in MB: the process's (``peak_memory_mb``) and, on a GPU, the tensors' (``peak_gpu_memory_mb``)."""
+    found = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+    if device.type == "cuda":
+        found["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20
+    return found
 
 
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import resource
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from neural_sim.artifacts import Artifacts
+from neural_sim.devices import peak_memory_mb
 from neural_sim.experiment import Experiment
 from neural_sim.plan import plan
 from neural_sim.report.run import (
@@ -85,7 +85,7 @@ class Pipeline:
             ap=scores,
             fields={name: self.made.field(name)["history"] for name in self.made.names},
             seconds=dict(self.made.account.seconds),
-            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            memory=peak_memory_mb(self.made.device),
             left_out=[dataclasses.asdict(omission) for omission in self.made.account.left_out],
             config=self.x.config,
             curve=self.curve() if evaluated else (),

@@ -12,8 +12,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.devices import at_once
+
 SCATTERED = 8192
-"""Samples whose derivatives are scattered at a time."""
+"""Samples whose derivatives are scattered at a time on a CPU."""
 
 CORNERS = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 """Offsets of a cell's eight vertices, in the order of ``trilinear_weights``."""
@@ -103,7 +105,8 @@ class _ScatterInterpolate(torch.autograd.Function):
         # A scatter of single numbers is faster on a CPU than one of rows, and pieces stay in its cache.
         gradient = cotangent.new_zeros(rows * channels)
         channel = torch.arange(channels, device=cotangent.device)
-        pieces = (part.split(SCATTERED) for part in (corners, weights, cotangent))
+        size = at_once(SCATTERED, cotangent.device)
+        pieces = (part.split(size) for part in (corners, weights, cotangent))
         for corner, weight, pulled in zip(*pieces, strict=True):
             place = torch.add(channel, corner.reshape(-1, 1).long(), alpha=channels)
             gradient.scatter_add_(0, place.view(-1), (weight[..., None] * pulled[:, None]).reshape(-1))

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from neural_sim.devices import at_once
 from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.field.samples import PackedSamples, Span
 from neural_sim.types import Rays
@@ -21,7 +22,7 @@ from neural_sim.types import Rays
 SHORTEST, LONGEST = 8, 64
 """Lattice steps taken at once by each ray that has reached a coarse occupied cell, powers of two."""
 POINTS = 131_072
-"""Below so many points a wave costs little more than its calls, and few rays take longer waves than many."""
+"""Below so many points a wave costs little more than its calls, and few rays take longer waves than many; on a CPU."""
 
 Axes = tuple[Tensor, Tensor, Tensor]
 
@@ -93,11 +94,12 @@ def march(
     unit = step / occupancy.cell
     ray, ahead, every = _enter(rays, occupancy, step, phase, span)
     nearest = occupancy.distance.flatten() if skip_empty else torch.zeros_like(occupancy.distance).flatten()
+    points = at_once(POINTS, ray.device)
     while len(ray):
         walk = every.select(ray)
         away, following = _leap(walk, ahead, occupancy, nearest, unit)
         length = SHORTEST
-        while 2 * length * len(ray) <= POINTS and length < LONGEST:
+        while 2 * length * len(ray) <= points and length < LONGEST:
             length *= 2
         # A long wave soon crosses the gap to an occupied coarse cell that is near.
         there = (away <= length // (4 * COARSENING)).nonzero()[:, 0]

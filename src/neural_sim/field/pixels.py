@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.cameras import focal_length
+from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.samples import Span
 from neural_sim.types import PinholeCamera, Rays
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
-"""Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one."""
+"""Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one.
+The largest is a CPU's."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ def seen_pixels(
     cull: bool = True,
 ) -> Iterator[SeenPixels]:
     """Chunks of at most ``rays_per_chunk`` pixels, in order; with ``cull`` only those that may see the field."""
-    strip = max(SMALLEST_STRIP, min(rays_per_chunk, LARGEST_STRIP))
+    strip = max(SMALLEST_STRIP, min(rays_per_chunk, at_once(LARGEST_STRIP, camera_to_world.device)))
     rows_per_strip = max(1, strip // camera.width)
     waiting: list[SeenPixels] = []
     for view, pose in enumerate(camera_to_world):

@@ -28,9 +28,17 @@ def sum_rays(
     values: Float[Tensor, "samples channels"], samples: PackedSamples
 ) -> Float[Tensor, "rays channels"]:
     """Sum each ray's samples; rays without samples give zero."""
-    running = torch.nn.functional.pad(values.double().cumsum(0), (0, 0, 1, 0))
+    running = torch.nn.functional.pad(_running(values.double()), (0, 0, 1, 0))
     ends = running.index_select(0, samples.starts)
     return (ends[1:] - ends[:-1]).to(values.dtype)
+
+
+def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
+    """Running sums over the samples, channel by channel where it is not the CPU that adds: CUDA walks the rows of a
+    matrix one by one, a single row in parallel."""
+    if values.device.type == "cpu":
+        return values.cumsum(0)
+    return torch.stack([channel.cumsum(0) for channel in values.unbind(-1)], -1)
 
 
 def transmittance(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
@@ -104,7 +112,7 @@ def composite_with_gradient(
     depth = sigma * samples.width
     weights = (passed * alpha_from_sigma(sigma, samples.width))[:, None]
     colour = torch.nn.functional.pad(rgb, (0, 1), value=1.0)
-    running = torch.nn.functional.pad((weights * colour).double().cumsum(0), (0, 0, 1, 0))
+    running = torch.nn.functional.pad(_running((weights * colour).double()), (0, 0, 1, 0))
     ends = running.index_select(0, samples.starts)
     behind = (ends[1:].index_select(0, samples.ray) - running[1:]).to(sigma.dtype)
     behind = behind.masked_fill((depth > OPAQUE_DEPTH)[:, None], 0.0)

@@ -17,7 +17,7 @@ from neural_sim.types import PinholeCamera, Rays
 FEW = 2
 """Up to so many rates each is taken through the samples; of more, a ray's derivatives by its six numbers."""
 SAMPLES_AT_ONCE = 16_384
-"""Samples asked for derivatives together: they keep to the cache."""
+"""Samples asked for derivatives together on a CPU: they keep to its cache."""
 
 
 def sample_points(

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import pixel_rays, seen_pixels
 from neural_sim.field.rendering import (
@@ -124,7 +125,7 @@ class NerfRenderer:
                 torch.cat([rays.origins[None][:0], *(rate.origins[None] for rate in moving)]),
                 torch.cat([rays.directions[None][:0], *(rate.directions[None] for rate in moving)]),
             )
-            samples_at_once = min(SAMPLES_AT_ONCE, 4 * self.rays_per_chunk)
+            samples_at_once = min(at_once(SAMPLES_AT_ONCE, value.device), 4 * self.rays_per_chunk)
             pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination, samples_at_once)
             value.view(-1, 4).index_copy_(0, seen.pixel, pixels)
             tangents.view(len(tangents), -1, 4).index_copy_(1, seen.pixel, moved)

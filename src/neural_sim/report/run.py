@@ -30,7 +30,8 @@ class RunResults:
     ``ap`` maps ns, learned, matched to scores. ``curve`` has what the method had spent (images, detector_steps,
     products, seconds) and what its psi was worth (``ap``) at every iteration that was scored.
 
-    ``symmetric_bins`` groups bins (from 1), by object and angle, whose views an object's symmetry makes the same.
+    ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
+    (from 1), by object and angle, whose views an object's symmetry makes the same.
     """
 
     experiment: str
@@ -43,7 +44,7 @@ class RunResults:
     ap: Mapping[str, Mapping[str, Any]]
     fields: Mapping[str, Sequence[Mapping[str, float]]]
     seconds: Mapping[str, float]
-    peak_memory_mb: float
+    memory: Mapping[str, float]
     left_out: Sequence[Mapping[str, Any]]
     config: Mapping[str, Any]
     curve: Sequence[Mapping[str, Any]] = ()
@@ -75,7 +76,7 @@ class RunResults:
                 "iterations": list(self.records),
                 "fields": {name: history[-1] for name, history in self.fields.items() if history},
                 "seconds": dict(self.seconds),
-                "peak_memory_mb": self.peak_memory_mb,
+                **self.memory,
                 "left_out": list(self.left_out),
             }
         )
@@ -119,7 +120,9 @@ class RunResults:
         if self.images_without_box():
             lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
-        lines.append(f"seconds: {spent}; peak memory {self.peak_memory_mb:.0f} MB")
+        gpu = self.memory.get("peak_gpu_memory_mb")
+        memory = f"{self.memory['peak_memory_mb']:.0f} MB" + ("" if gpu is None else f", on the GPU {gpu:.0f} MB")
+        lines.append(f"seconds: {spent}; peak memory {memory}")
         if self.left_out:
             lines.append(_left_out_line(self.left_out))
         return "\n".join(lines)

@@ -17,7 +17,7 @@ _CERTIFIED = (
 def track(results: RunResults, uri: str, folder: Path) -> str:
     """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
     metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}
-    metrics["peak_memory_mb"] = results.peak_memory_mb
+    metrics |= results.memory
     for which, scores in results.ap.items():
         metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
         metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
