@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils import _pytree as pytree
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
@@ -120,33 +119,47 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = func.overloadpacket.__name__
     if name == "_efficientzerotensor":  # a tensor without data, which kernels below this do not know
         func, name = aten.zeros.default, "zeros"
-    leaves = pytree.tree_leaves((args, kwargs))
-    there = [x for x in leaves if isinstance(x, PretendTensor)]
-    here = [x for x in leaves if isinstance(x, torch.Tensor) and not isinstance(x, PretendTensor)]
+    there: list[PretendTensor] = []
+    here: list[torch.Tensor] = []
+    drawn: list[torch.Generator] = []
+
+    def unwrapped(x: Any) -> Any:
+        if isinstance(x, PretendTensor):
+            there.append(x)
+            return x.raw
+        if isinstance(x, torch.Tensor):
+            here.append(x)
+        elif isinstance(x, torch.Generator):
+            drawn.append(x)
+        elif isinstance(x, (list, tuple)):
+            return type(x)(unwrapped(y) for y in x)
+        return x
+
+    raw, named = unwrapped(list(args)), {key: unwrapped(value) for key, value in kwargs.items()}
     device = kwargs.get("device")
     goes_there = bool(there) if device is None else torch.device(device).type == NAME
-    if goes_there and not (here and there) and any(isinstance(x, torch.Generator) for x in leaves):
+    if goes_there and drawn:
         raise Mixture(f"{func}: a CPU generator cannot draw on the device ({_place()})")
     if goes_there or there:
         _check(func, name, args, kwargs.get("output_size"), there, here, goes_there)
-    known = {id(x.raw): x for x in there}
-    asked = args
-    args, kwargs = pytree.tree_map_only(PretendTensor, lambda x: x.raw, (args, kwargs))
     if device is not None:
-        kwargs = {**kwargs, "device": torch.device("cpu")}
-    made = func(*args, **kwargs)
+        named["device"] = torch.device("cpu")
+    made = func(*raw, **named)
     if there and torch.Tag.inplace_view in func.tags:  # squeeze_ and its like: the wrapper takes the new shape too
         with no_dispatch():
-            func(*asked, **kwargs)
+            func(*args, **kwargs)
+    known = {id(x.raw): x for x in there}
     if name == "copy_":
         return known.get(id(made), made)
-    if name == "_to_copy" and there and not goes_there and made is not None:
-        return made
-    if not goes_there:
-        return made
-    return pytree.tree_map_only(
-        torch.Tensor, lambda x: known[id(x)] if id(x) in known else PretendTensor(x), made
-    )
+    return _wrapped(made, known) if goes_there else made
+
+
+def _wrapped(made: Any, known: dict[int, PretendTensor]) -> Any:
+    if isinstance(made, torch.Tensor):
+        return known[id(made)] if id(made) in known else PretendTensor(made)
+    if isinstance(made, (list, tuple)):
+        return type(made)(_wrapped(x, known) for x in made)
+    return made
 
 
 def _check(
@@ -246,10 +259,21 @@ class _Hook(torch._C._acc.PrivateUse1Hooks):
         return True
 
 
+_library = torch.library.Library("aten", "IMPL")
+
+
+def _never(*_: Any, **__: Any) -> Any:
+    raise Mixture("a kernel of the pretended device was reached outside of its context")
+
+
 def register() -> None:
     """Make the device known to torch, once a process and before its first backward pass, which counts the devices."""
     if not hasattr(torch, NAME):
         _setup_privateuseone_for_python_backend(NAME, _Module(), _Hook())
+        # CPU and CUDA have kernels of their own where other devices get a formula, whose rounding is another. Any
+        # kernel says that this one has, too; the mode stands before it.
+        for name in ("silu_backward",):
+            _library.impl(name, _never, "PrivateUse1")
 
 
 def _register_with_lightning() -> None:

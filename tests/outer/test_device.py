@@ -1,0 +1,104 @@
+"""The psi loop with its scene and detector on another device."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+from pretend_device import counted
+
+from neural_sim import devices
+from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.parameter.update import Mirror
+from neural_sim.settings import Outer
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.solver.damping import LanczosDamping
+from neural_sim.solver.hvp import HessianOperator
+from neural_sim.solver.operator import Shifted
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import join
+from neural_sim.synthesis.training_set import Synthesizer
+
+TINY = {
+    "num_classes": 2, "image_size": 32, "anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8,
+    "head_convs": 1, "architecture": "micro",
+}  # fmt: skip
+
+
+def _module(scene, estimator, device, epochs=1, iterations=1):
+    generator = torch.Generator().manual_seed(0)
+    detector, psi = Detector(**TINY), torch.zeros(2, 4)
+    scene = dataclasses.replace(
+        scene,
+        fields=tuple(copy.deepcopy(field).to(device) for field in scene.fields),
+        synthesizer=Synthesizer(ProceduralClutter(octaves=1, shapes=1), shift=0.1),
+    )
+    validation = join(scene.training_set(psi, 3, generator)).to("cpu")
+    settings = Outer(
+        Mirror(), iterations=iterations, images_per_object=4, epochs=epochs, curvature_images=4, pool_per_bin=2
+    )
+    params = devices.placed(detector.init(generator), torch.device(device))
+    inner = InnerLoop(scene, detector, params, validation, settings, 4, 0.0, generator, estimator.draws)
+    solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=2), max_steps=3)
+    return SimulatorModule(inner, psi, estimator, solver)
+
+
+ESTIMATORS = [
+    PathwiseEstimator(), PathwiseEstimator("reverse"), StratifiedEstimator(probes_per_bin=1), ReinforceEstimator()
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
+    monkeypatch.setattr(devices, "CACHES", 1)  # sums in the CPU's pieces have its rounding
+    found = []
+    for device in ("cpu", "pretend"):
+        module = _module(scene, estimator, device)
+        found.append(learn_psi(module, progress=False))
+        assert {value.device.type for value in module.inner.theta.values()} == {device}
+        assert module.psi.device.type == "cpu"
+    # Up to the rounding of second derivatives, which the device takes by formulas where the CPU has kernels.
+    assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
+    losses = [[record.validation_loss for record in learned.records] for learned in found]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+
+
+def test_detector_steps_wait_for_nothing(scene, pretend):
+    """Each epoch brings its order to the device; all else is once a training, however many steps."""
+    trips = {}
+    for epochs in (1, 5):
+        module = _module(scene, StratifiedEstimator(probes_per_bin=1), "pretend", epochs)
+        cached = dataclasses.replace(module.inner.validation)
+        with counted() as ledger:
+            module.inner.train(cached)
+        trips[epochs] = ledger
+    assert trips[5].count("to_device") - trips[1].count("to_device") == 4
+    assert trips[5].count("wait", "to_host") == trips[1].count("wait", "to_host")
+
+
+def test_a_product_of_conjugate_gradients_waits_twice(scene, pretend):
+    module = _module(scene, StratifiedEstimator(probes_per_bin=1), "pretend")
+    inner, generator = module.inner, torch.Generator().manual_seed(0)
+    operator = HessianOperator(inner.validation.mean_terms(), inner.trainable, retain_graph=True)
+    b = torch.randn(operator.size, generator=generator).to("pretend")
+    trips = {}
+    for steps in (2, 6):
+        with counted() as ledger:
+            solution = ConjugateGradient().solve(Shifted(operator, 100.0), b, rtol=0.0, max_steps=steps)
+        trips[solution.products] = ledger.count()
+    (few, first), (many, last) = trips.items()
+    assert many - few == 4 and last - first == 2 * 4
+
+
+def test_images_and_features_stay_on_the_device(scene, pretend):
+    """What returns to the CPU in an iteration are numbers: less than one image of the training set."""
+    module = _module(scene, StratifiedEstimator(probes_per_bin=1), "pretend")
+    with counted() as ledger:
+        module.training_step(0, 0)
+    back = sum(size for (kind, _, _), size in ledger.moved.items() if kind == "to_host")
+    assert back < 3 * 32 * 32 * 4

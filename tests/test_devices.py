@@ -1,0 +1,38 @@
+"""Where a run computes."""
+
+import pytest
+import torch
+from pretend_device import counted
+
+from neural_sim import devices
+
+
+def test_a_gpu_that_is_not_there_is_refused_with_the_key():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(ValueError, match="trainer=gpu: no cuda device"):
+        devices.device_of("gpu")
+    with pytest.raises(ValueError, match=r"trainer\.accelerator"):
+        devices.device_of("tpu")
+    assert devices.device_of("cpu") == torch.device("cpu")
+
+
+def test_one_place_chooses_the_device(pretend, monkeypatch):
+    monkeypatch.setitem(devices.DEVICES, "gpu", "pretend")
+    device = devices.device_of("gpu")
+    trainer = devices.trainer_on(device)
+    assert device == torch.device("pretend", 0) and trainer.strategy.root_device == device
+
+
+def test_many_small_tensors_move_in_one_copy(pretend):
+    parts = [torch.arange(6.0).view(2, 3), torch.ones(()), torch.zeros(0, 4)]
+    with counted() as ledger:
+        there = devices.moved(parts, "pretend")
+    assert ledger.count() == 1
+    assert all(torch.equal(x.cpu(), y) and x.device.type == "pretend" for x, y in zip(there, parts, strict=True))
+    assert all(x is y for x, y in zip(devices.moved(parts, "cpu"), parts, strict=True))
+
+
+def test_memory_of_a_gpu_is_reported_only_where_there_is_one():
+    found = devices.peak_memory_mb(torch.device("cpu"))
+    assert set(found) == {"peak_memory_mb"} and found["peak_memory_mb"] > 10.0
