@@ -21,11 +21,12 @@ from pathlib import Path
 
 import torch
 from field import fit, load_objects, training_views  # the benchmark beside this one
-from machine import machine
+from machine import add_device, forget_peak, machine
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from neural_sim import cameras
+from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
 from neural_sim.field.training import load_field, save_field
 from neural_sim.gradient.pathwise import contract, patch_rays
@@ -58,7 +59,7 @@ class Case:
         return self.renderer.render_with_tangents(self.field, self.camera, self.pose, self.rates)
 
 
-def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) -> Case:
+def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int, device: torch.device) -> Case:
     """The first three numbers are phi, rho and distance, the others random directions of the pose's twelve entries."""
     generator = torch.Generator().manual_seed(0)
     camera = PinholeCamera(size, size, math.radians(40.0))
@@ -68,8 +69,9 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
     rates[:3] = pose_rates(draw, RIGID)
     cotangent = torch.randn(1, size, size, 4, generator=generator)
     pose = cameras.orbit(draw.phi, draw.rho, draw.distance)
+    cotangent = cotangent.to(device)
     maps = Maps(cotangent[..., :3], cotangent[..., 3])
-    return Case(field, renderer, camera, pose, rates[:numbers], maps)
+    return Case(field.to(device), renderer, camera, pose.to(device), rates[:numbers].to(device), maps)
 
 
 def forward(of: Case) -> Tensor:
@@ -81,9 +83,9 @@ def reverse(of: Case, patch: int) -> Tensor:
     """As ``draw_cotangents``, for a camera that moves linearly in any number of numbers."""
     of.renderer.render(of.field, of.camera, of.pose)
     rgb, opacity = of.maps.rgb.reshape(-1, 3), of.maps.opacity.reshape(-1)
-    total = torch.zeros(len(of.rates))
-    for pixels in torch.arange(len(opacity)).split(patch):
-        numbers = torch.zeros(len(of.rates), requires_grad=True)
+    total = torch.zeros(len(of.rates), device=of.pose.device)
+    for pixels in torch.arange(len(opacity), device=of.pose.device).split(patch):
+        numbers = torch.zeros_like(total, requires_grad=True)
         pose = of.pose + torch.einsum("m,mnij->nij", numbers, of.rates)
         rendered = of.renderer.render_rays(of.field, patch_rays(of.camera, pose, pixels))
         (part,) = torch.autograd.grad(
@@ -93,8 +95,13 @@ def reverse(of: Case, patch: int) -> Tensor:
     return total
 
 
-def peak_bytes(run: Callable[[], object]) -> int:
-    """Most bytes that torch held at once, beyond what it held before."""
+def peak_bytes(run: Callable[[], object], device: torch.device | None = None) -> int:
+    """Most bytes that torch held at once on a GPU, else on the CPU, beyond what it held before."""
+    if device is not None and device.type == "cuda":
+        before = torch.cuda.memory_allocated(device)
+        forget_peak(device)
+        run()
+        return torch.cuda.max_memory_allocated(device) - before
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
         run()
     held, most = 0, 0
@@ -109,16 +116,19 @@ def peak_bytes(run: Callable[[], object]) -> int:
 
 
 def measure(of: Case, name: str, run: Callable[[Case], Tensor], repeats: int) -> dict[str, object]:
+    device = of.pose.device
     value, seconds, processor = run(of), [], []
+    synchronise(device)
     for _ in range(repeats):
         begun, worked = time.perf_counter(), time.process_time()
         run(of)
+        synchronise(device)
         seconds.append(time.perf_counter() - begun)
         processor.append(time.process_time() - worked)
-    peak = working = peak_bytes(lambda: run(of))
+    peak = working = peak_bytes(lambda: run(of), device)
     outputs = of.map_bytes(1)
     if name.startswith("forward"):
-        working, outputs = peak_bytes(of.render), of.map_bytes(1 + len(of.rates))
+        working, outputs = peak_bytes(of.render, device), of.map_bytes(1 + len(of.rates))
     return {
         "method": name,
         "size": of.camera.width,
@@ -167,6 +177,7 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=512, help="rays under way at once, to compare memory")
     parser.add_argument("--quality", default="final")
     parser.add_argument("--repeats", type=int, default=3)
+    add_device(parser)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/hypergradient.json"))
     arguments = parser.parse_args()
@@ -174,7 +185,7 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     if arguments.field is None or not arguments.field.exists():
         item = load_objects(arguments.root, arguments.names)[0]
-        fitted, _ = fit(training_views(item, 128, 100), arguments.steps, 0)
+        fitted, _ = fit(training_views(item, 128, 100), arguments.steps, 0, arguments.device)
         if arguments.field is not None:
             save_field(fitted, arguments.field)
     else:
@@ -187,7 +198,7 @@ def main() -> None:
     rows, ratios = [], []
     print(f"{'size':>5}{'m':>4}  {'method':24}{'ms':>9}{'cpu ms':>9}{'peak MB':>9}{'working MB':>12}")
     for size, numbers in asked:
-        of = case(fitted, renderer, size, numbers)
+        of = case(fitted, renderer, size, numbers, arguments.device)
         patches = tuple(p for p in arguments.patches if size <= arguments.largest_reverse or p >= 4096)
         some = []
         runs = [(of, name, run) for name, run in methods(size, patches).items()]
@@ -203,7 +214,7 @@ def main() -> None:
         ratios.append({"size": size, "numbers": numbers, **compare(some)})
         print("      ", {key: float(f"{value:.3g}") for key, value in ratios[-1].items()}, flush=True)
         rows += some
-    result = {"machine": machine(), "chunk": arguments.chunk, "ratios": ratios, "rows": rows}
+    result = {"machine": machine(arguments.device), "chunk": arguments.chunk, "ratios": ratios, "rows": rows}
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(result, indent=2))
 

@@ -17,9 +17,10 @@ from pathlib import Path
 import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
 from hypergradient import peak_bytes
-from machine import machine
+from machine import add_device, machine
 
 from neural_sim import cameras
+from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.renderer.nerf import NerfRenderer, Quality
@@ -41,12 +42,15 @@ def variants(qualities: list[Quality], undo: bool) -> dict[str, NerfRenderer]:
 def measure(
     field: RadianceField, renderer: NerfRenderer, views: PosedViews, size: int, repeats: int
 ) -> dict[str, float]:
-    camera, pose = PinholeCamera(size, size, math.radians(40.0)), views.camera_to_world[-HELD_OUT:]
+    device = next(field.parameters()).device
+    camera, pose = PinholeCamera(size, size, math.radians(40.0)), views.camera_to_world[-HELD_OUT:].to(device)
     rgb, opacity = renderer.render(field, camera, pose)
+    synchronise(device)
     seconds, processor = [], []
     for _ in range(repeats):
         begun, worked = time.perf_counter(), time.process_time()
         renderer.render(field, camera, pose)
+        synchronise(device)
         seconds.append((time.perf_counter() - begun) / len(pose))
         processor.append((time.process_time() - worked) / len(pose))
     every_rgb, every_opacity = renderer.render(field, camera, pose, exact=True)
@@ -61,7 +65,7 @@ def measure(
         "milliseconds": 1e3 * statistics.median(seconds),
         "cpu_milliseconds": 1e3 * statistics.median(processor),
         "images_per_second": 1.0 / statistics.median(seconds),
-        "peak_megabytes": peak_bytes(lambda: renderer.render(field, camera, pose)) / 2**20,
+        "peak_megabytes": peak_bytes(lambda: renderer.render(field, camera, pose), device) / 2**20,
         "rays_cast": cast / (len(pose) * size * size),
         "rays_hit": hit / len(rays.origins),
         "samples_per_hit_ray": len(samples) / max(hit, 1),
@@ -79,6 +83,7 @@ def main() -> None:
     parser.add_argument("--qualities", nargs="*", default=["draft", "normal", "final"])
     parser.add_argument("--omit-size", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=3)
+    add_device(parser)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/render.json"))
     arguments = parser.parse_args()
@@ -91,7 +96,7 @@ def main() -> None:
     )
     for item in load_objects(arguments.root, arguments.names):
         views = training_views(item, 128, 100)
-        field, _ = fit(views, arguments.steps, 0)
+        field, _ = fit(views, arguments.steps, 0, arguments.device)
         for size in arguments.sizes:
             for name, renderer in variants(arguments.qualities, size == arguments.omit_size).items():
                 row = measure(field, renderer, views, size, arguments.repeats)
@@ -103,7 +108,7 @@ def main() -> None:
                     flush=True,
                 )
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=2))
+    arguments.out.write_text(json.dumps({"machine": machine(arguments.device), "rows": rows}, indent=2))
 
 
 if __name__ == "__main__":

@@ -145,7 +145,9 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if device is not None:
         named["device"] = torch.device("cpu")
     made = func(*raw, **named)
-    if there and torch.Tag.inplace_view in func.tags:  # squeeze_ and its like: the wrapper takes the new shape too
+    if (
+        there and torch.Tag.inplace_view in func.tags
+    ):  # squeeze_ and its like: the wrapper takes the new shape too
         with no_dispatch():
             func(*args, **kwargs)
     known = {id(x.raw): x for x in there}

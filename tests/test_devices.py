@@ -29,7 +29,9 @@ def test_many_small_tensors_move_in_one_copy(pretend):
     with counted() as ledger:
         there = devices.moved(parts, "pretend")
     assert ledger.count() == 1
-    assert all(torch.equal(x.cpu(), y) and x.device.type == "pretend" for x, y in zip(there, parts, strict=True))
+    assert all(
+        torch.equal(x.cpu(), y) and x.device.type == "pretend" for x, y in zip(there, parts, strict=True)
+    )
     assert all(x is y for x, y in zip(devices.moved(parts, "cpu"), parts, strict=True))
 
 

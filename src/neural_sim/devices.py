@@ -68,8 +68,14 @@ def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[t
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
+def synchronise(device: torch.device) -> None:
+    """Wait for the device, so that a clock read next has its work in it; nothing on a CPU."""
+    if device.type != "cpu":
+        torch.get_device_module(device).synchronize(device)
+
+
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """Most memory so far in MB: the process's (``peak_memory_mb``) and, on a GPU, the tensors' (``peak_gpu_memory_mb``)."""
+    """Most memory so far in MB: of the process (``peak_memory_mb``), and of tensors on a GPU (``peak_gpu_memory_mb``)."""
     found = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
     if device.type == "cuda":
         found["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20

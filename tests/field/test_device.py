@@ -29,9 +29,9 @@ def _fit(views, device, make, held_out=0, progress=None, steps=24):
     torch.manual_seed(0)  # of the colour head's layers
     fitting = make(device)
     generator = torch.Generator().manual_seed(0)
-    return fit_field(
-        views.to(device), fitting, generator, steps=steps, held_out=held_out, progress=progress
-    )[0]
+    return fit_field(views.to(device), fitting, generator, steps=steps, held_out=held_out, progress=progress)[
+        0
+    ]
 
 
 def _grid(device):
@@ -114,6 +114,8 @@ def test_a_render_waits_twice_a_view_and_four_times_a_wave(lit_ball, pretend):
     there, at = field.grid.to(DEVICE), poses.repeat(4, 1, 1).to(DEVICE)
     with counted() as ledger:
         NerfRenderer().render(there, CAMERA, at)
-    views = sum(n for (_, _, place), n in ledger.trips.items() if "screen.py" in place or "pixels.py" in place)
+    views = sum(
+        n for (_, _, place), n in ledger.trips.items() if "screen.py" in place or "pixels.py" in place
+    )
     assert views == 2 * len(at)
     assert ledger.count() - views <= 2 + 4 * 4  # two to enter the grid, few waves behind one another

@@ -40,7 +40,12 @@ def _module(scene, estimator, device, epochs=1, iterations=1):
     )
     validation = join(scene.training_set(psi, 3, generator)).to("cpu")
     settings = Outer(
-        Mirror(), iterations=iterations, images_per_object=4, epochs=epochs, curvature_images=4, pool_per_bin=2
+        Mirror(),
+        iterations=iterations,
+        images_per_object=4,
+        epochs=epochs,
+        curvature_images=4,
+        pool_per_bin=2,
     )
     params = devices.placed(detector.init(generator), torch.device(device))
     inner = InnerLoop(scene, detector, params, validation, settings, 4, 0.0, generator, estimator.draws)

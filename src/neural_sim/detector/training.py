@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neural_sim.devices import trainer_on
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
+from neural_sim.devices import trainer_on
 from neural_sim.types import LabelledImages
 
 
@@ -60,7 +60,8 @@ def train_detector(
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
     Args:
-        images: on the device of ``params``; where they come as features, the backbone stays frozen: the pyramid and the head are trained.
+        images: on the device of ``params``; where they come as features, the backbone stays frozen: the pyramid and
+            the head are trained.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
         proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
 

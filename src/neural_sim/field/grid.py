@@ -60,7 +60,9 @@ class GridField(RadianceField):
         self.features, self.head_width = features, head_width
         self.step_cells, self.initial_density, self.density_gain = step_cells, initial_density, density_gain
         self.directed = head_width > 0
-        layers = (nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)) if head_width else ()
+        layers = (
+            (nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)) if head_width else ()
+        )
         self.head = nn.Sequential(*layers) if head_width else None
         self.table = nn.Parameter(torch.zeros(1, 1 + features))
         saved = ("occupied", "origin", "cell")

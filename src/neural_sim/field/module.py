@@ -10,6 +10,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader
 
+from neural_sim.devices import synchronise
 from neural_sim.field.objective import Fitting
 from neural_sim.types import PosedViews
 
@@ -89,6 +90,7 @@ class RadianceFieldModule(lightning.LightningModule):
     def _score(self) -> None:
         if self.held_out is None:
             return
+        synchronise(self.held_out.images.device)
         now = time.perf_counter()
         self.field.eval()
         scores = self.fitting.score(self.held_out, TERMINATION, RAYS_PER_CHUNK)

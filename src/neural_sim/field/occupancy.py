@@ -11,6 +11,7 @@ from torch.nn import functional
 
 COARSENING = 4
 """Fine cells along one edge of a coarse cell, in which rays skip empty space."""
+NOTHING = "occupancy: no cell is occupied, want at least one (silhouettes empty or all pruned?)"
 FARTHEST = 16
 """Largest skip, in coarse cells."""
 
@@ -41,9 +42,7 @@ class Occupancy:
 def build_occupancy(occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> Occupancy:
     """Number the occupied cells and measure distances to them. Raises ValueError when no cell is occupied."""
     if not bool(occupied.any()):
-        raise ValueError(
-            "occupancy: no cell is occupied, want at least one (silhouettes empty or all pruned?)"
-        )
+        raise ValueError(NOTHING)
     number = occupied.flatten().cumsum(0, dtype=torch.int32).view(occupied.shape) - 1
     index = torch.where(occupied, number, torch.full_like(number, -1))
     return Occupancy(origin, cell, index, _coarse_distance(occupied))
@@ -76,8 +75,10 @@ def subdivide(occupied: Bool[Tensor, "nx ny nz"]) -> Bool[Tensor, "mx my mz"]:
 def crop(
     occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float
 ) -> tuple[Bool[Tensor, "mx my mz"], Float[Tensor, "3"]]:
-    """Cut away empty margins; returns the smaller grid and its origin."""
+    """Cut away empty margins; returns the smaller grid and its origin. Raises ValueError when no cell is occupied."""
     where = occupied.nonzero()
+    if not len(where):
+        raise ValueError(NOTHING)
     low = where.min(0).values
     (x, y, z), (u, v, w) = torch.stack([low, where.max(0).values + 1]).tolist()
     inside = occupied[x:u, y:v, z:w].contiguous()

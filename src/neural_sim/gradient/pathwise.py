@@ -158,7 +158,9 @@ def draw_cotangents(
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
-    numbers = dict(zip(RIGID, moved([getattr(draw, name).detach() for name in RIGID], rgb.device), strict=True))
+    numbers = dict(
+        zip(RIGID, moved([getattr(draw, name).detach() for name in RIGID], rgb.device), strict=True)
+    )
     total = {name: torch.zeros_like(number) for name, number in numbers.items()}
     for pixels in live.split(patch_size) if len(live) else ():
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}

@@ -14,7 +14,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
-from neural_sim.devices import placed
+from neural_sim.devices import placed, synchronise
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.settings import Outer
 from neural_sim.synthesis.pool import ImagePool
@@ -23,10 +23,11 @@ from neural_sim.types import LabelledImages
 
 
 @contextmanager
-def timed(seconds: dict[str, float], phase: str) -> Iterator[None]:
-    """Add the seconds spent inside to those of a phase."""
+def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterator[None]:
+    """Add the seconds spent inside, the device's work for it included, to those of a phase."""
     begin = time.perf_counter()
     yield
+    synchronise(device)
     seconds[phase] = seconds.get(phase, 0.0) + time.perf_counter() - begin
 
 
@@ -39,10 +40,11 @@ class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
     The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each time
-    an iteration asks, on the device of ``params``, where the scene's fields are too. ``validation`` is the labelled target set; no step sees any other real image. ``draws`` says how
-    the method wants images drawn. Relaxed ones, and those under a light that moves, are always rendered anew, all
-    others come from a pool of every bin. ``images`` and ``steps`` count labelled images made and optimiser steps;
-    ``cpu_begun`` is the processor time at which the pool was begun.
+    an iteration asks, on the device of ``params``, where the scene's fields are too. ``validation`` is the labelled
+    target set, anywhere; no step sees any other real image. ``draws`` says how the method wants images drawn. Relaxed
+    ones, and those under a light that moves, are always rendered anew, all others come from a pool of every bin.
+    ``images`` and ``steps`` count labelled images made and optimiser steps; ``cpu_begun`` is the processor time at
+    which the pool was begun.
     """
 
     def __init__(
@@ -61,13 +63,13 @@ class InnerLoop:
         self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
         self.backbone, self.warm_start = detector.split(params)
         self.validation = CachedSet.of(detector, self.backbone, validation)
-        self.draws = draws
+        self.draws, self.device = draws, self.validation.device
         self.pool: ImagePool | None = None
         begun, self.cpu_begun = time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
+        synchronise(self.device)
         self.pool_seconds = time.perf_counter() - begun
-        self.device = self.validation.device
         self._start = params
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}

@@ -51,19 +51,19 @@ class SimulatorModule(OuterLoop):
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         seconds: dict[str, float] = {}
-        with timed(seconds, "render"):
+        with timed(seconds, "render", self.inner.device):
             rendered = self.inner.draw(self.psi)
             images = join(rendered)
-        with timed(seconds, "probes"):
+        with timed(seconds, "probes", self.inner.device):
             self._draw_probes()
-        with timed(seconds, "features"):
+        with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
-        with timed(seconds, "train"):
+        with timed(seconds, "train", self.inner.device):
             training_loss = self.inner.train(cached)
-        with timed(seconds, "hypergradient"):
+        with timed(seconds, "hypergradient", self.inner.device):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
-        with timed(seconds, "certify"):
+        with timed(seconds, "certify", self.inner.device):
             check = self._check(result)
         certificate = certify(
             result, self.scene.names, check, self.settings.trust, self.settings.on_untrusted

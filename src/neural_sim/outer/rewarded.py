@@ -22,14 +22,14 @@ class RewardLoop(OuterLoop):
     def training_step(self, batch: int, batch_idx: int) -> None:
         seconds: dict[str, float] = {}
         asked = self.search.ask()
-        with timed(seconds, "render"):
+        with timed(seconds, "render", self.inner.device):
             rendered = self.inner.draw(asked)
             images = join(rendered)
-        with timed(seconds, "features"):
+        with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
-        with timed(seconds, "train"):
+        with timed(seconds, "train", self.inner.device):
             training_loss = self.inner.train(cached)
-        with timed(seconds, "reward"):
+        with timed(seconds, "reward", self.inner.device):
             record = self.record(asked, images, training_loss, seconds)
         self.search.tell(-record.validation_loss, [part.draw for part in rendered])
         self.psi.data = self.search.psi.clone()

@@ -121,7 +121,9 @@ class RunResults:
             lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
         gpu = self.memory.get("peak_gpu_memory_mb")
-        memory = f"{self.memory['peak_memory_mb']:.0f} MB" + ("" if gpu is None else f", on the GPU {gpu:.0f} MB")
+        memory = f"{self.memory['peak_memory_mb']:.0f} MB" + (
+            "" if gpu is None else f", on the GPU {gpu:.0f} MB"
+        )
         lines.append(f"seconds: {spent}; peak memory {memory}")
         if self.left_out:
             lines.append(_left_out_line(self.left_out))
