@@ -32,11 +32,13 @@ def device_of(accelerator: str) -> torch.device:
 
 
 class Resident(SingleDeviceStrategy):
-    """One device, on which modules and optimisers stay: Lightning's own moves each tensor to the CPU after a fit."""
+    """One device, on which modules and optimisers stay, and whose memory stays with torch.
+
+    Lightning's own moves each tensor to the CPU after a fit and frees what the allocator keeps for the next one.
+    """
 
     def teardown(self) -> None:
-        if self.accelerator is not None:
-            self.accelerator.teardown()
+        return
 
 
 def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False) -> Trainer:
@@ -75,7 +77,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """Most memory so far in MB: of the process (``peak_memory_mb``), and of tensors on a GPU (``peak_gpu_memory_mb``)."""
+    """Most memory so far in MB: of the process (``peak_memory_mb``) and a GPU's tensors (``peak_gpu_memory_mb``)."""
     found = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
     if device.type == "cuda":
         found["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20

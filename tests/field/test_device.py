@@ -1,5 +1,6 @@
 """Fields on another device: the CPU's numbers bit for bit, with few trips between host and device."""
 
+import dataclasses
 import math
 from functools import partial
 
@@ -12,6 +13,8 @@ from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
 from neural_sim.field.fitting import BATCHES_PER_BLOCK, GridFitting
 from neural_sim.field.grid import GridField
+from neural_sim.field.mlp import MLPField
+from neural_sim.field.mlp_fitting import MLPFitting
 from neural_sim.field.training import fit_field
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
@@ -43,6 +46,17 @@ def _grid_w(device):
     return AppearanceFitting(field, GRID)
 
 
+def _photographs(device):
+    """Codes of the views' own, fitted to held-out views too, and transients in front of the object."""
+    field = AppearanceField(code_size=4, head_width=8, view_dependent=True).to(device)
+    return AppearanceFitting(field, GRID, shared_lights=False, anchors=2, transients=True)
+
+
+def _network(device):
+    field = MLPField(width=8, depth=2, coarse_samples=4, fine_samples=4)
+    return MLPFitting(field.to(device), batch_rays=64)
+
+
 def _functions(lines):
     """``file:function`` of ledger places, which are ``file:line function``."""
     return {f"{place.split(':')[0]}:{place.split()[-1]}" for place in lines}
@@ -54,10 +68,12 @@ def same_pieces(monkeypatch):
     monkeypatch.setattr(devices, "CACHES", 1)
 
 
-@pytest.mark.parametrize("make", [_grid, _grid_w])
+@pytest.mark.parametrize("make", [_grid, _grid_w, _photographs, _network])
 def test_a_field_is_fitted_as_on_the_cpu(lit_ball, pretend, same_pieces, make):
-    views = lit_ball(14, 0)
-    here, there = (_fit(views, device, make, held_out=2) for device in (CPU, DEVICE))
+    views, steps = lit_ball(14, 0), 10 if make is _network else 24
+    if make is _photographs:
+        views = dataclasses.replace(views, light_weights=None)
+    here, there = (_fit(views, device, make, held_out=2, steps=steps) for device in (CPU, DEVICE))
     for (name, want), got in zip(here.state_dict().items(), there.state_dict().values(), strict=True):
         assert got.device.type == "pretend" or name.endswith("cell")
         assert torch.equal(got.cpu(), want), name

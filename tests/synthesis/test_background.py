@@ -104,3 +104,11 @@ def test_missing_empty_and_broken_photos_are_refused_with_their_path(tmp_path: P
     (tmp_path / "broken.png").write_bytes(b"not an image")
     with pytest.raises(ValueError, match=r"broken\.png: not a readable photograph"):
         PhotoFolder(tmp_path).draw(1, 8, 8, torch.Generator())
+
+
+def test_another_device_gets_the_cpus_clutter_in_two_copies_a_chunk(pretend):
+    made = [
+        ProceduralClutter().draw(20, 16, 24, torch.Generator().manual_seed(7), d) for d in ("cpu", "pretend")
+    ]
+    assert made[1].device.type == "pretend" and torch.equal(made[1].cpu(), made[0])
+    assert pretend.count("to_device") == 2 * 2 and not pretend.count("wait")

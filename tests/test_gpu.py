@@ -1,0 +1,47 @@
+"""A whole run with `trainer=gpu`, on the pretended device, beside the same run on the CPU."""
+
+import json
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim import devices
+from neural_sim.main import build, conf_directory
+from neural_sim.pipeline import run
+
+RUNS = {
+    "stratified": [],
+    "pathwise": ["gradient=pathwise"],
+    "light": ["renderer=nerf_w", "parameter=[pose,illumination]"],
+}
+
+
+def _results(folder, trainer, overrides):
+    paths = [f"paths.store={folder}/store", f"paths.mlflow={folder}/mlflow.db", f"trainer={trainer}"]
+    chosen = [
+        "+experiment=pose_gap",
+        "scale=smoke",
+        "progress=false",
+        "objects.names=[pitcher,drill]",
+        *paths,
+    ]
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        experiment = build(compose("config", [*chosen, *overrides]))
+    run(experiment, folder / "run")
+    return json.loads((folder / "run" / "results.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_on_a_gpu_gives_what_the_cpu_gives(tmp_path, pretend, monkeypatch, name):
+    monkeypatch.setitem(devices.DEVICES, "gpu", "pretend")
+    monkeypatch.setattr(devices, "CACHES", 1)  # sums in the CPU's pieces have its rounding
+    here, there = (_results(tmp_path / trainer, trainer, RUNS[name]) for trainer in ("cpu", "gpu"))
+    assert pretend.calls > 10_000
+    for scores in (here["fields"], there["fields"]):
+        for history in scores.values():
+            history.pop("seconds")
+    assert there["fields"] == here["fields"] and there["ap"]["ns"] == here["ap"]["ns"]
+    for object_name, factors in here["psi"].items():
+        for factor, psi in factors.items():
+            assert there["psi"][object_name][factor]["learned"] == pytest.approx(psi["learned"], abs=1e-3)
