@@ -7,23 +7,17 @@ wrapped, and keeps a ``Ledger``. What this cannot show: whether CUDA has a kerne
 
 from __future__ import annotations
 
-import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
-
-import neural_sim
+from trips import Ledger, ledgers, place
 
 NAME = "pretend"
-PACKAGE = str(Path(neural_sim.__file__).parent)
 aten = torch.ops.aten
 BINARY = {
     "add", "add_", "sub", "sub_", "rsub", "mul", "mul_", "div", "div_", "true_divide", "floor_divide", "remainder",
@@ -40,46 +34,6 @@ WAITING = {"_local_scalar_dense", "equal", "nms", "nonzero", "masked_select", "b
 
 class Mixture(RuntimeError):
     """An operation that a GPU would refuse."""
-
-
-@dataclass
-class Ledger:
-    """What the host waited for or moved, by (kind, operation, place); ``calls`` counts operations on the device.
-
-    Kinds: ``wait`` (a number or a size that depends on values), ``to_host``, ``to_device``. The place is the innermost
-    line of the package, none in a backward pass. ``moved`` are the bytes of the copies.
-    """
-
-    trips: Counter[tuple[str, str, str]] = field(default_factory=Counter)
-    moved: Counter[tuple[str, str, str]] = field(default_factory=Counter)
-    calls: int = 0
-
-    def note(self, kind: str, operation: str, size: int = 0) -> None:
-        key = (kind, operation, _place())
-        self.trips[key] += 1
-        self.moved[key] += size
-
-    def count(self, *kinds: str) -> int:
-        return sum(
-            n for (kind, _, _), n in self.trips.items() if kind in (kinds or ("wait", "to_host", "to_device"))
-        )
-
-    def table(self) -> str:
-        rows = [f"{n:7} {self.moved[key]:12} {' '.join(key)}" for key, n in self.trips.most_common()]
-        return "\n".join([f"{self.calls} calls, {self.count()} trips", *rows])
-
-
-_ledgers: list[Ledger] = []
-
-
-def _place() -> str:
-    frame = sys._getframe(2)
-    while frame is not None:
-        name = frame.f_code.co_filename
-        if name.startswith(PACKAGE):
-            return f"{name[len(PACKAGE) + 1 :]}:{frame.f_lineno} {frame.f_code.co_name}"
-        frame = frame.f_back
-    return ""
 
 
 class PretendTensor(torch.Tensor):
@@ -139,7 +93,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     device = kwargs.get("device")
     goes_there = bool(there) if device is None else torch.device(device).type == NAME
     if goes_there and drawn:
-        raise Mixture(f"{func}: a CPU generator cannot draw on the device ({_place()})")
+        raise Mixture(f"{func}: a CPU generator cannot draw on the device ({place()})")
     if goes_there or there:
         _check(func, name, args, kwargs.get("output_size"), there, here, goes_there)
     if device is not None:
@@ -168,9 +122,9 @@ def _check(
     func: Any, name: str, args: Any, sized: int | None, there: list, here: list, goes_there: bool
 ) -> None:
     """Raise what CUDA would raise; count what it would wait for."""
-    if not _ledgers:
+    if not ledgers:
         raise Mixture(f"{func}: outside of the pretended device's context")
-    ledger = _ledgers[-1]
+    ledger = ledgers[-1]
     ledger.calls += 1
     if name in ("_to_copy", "copy_"):
         source = args[1] if name == "copy_" else args[0]
@@ -198,7 +152,7 @@ def _check_mixture(func: Any, name: str, args: Any, here: list, ledger: Ledger) 
             continue
         else:
             shape = tuple(tensor.shape)
-            raise Mixture(f"{func}: a CPU tensor {shape} beside tensors on the device ({_place()})")
+            raise Mixture(f"{func}: a CPU tensor {shape} beside tensors on the device ({place()})")
 
 
 def _accelerator() -> type:
@@ -230,7 +184,7 @@ def _accelerator() -> type:
 
         @staticmethod
         def is_available() -> bool:
-            return bool(_ledgers)
+            return bool(ledgers)
 
         @staticmethod
         def name() -> str:
@@ -241,21 +195,21 @@ def _accelerator() -> type:
 
 class _Module(_DummyBackendModule):
     def is_available(self) -> bool:
-        return bool(_ledgers)
+        return bool(ledgers)
 
     def synchronize(self, device: Any = None) -> None:
-        if _ledgers:
-            _ledgers[-1].note("wait", "synchronize")
+        if ledgers:
+            ledgers[-1].note("wait", "synchronize")
 
 
 class _Hook(torch._C._acc.PrivateUse1Hooks):
     """Says no outside of the context, so that other tests of the process see a machine without accelerator."""
 
     def is_available(self) -> bool:
-        return bool(_ledgers)
+        return bool(ledgers)
 
     def has_primary_context(self, dev_id: int) -> bool:
-        return bool(_ledgers)
+        return bool(ledgers)
 
     def is_built(self) -> bool:
         return True
@@ -292,20 +246,10 @@ def pretend_device() -> Iterator[Ledger]:
     _register_with_lightning()
     lifting = torch._C._only_lift_cpu_tensors()
     torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device=...) then comes by _run
-    _ledgers.append(Ledger())
+    ledgers.append(Ledger())
     try:
         with _Mode():
-            yield _ledgers[-1]
+            yield ledgers[-1]
     finally:
-        _ledgers.pop()
+        ledgers.pop()
         torch._C._set_only_lift_cpu_tensors(lifting)
-
-
-@contextmanager
-def counted() -> Iterator[Ledger]:
-    """A ledger of its own for what happens inside."""
-    _ledgers.append(Ledger())
-    try:
-        yield _ledgers[-1]
-    finally:
-        _ledgers.pop()

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from pretend_device import counted
+from trips import counted
 
 from neural_sim import devices
 

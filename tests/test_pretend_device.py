@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from pretend_device import Mixture, counted
+from pretend_device import Mixture
+from trips import counted
 
 from neural_sim.field.grid import GridField
 

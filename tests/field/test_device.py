@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from pretend_device import counted
+from trips import counted
 
 from neural_sim import cameras, devices
 from neural_sim.field.appearance import AppearanceField

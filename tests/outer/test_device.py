@@ -5,7 +5,7 @@ import dataclasses
 
 import pytest
 import torch
-from pretend_device import counted
+from trips import counted
 
 from neural_sim import devices
 from neural_sim.detector.retinanet import Detector
