@@ -52,8 +52,9 @@ class StillLoop:
     ) -> StillLoop:
         """v for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
         backbone, trainable = detector.split(theta)
-        weights = torch.full((len(images),), 1.0 / len(images))
-        inner = InnerProblem(trainable, CachedSet.of(detector, backbone, images).losses, weights)
+        cached = CachedSet.of(detector, backbone, images)
+        weights = torch.full((len(images),), 1.0 / len(images), device=cached.device)
+        inner = InnerProblem(trainable, cached.losses, weights)
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
         found = hypergradient(inner, terms, {}, solver, generator)
         solution = found.solution
@@ -102,7 +103,7 @@ class StillLoop:
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
         factor = self.factor
         held = probed.probes[label][factor.name]
-        along = scores(probed.cached.losses, self.trainable, self.vector, held.index)
+        along = scores(probed.cached.losses, self.trainable, self.vector, held.index).cpu()
         if isinstance(factor, BinnedFactor):
             return stratified(along, held.bins, self.psi[label].float(), factor.log_probabilities)
         return across_lights(along, factor.size)

@@ -94,16 +94,16 @@ def interpolate(
     if steps < 2:
         raise ValueError(f"interpolate: want at least 2 steps, got {steps}")
     parts = torch.linspace(0.0, 1.0, steps).to(ends[0])
-    images, opacities = [], []
+    images, opacities, pose = [], [], camera_to_world.to(next(field.parameters()).device)
     for part in parts:
         weights = torch.lerp(ends[0], ends[1], part)[None]
-        rgb, opacity = renderer.render(field, camera, camera_to_world[None], weights=weights)
+        rgb, opacity = renderer.render(field, camera, pose[None], weights=weights)
         images.append(rgb[0] + (1.0 - opacity[0])[..., None])
         opacities.append(opacity[0])
     change = float((torch.stack(opacities) - opacities[0]).abs().max())
     if not change <= UNCHANGED:
         raise RuntimeError(f"interpolate: opacity changes by {change:.3g} with the light, want {UNCHANGED:g}")
-    return Way(torch.stack(images).clamp(0.0, 1.0), change)
+    return Way(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
 
 
 def interpolation_figure(ways: Mapping[str, Way], title: str) -> Figure:

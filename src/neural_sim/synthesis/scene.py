@@ -238,7 +238,7 @@ class Scene:
         )
         draw = self.distribution.hard(logits, noise).select(again)
         draw = replace(draw, weights=torch.eye(size, dtype=logits.dtype)[bins])
-        nuisance = self.synthesizer.draw_nuisance(per_bin, self.camera, generator).select(again)
+        nuisance = self._nuisance(label, per_bin, generator).select(again)
         return self._compose(label, draw, None, self._maps(label, draw), nuisance)
 
 
