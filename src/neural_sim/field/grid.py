@@ -60,10 +60,8 @@ class GridField(RadianceField):
         self.features, self.head_width = features, head_width
         self.step_cells, self.initial_density, self.density_gain = step_cells, initial_density, density_gain
         self.directed = head_width > 0
-        layers = (
-            (nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)) if head_width else ()
-        )
-        self.head = nn.Sequential(*layers) if head_width else None
+        mlp = (nn.Linear(features + 3, head_width), nn.SiLU(), nn.Linear(head_width, 3)) if head_width else ()
+        self.head = nn.Sequential(*mlp) if head_width else None
         self.table = nn.Parameter(torch.zeros(1, 1 + features))
         saved = ("occupied", "origin", "cell")
         for name in (*saved, "index", "distance", "corners", "coarse"):
