@@ -12,6 +12,7 @@ from neural_sim.field.grid import GridField
 from neural_sim.field.hull import visual_hull
 from neural_sim.field.mlp import MLPField, inverse_cumulative
 from neural_sim.field.mlp_fitting import MLPFitting
+from neural_sim.field.recipe import FieldRecipe
 from neural_sim.field.training import fit_field, load_field, save_field
 from neural_sim.types import PinholeCamera, PosedViews, Rays
 
@@ -64,6 +65,20 @@ def test_a_grid_field_learns_the_ball_bit_for_bit_the_same() -> None:
     assert history[-1]["psnr"] > 20.0 and history[-1]["psnr"] > history[0]["psnr"]
     first, second = (field.state_dict() for field, _ in runs)
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("head_width", [0, 4])
+def test_a_recipe_gives_the_same_field_whatever_the_process_drew_before(head_width: int) -> None:
+    recipe = FieldRecipe(
+        lambda: GridField(features=4, head_width=head_width),
+        lambda field: GridFitting(field, resolution=32, refine_steps=(), prune_steps=(), batch_rays=256),
+        steps=3,
+    )
+    fits = []
+    for _ in range(2):
+        torch.rand(7)
+        fits.append(recipe.fit(ball_views(), 2, torch.device("cpu"))[0].state_dict())
+    assert all(torch.equal(fits[0][name], fits[1][name]) for name in fits[0])
 
 
 def test_a_network_field_learns_and_survives_saving(tmp_path: Path) -> None:

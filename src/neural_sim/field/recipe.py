@@ -22,7 +22,7 @@ class FieldRecipe:
         field: makes a new field.
         fitting: makes the fitting of a field.
         steps: optimiser steps, the budget.
-        seed: of the order of rays; not the run's seed, so that runs share fields.
+        seed: of new weights and the order of rays; not the run's seed, so that runs share fields.
     """
 
     field: Callable[[], RadianceField]
@@ -41,7 +41,9 @@ class FieldRecipe:
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
         """The fitted field, and its scores on the last ``held_out`` views against steps and seconds."""
         placed = views.to(device)
-        fitting = self.fitting(self.field().to(device))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)  # layers of a new field draw from the global generator
+            fitting = self.fitting(self.field().to(device))
         generator = torch.Generator().manual_seed(self.seed)
         return fit_field(
             placed, fitting, generator, steps=self.steps, held_out=held_out,

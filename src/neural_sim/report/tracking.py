@@ -39,8 +39,8 @@ def log_run(
     """Write one finished run and return its id.
 
     ``series`` holds a value a step (``psi/pitcher/bin_3``), or values by their steps, ``metrics`` final numbers
-    (``evaluate/learned/ap``). Non-finite values are left out, since MLflow's charts break on them. A new SQLite store is
-    created once, under a lock, so that sweep workers that start together do not race for its tables.
+    (``evaluate/learned/ap``). Non-finite values are left out, since MLflow's charts break on them. A new SQLite store
+    is created once, under a lock, so that sweep workers that start together do not race for its tables.
     """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     with warnings.catch_warnings():
