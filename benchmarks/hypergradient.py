@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--numbers-size", type=int, default=64, help="image size at which m varies")
     parser.add_argument("--patches", type=int, nargs="*", default=list(PATCHES))
     parser.add_argument("--largest-reverse", type=int, default=256, help="largest image by small patches")
-    parser.add_argument("--chunk", type=int, default=512, help="rays under way at once, to compare memory")
+    parser.add_argument("--chunk", type=int, default=256, help="rays under way at once, to compare memory")
     parser.add_argument("--quality", default="final")
     parser.add_argument("--repeats", type=int, default=3)
     add_device(parser)

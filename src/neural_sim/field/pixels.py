@@ -51,9 +51,10 @@ def seen_pixels(
 
 
 def pixel_rays(
-    camera: PinholeCamera, camera_to_world: Float[Tensor, "views 4 4"], pixel: Int[Tensor, "rays"]
+    camera: PinholeCamera, camera_to_world: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
 ) -> Rays:
-    """Rays of the pixels with the given flat indices: those of ``cameras.rays``, linear in the pose like them."""
+    """Rays (*m, rays, 3) of the pixels with the given flat indices: those of ``cameras.rays``, linear in the pose like
+    them, so that the rays of a pose's rate are the rays' rates."""
     per_view = camera.height * camera.width
     inside, focal = pixel % per_view, focal_length(camera)
     x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
@@ -61,9 +62,9 @@ def pixel_rays(
     y = (row.to(camera_to_world.dtype) + 0.5 - 0.5 * camera.height) / focal
     local = torch.stack([x, -y, -torch.ones_like(x)], -1)
     local = local / local.norm(dim=-1, keepdim=True)
-    pose = camera_to_world.index_select(0, torch.div(pixel, per_view, rounding_mode="floor"))
+    pose = camera_to_world.index_select(-3, torch.div(pixel, per_view, rounding_mode="floor"))
     # The arithmetic of the estimators' rays: a sample that lands in another cell has another derivative.
-    return Rays(pose[:, :3, 3], torch.einsum("rij,rj->ri", pose[:, :3, :3], local))
+    return Rays(pose[..., :3, 3], torch.einsum("...rij,rj->...ri", pose[..., :3, :3], local))
 
 
 def _strip(

@@ -119,12 +119,7 @@ class NerfRenderer:
         tangents = camera_to_world.new_zeros(len(rates) + field.light_rates, *shape)
         for seen in seen_pixels(field, camera, camera_to_world, self.rays_per_chunk, self.cull):
             rays = pixel_rays(camera, camera_to_world, seen.pixel)
-            # Rays are linear in the pose, so that the rays of a pose's rate are the rays' rates.
-            moving = [pixel_rays(camera, rate, seen.pixel) for rate in rates]
-            ray_rates = Rays(
-                torch.cat([rays.origins[None][:0], *(rate.origins[None] for rate in moving)]),
-                torch.cat([rays.directions[None][:0], *(rate.directions[None] for rate in moving)]),
-            )
+            ray_rates = pixel_rays(camera, rates, seen.pixel)
             samples_at_once = min(at_once(SAMPLES_AT_ONCE, value.device), 4 * self.rays_per_chunk)
             pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination, samples_at_once)
             value.view(-1, 4).index_copy_(0, seen.pixel, pixels)
