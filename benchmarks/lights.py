@@ -64,7 +64,7 @@ def foretold(found: list[MixedDerivative], way: torch.Tensor) -> tuple[float, fl
     return sum(slopes) / len(found), math.hypot(*errors) / len(found)
 
 
-INTRODUCTION = """    python benchmarks/lights.py
+INTRODUCTION = """    python benchmarks/lights.py --seeds {seeds} --per-light {per_light}
 
 `illumination_gap` at `scale=quick`: the biased objects' weights at a part of the way from the initial lights to the
 target's; validation loss of the detector trained there, mean of {seeds}; and the loss's slope along the whole way as it

@@ -91,7 +91,7 @@ def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -
 
     ``scores`` are those of the same scenes under one light after the other. Where one light is bent all the way into
     another, the derivative by the blend of light in every image (``gradient=pathwise``) says little: a detector that
-    never saw the other light gains nothing from a trace of it. docs/numerics.md has both beside the truth.
+    never saw the other light gains nothing from a trace of it (docs/numerics.md, Lights: both beside the truth).
     """
     if lights < 1 or scores.ndim != 1 or scores.numel() == 0 or scores.numel() % lights:
         raise ValueError(
