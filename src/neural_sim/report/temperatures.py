@@ -123,7 +123,7 @@ def _errors(axes: Any, rows: Sequence[AtTemperature], truth: Truth, first: bool)
         at,
         np.maximum(bias, LEAST),
         yerr=[low, error],
-        fmt="s-",
+        fmt="s",
         color=BIAS,
         markersize=4,
         capsize=2,
