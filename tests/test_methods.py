@@ -15,8 +15,8 @@ RUNS = {
     "zoom": ["+experiment=zoom_gap", "objects.names=[can,flat_box,mug]"],
     "focal_length": ["+experiment=zoom_gap", "objects.names=[can,flat_box,mug]", "parameter.zoom.by=focal_length",
                      "parameter.zoom.range=[0.3,1.2]"],
-    "illumination": ["+experiment=illumination_gap", "objects.names=[drill,mug]"],
-    "joint": ["+experiment=illumination_gap", "objects.names=[drill,mug]", "parameter=[pose,zoom,illumination]"],
+    "illumination": ["+experiment=illumination_gap", "objects.names=[can,mug]"],
+    "joint": ["+experiment=illumination_gap", "objects.names=[can,mug]", "parameter=[pose,zoom,illumination]"],
 }  # fmt: skip
 
 
