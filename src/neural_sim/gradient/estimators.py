@@ -12,8 +12,7 @@ from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Para
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.stratified import across_lights, stratified
-from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.gradient.stratified import by_strata
 from neural_sim.synthesis.scene import HardDraws
 
 
@@ -57,13 +56,7 @@ class StratifiedEstimator:
         for factor in distribution.factors:
             held = probes[factor.name]
             along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            along = along.to(images.psi)
-            if isinstance(factor, BinnedFactor):
-                parts[factor.name] = stratified(
-                    along, held.bins, psi[factor.name], factor.log_probabilities, share
-                )
-            else:
-                parts[factor.name] = across_lights(along, factor.size, share)
+            parts[factor.name] = by_strata(along.to(images.psi), held.bins, factor, psi[factor.name], share)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),

@@ -15,6 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import MixedDerivative
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.product import Factor
 
 logger = logging.getLogger(__name__)
 LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
@@ -83,6 +85,20 @@ def stratified(
     # A slope of zero makes a bin's unknown mean harmless; 0 * inf would not say so.
     spread = torch.where(slopes == 0.0, torch.zeros_like(slopes), slopes.square() * variance[:, None])
     return MixedDerivative(share * (means @ slopes), share * spread.sum(0).sqrt())
+
+
+def by_strata(
+    scores: Float[Tensor, "n"],
+    strata: Int[Tensor, "n"],
+    factor: Factor,
+    psi: Float[Tensor, "k"],
+    share: float = 1.0,
+) -> MixedDerivative:
+    """The derivative by one factor's psi, from the scores of its probes: bins by :func:`stratified`, lights by
+    :func:`across_lights`."""
+    if isinstance(factor, BinnedFactor):
+        return stratified(scores, strata, psi, factor.log_probabilities, share)
+    return across_lights(scores, factor.size, share)
 
 
 def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -> MixedDerivative:

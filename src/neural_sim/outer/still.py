@@ -15,14 +15,14 @@ from neural_sim.gradient.base import Losses, MixedDerivative
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.stratified import across_lights, stratified
+from neural_sim.gradient.stratified import by_strata
 from neural_sim.outer.binding import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import Factor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.flatten import unflatten
-from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.scene import Scene, join
 from neural_sim.types import LabelledImages
 
 
@@ -101,25 +101,15 @@ class StillLoop:
         return [self._stratified(probed, label) for label in range(len(probed.probes))]
 
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
-        factor = self.factor
-        held = probed.probes[label][factor.name]
+        held = probed.probes[label][self.factor.name]
         along = scores(probed.cached.losses, self.trainable, self.vector, held.index).cpu()
-        if isinstance(factor, BinnedFactor):
-            return stratified(along, held.bins, self.psi[label].float(), factor.log_probabilities)
-        return across_lights(along, factor.size)
+        return by_strata(along, held.bins, self.factor, self.psi[label].float())
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
     ) -> list[MixedDerivative]:
-        """Every object's estimate from ``count`` relaxed draws of each."""
-        return self.differentiate(
-            estimator, self.scene.training_set(self.psi, count, generator, estimator.draws)
-        )
-
-    def differentiate(
-        self, estimator: PathwiseEstimator, rendered: list[RenderedObject]
-    ) -> list[MixedDerivative]:
-        """Every object's estimate from given images, through the psi loop's own binding."""
+        """Every object's estimate from ``count`` relaxed draws of each, through the psi loop's own binding."""
+        rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
         images = join(rendered)
         targets = self.detector.assign(images.boxes, images.labels)
         losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets, images.labels))
