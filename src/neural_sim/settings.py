@@ -135,7 +135,8 @@ class Outer:
 
     Each iteration's training starts from the pyramid and head of the iteration before (``previous``, the paper), of the
     warm start (``warm``) or from new ones, always the same (``fresh``). A detector that goes on remembers bins that psi
-    has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches.
+    has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches. The first
+    iteration of ``fresh`` and ``warm`` takes the warm start as it is: it has trained on that psi, and for longer.
     psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951);
     ``update`` steps logits of bins, ``light_update`` weights of lights.
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
@@ -152,13 +153,13 @@ class Outer:
     update: Update
     iterations: int = 10
     images_per_object: int = 50
-    epochs: int = 2
-    learning_rate: float = 5e-4
+    epochs: int = 12
+    learning_rate: float = 3e-3
     start: Start = "fresh"
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
-    refresh: float = 1.0
+    refresh: float = 0.5
     quality: Quality | None = None
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"

@@ -115,7 +115,7 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
     cached = CachedSet.of(detector, backbone, join(rendered))
     losses = bound_losses(cached, backbone, join(rendered).labels, probed.cached)
     held = object_images(scene, rendered, psi, torch.full((6,), 1.0 / 6, dtype=DOUBLE))
-    estimator = StratifiedEstimator(4)
+    estimator = StratifiedEstimator(4, theta_mode="forward")
     for label, name in enumerate(scene.names):
         found = estimator.estimate(losses, trainable, vector, held[name], probed.probes[label])
         index = probed.probes[label]["illumination"].index

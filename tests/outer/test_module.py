@@ -75,6 +75,17 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()
 
 
+@pytest.mark.parametrize("start", ["fresh", "warm", "previous"])
+def test_the_first_iteration_takes_the_warm_start_as_it_is_unless_the_detector_goes_on(scene, start):
+    module = _module(scene, StratifiedEstimator(probes_per_bin=2), start=start)
+    at_warm_start = module.inner.validation_loss()
+    first, second = learn_psi(module, progress=False).records
+    steps = -(-12 // 4)
+    assert (first.detector_steps, second.detector_steps) == (steps if start == "previous" else 0, steps)
+    assert (first.validation_loss == at_warm_start) == (start != "previous")
+    assert math.isfinite(first.training_loss)
+
+
 def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
     runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
     assert torch.equal(*runs)

@@ -26,9 +26,9 @@ class StratifiedEstimator:
     """
 
     draws: ClassVar[HardDraws] = HardDraws()
-    probes_per_bin: int = 8
+    probes_per_bin: int = 16
     chunk_size: int = 64
-    theta_mode: ThetaMode = "forward"
+    theta_mode: ThetaMode = "central_difference"
 
     def __post_init__(self) -> None:
         if self.probes_per_bin < 1:

@@ -109,6 +109,10 @@ class InnerLoop:
         return history.losses[-1]
 
     @torch.no_grad()
+    def loss(self, images: CachedSet) -> float:
+        """Mean loss of images at theta."""
+        return float(sum(term(self.trainable) for term in images.mean_terms()))
+
     def validation_loss(self) -> float:
         """L_val at theta."""
-        return float(sum(term(self.trainable) for term in self.validation.mean_terms()))
+        return self.loss(self.validation)

@@ -59,7 +59,9 @@ class SimulatorModule(OuterLoop):
         with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
         with timed(seconds, "train", self.inner.device):
-            training_loss = self.inner.train(cached)
+            # The warm start has trained on this psi already, on more images and for longer than an iteration would.
+            arrived = not self.records and self.settings.start != "previous"
+            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached)
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}

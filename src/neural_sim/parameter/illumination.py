@@ -139,9 +139,9 @@ class ProjectedGradient:
     constraint would take back, moves nothing. ``max_step`` bounds the largest change of a weight.
     """
 
-    learning_rate: float = 0.3
+    learning_rate: float = 0.6
     momentum: float = 0.6
-    max_step: float = 0.5
+    max_step: float = 1.0
     shrink: bool = True
 
     def __post_init__(self) -> None:

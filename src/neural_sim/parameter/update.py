@@ -130,9 +130,9 @@ class Mirror:
     several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
     """
 
-    learning_rate: float = 1.0
+    learning_rate: float = 3.0
     momentum: float = 0.6
-    max_step: float = 1.0
+    max_step: float = 3.0
     shrink: bool = True
 
     def __post_init__(self) -> None:

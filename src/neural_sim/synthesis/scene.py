@@ -224,21 +224,23 @@ class Scene:
         Of an illumination the anchor lights take the place of bins, and the same ``per_bin`` poses and backgrounds are
         seen under each.
         """
+        light, logits = self.distribution.light, psi.detach().to(self.dtype(label))
+        if light is not None and factor == light.name:
+            return self._under_each_light(label, light.size, per_bin, logits, generator)
         size = next(f.size for f in self.distribution.factors if f.name == factor)
-        bins, light = torch.arange(size).repeat_interleave(per_bin), self.distribution.light
-        logits = psi.detach().to(self.dtype(label))
-        if light is None or factor != light.name:
-            noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
-            return self.render(
-                label, self.distribution.stratum(factor, bins, logits, noise), noise, generator
-            )
-        noise, again = (
-            self.distribution.draw_noise(per_bin, generator, self.dtype(label)),
-            torch.arange(per_bin).repeat(size),
-        )
+        bins = torch.arange(size).repeat_interleave(per_bin)
+        noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
+        return self.render(label, self.distribution.stratum(factor, bins, logits, noise), noise, generator)
+
+    def _under_each_light(
+        self, label: int, lights: int, count: int, logits: Tensor, generator: torch.Generator
+    ) -> RenderedObject:
+        noise = self.distribution.draw_noise(count, generator, self.dtype(label))
+        again = torch.arange(count).repeat(lights)
         draw = self.distribution.hard(logits, noise).select(again)
-        draw = replace(draw, weights=torch.eye(size, dtype=logits.dtype)[bins])
-        nuisance = self._nuisance(label, per_bin, generator).select(again)
+        alone = torch.eye(lights, dtype=logits.dtype).repeat_interleave(count, 0)
+        draw = replace(draw, weights=alone)
+        nuisance = self._nuisance(label, count, generator).select(again)
         return self._compose(label, draw, None, self._maps(label, draw), nuisance)
 
 
