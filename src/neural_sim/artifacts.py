@@ -36,11 +36,7 @@ DISTRIBUTIONS = tuple(
 
 MESHES_DRAWN = (
     "objects",
-    "renderer/mesh",
-    "renderer/raycast",
-    "renderer/surface",
-    "renderer/lighting",
-    "renderer/rig",
+    *(f"renderer/{name}" for name in ("mesh", "raycast", "surface", "lighting", "rig")),
 )
 """What draws images from meshes."""
 
@@ -89,11 +85,13 @@ class Artifacts:
             return make()
 
         name = f"{kind} {digest(key)}"
-        if name not in self._held:
-            entry = self.store.fetch(kind, key, make_if_asked)
-            self.account.note(stage, entry, what)
+        if name in self._held:
+            return self._held[name]
+        entry = self.store.fetch(kind, key, make_if_asked)
+        self.account.note(stage, entry, what)
+        if kind != "views":  # large, and asked for once, to make a field
             self._held[name] = entry.value
-        return self._held[name]
+        return entry.value
 
     # --- views and fields: per object, shared by all runs ---
 

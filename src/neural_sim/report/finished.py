@@ -52,8 +52,8 @@ def finished_runs(uri: str, experiments: Sequence[str]) -> list[FinishedRun]:
     """
     found: dict[tuple[str, str, int], FinishedRun] = {}
     for experiment in experiments:
-        for folder in tracking.finished_folders(uri, experiment):
-            run = read_run(folder)
+        for files in tracking.finished_files(uri, experiment, ("results.json", "detections.json")):
+            run = read_run(*files.values())
             if run is not None:
                 found.setdefault((run.setting, run.method, run.seed), run)
     if not found:
@@ -63,14 +63,12 @@ def finished_runs(uri: str, experiments: Sequence[str]) -> list[FinishedRun]:
     return list(found.values())
 
 
-def read_run(folder: Path) -> FinishedRun | None:
-    """A run from its folder; None where it was not evaluated, or has no biased object to compare by."""
-    if not (folder / "results.json").is_file() or not (folder / "detections.json").is_file():
-        return None
-    results = json.loads((folder / "results.json").read_text())
+def read_run(results_file: Path, detections_file: Path) -> FinishedRun | None:
+    """A run from its results.json and detections.json; None where it has no biased object to compare by."""
+    results = json.loads(results_file.read_text())
     if not results["biased"] or not results["curve"]:
         return None
-    held = json.loads((folder / "detections.json").read_text())
+    held = json.loads(detections_file.read_text())
     names, count = list(results["psi"]), held["images"]
     truth = _images(held["truth"], count)
     labels = [names.index(name) for name in results["biased"]]

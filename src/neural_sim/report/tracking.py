@@ -70,8 +70,10 @@ def log_run(
     return run_id
 
 
-def finished_folders(uri: str, experiment: str) -> list[Path]:
-    """Folders with the artifacts of an experiment's finished runs, the latest first.
+def finished_files(uri: str, experiment: str, names: Sequence[str]) -> list[dict[str, Path]]:
+    """The artifacts ``names`` of an experiment's finished runs that have them all, the latest run first.
+
+    Nothing else is fetched from a remote store.
 
     Raises:
         ValueError: no experiment of that name.
@@ -88,7 +90,9 @@ def finished_folders(uri: str, experiment: str) -> list[Path]:
             raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
         order = ["attributes.start_time DESC"]
         runs = client.search_runs([found.experiment_id], "attributes.status = 'FINISHED'", order_by=order)
-        return [Path(client.download_artifacts(run.info.run_id, "")) for run in runs]
+        ids = [run.info.run_id for run in runs]
+        complete = [i for i in ids if {item.path for item in client.list_artifacts(i)}.issuperset(names)]
+        return [{name: Path(client.download_artifacts(i, name)) for name in names} for i in complete]
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
