@@ -103,10 +103,3 @@ def test_what_was_reached_charts_by_what_was_spent(results, tmp_path):
     ):
         history = MlflowClient(uri).get_metric_history(run, f"curve/{name}")
         assert {metric.step: pytest.approx(metric.value) for metric in history} == expected
-
-
-def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path):
-    assert tracking.tracking_uri("http://localhost:5000") == "http://localhost:5000"
-    assert tracking.tracking_uri("outputs/mlflow.db").startswith("sqlite:////")
-    with pytest.raises(ValueError, match=r"paths\.mlflow"):
-        tracking.tracking_uri("")
