@@ -74,11 +74,7 @@ def composite_with_tangents(
     and D its exclusive sum along the ray, the weight T alpha changes at T (exp(-tau) tau' - alpha D'). Distances and
     widths are constants.
     """
-    passed = transmittance(sigma, samples)
-    alpha = alpha_from_sigma(sigma, samples.width)
-    weights = passed * alpha
-    depth = sigma * samples.width
-    held = passed * torch.exp(-depth)
+    depth, weights, held = _passage(sigma, samples)
     parts = [weights[:, None] * rgb, weights[:, None]]
     for sigma_rate, rgb_rate in zip(sigma_rates, rgb_rates[: len(sigma_rates)], strict=True):
         depth_rate = sigma_rate * samples.width
@@ -108,15 +104,14 @@ def composite_with_gradient(
     own colour, as far as light passes through it, and takes away all behind it: with tau = sigma delta the pixel C
     changes by T exp(-tau) c - sum_{j behind} w_j c_j.
     """
-    passed = transmittance(sigma, samples)
-    depth = sigma * samples.width
-    weights = (passed * alpha_from_sigma(sigma, samples.width))[:, None]
+    depth, weights, held = _passage(sigma, samples)
+    weights = weights[:, None]
     colour = torch.nn.functional.pad(rgb, (0, 1), value=1.0)
     running = torch.nn.functional.pad(_running((weights * colour).double()), (0, 0, 1, 0))
     ends = running.index_select(0, samples.starts)
     behind = (ends[1:].index_select(0, samples.ray) - running[1:]).to(sigma.dtype)
     behind = behind.masked_fill((depth > OPAQUE_DEPTH)[:, None], 0.0)
-    by_depth = torch.addcmul(-behind, (passed * torch.exp(-depth))[:, None], colour) * samples.width[:, None]
+    by_depth = torch.addcmul(-behind, held[:, None], colour) * samples.width[:, None]
     gradient = sigma.new_empty(len(sigma), 3, 4)
     for axis in range(3):
         torch.mul(by_depth, sigma_rates[axis][:, None], out=gradient[:, axis])
@@ -129,6 +124,14 @@ def composite_with_gradient(
     for out, rate in zip(of_colour, rgb_rates[3:], strict=True):
         out.copy_(_segment_sum(rate, samples, weights[:, 0]))
     return pixels, by_origin, by_direction, of_colour
+
+
+def _passage(
+    sigma: Float[Tensor, "samples"], samples: PackedSamples
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:
+    """Every sample's optical depth, its weight, and the light that passes it."""
+    depth, reached = sigma * samples.width, transmittance(sigma, samples)
+    return depth, reached * alpha_from_sigma(sigma, samples.width), reached * torch.exp(-depth)
 
 
 def _segment_sum(
