@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from neural_sim.report.bootstrap import THRESHOLDS, Matches
+from neural_sim.report.compare import points
 from neural_sim.report.finished import FinishedRun
 from neural_sim.report.statistics import area_under, biased_ap, compare
 
@@ -77,6 +78,16 @@ def test_who_reaches_the_same_sooner_has_the_larger_area():
     # Over two decades from 1 to 100 s: ours has 0.45 then 0.7, the other 0.2 then 0.45.
     assert found.area["other"].value == pytest.approx(0.25) and found.area["other"].certain
     np.testing.assert_allclose(biased_ap(runs[0], "seconds")[1], [0.2, 0.45, 0.7])
+
+
+def test_the_area_of_one_seed_has_no_interval_and_is_never_certain():
+    found = compare([run("ours", 0, 0.7, (1.0, 10.0)), run("other", 0, 0.7)], "ours", draws=5).area["other"]
+    assert found.value == pytest.approx(0.25) and (found.low, found.high, found.certain) == (
+        None,
+        None,
+        False,
+    )
+    assert points(found, sure=True) == "25.0"
 
 
 def test_processor_time_is_another_clock():

@@ -75,7 +75,8 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
     c, count = comparison, len(comparison.seeds)
     lines = [
         f"## {c.setting}",
-        f"Seeds {', '.join(map(str, c.seeds))}; AP (0.50 to 0.95) of {', '.join(runs[0].results['biased'])} in points, "
+        f"Seed{'s' if count > 1 else ''} {', '.join(map(str, c.seeds))}; "
+        f"AP (0.50 to 0.95) of {', '.join(runs[0].results['biased'])} in points, "
         "with 95 % bootstrap intervals over seeds and test images"
         + (" (one seed: over images alone)." if count == 1 else "."),
         "",
@@ -101,11 +102,12 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
 
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
     """A share in points with its interval; in bold where it is certain and that is asked for."""
-    value, low, high = (100 * part for part in (estimate.value, estimate.low, estimate.high))
-    text = f"{value:.1f}" if not unit else f"{value:.0f} {unit}"
-    digits = 1 if not unit else 0
+    digits = 0 if unit else 1
+    text = f"{100 * estimate.value:.{digits}f}{unit and ' ' + unit}"
+    if estimate.low is None or estimate.high is None:
+        return text
     text = f"**{text}**" if sure and estimate.certain else text
-    return f"{text} ({low:.{digits}f} to {high:.{digits}f})"
+    return f"{text} ({100 * estimate.low:.{digits}f} to {100 * estimate.high:.{digits}f})"
 
 
 def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:

@@ -29,6 +29,7 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
                     spent,
                     100 * biased_ap(run, comparison.clock)[1],
                     ".-",
+                    drawstyle="steps-post",  # worth what it has reached, as in the area
                     color=colour,
                     alpha=0.7,
                     linewidth=1,

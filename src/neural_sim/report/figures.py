@@ -72,7 +72,7 @@ def psi_figure(
             bottom += share
         axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=name)
         axes.title.set_fontsize(9)
-        ticks = np.arange(0, len(p), max(1, -(-(len(p) - 1) // 6)))
+        ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
         axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
         style(axes)
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]

@@ -27,16 +27,16 @@ Clock = Literal["seconds", "cpu_seconds"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % bootstrap interval."""
+    """A number with its 95 % bootstrap interval, None where there is nothing to resample."""
 
     value: float
-    low: float
-    high: float
+    low: float | None = None
+    high: float | None = None
 
     @property
     def certain(self) -> bool:
-        """Whether the interval leaves 0 out."""
-        return self.low > 0.0 or self.high < 0.0
+        """Whether there is an interval, and leaves 0 out."""
+        return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,8 @@ def _areas(
     for method in methods[1:]:
         ahead = np.asarray([areas[methods[0], s] - areas[method, s] for s in seeds])
         found[method] = _estimates(ahead.mean(keepdims=True), ahead[chosen].mean(1, keepdims=True))[0]
+        if len(seeds) == 1:  # images on the way are scored, their detections not kept
+            found[method] = Estimate(found[method].value)
     return found
 
 

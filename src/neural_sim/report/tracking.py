@@ -79,6 +79,7 @@ def finished_files(uri: str, experiment: str, names: Sequence[str]) -> list[dict
         ValueError: no experiment of that name.
     """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from mlflow import MlflowClient
