@@ -136,7 +136,7 @@ class Outer:
     Each iteration's training starts from the pyramid and head of the iteration before (``previous``, the paper), of the
     warm start (``warm``) or from new ones, always the same (``fresh``). A detector that goes on remembers bins that psi
     has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches. The
-    first iteration of ``fresh`` and ``warm`` takes the warm start as it is: it has trained on that psi, and for longer.
+    first iteration's hypergradient is taken at the warm start as it is, unless ``train_first``.
     psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951);
     ``update`` steps logits of bins, ``light_update`` weights of lights.
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
@@ -156,6 +156,7 @@ class Outer:
     epochs: int = 12
     learning_rate: float = 3e-3
     start: Start = "fresh"
+    train_first: bool = False
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24

@@ -75,14 +75,15 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()
 
 
-@pytest.mark.parametrize("start", ["fresh", "warm", "previous"])
-def test_the_first_iteration_takes_the_warm_start_as_it_is_unless_the_detector_goes_on(scene, start):
-    module = _module(scene, StratifiedEstimator(probes_per_bin=2), start=start)
+@pytest.mark.parametrize("start", ["fresh", "previous"])
+@pytest.mark.parametrize("train_first", [False, True])
+def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_first(scene, start, train_first):
+    module = _module(scene, StratifiedEstimator(probes_per_bin=2), start=start, train_first=train_first)
     at_warm_start = module.inner.validation_loss()
     first, second = learn_psi(module, progress=False).records
-    steps = -(-12 // 4)
-    assert (first.detector_steps, second.detector_steps) == (steps if start == "previous" else 0, steps)
-    assert (first.validation_loss == at_warm_start) == (start != "previous")
+    batches = 12 // 4
+    assert (first.detector_steps, second.detector_steps) == (batches * train_first, batches)
+    assert (first.validation_loss == at_warm_start) is not train_first
     assert math.isfinite(first.training_loss)
 
 

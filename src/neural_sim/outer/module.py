@@ -60,7 +60,7 @@ class SimulatorModule(OuterLoop):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
         with timed(seconds, "train", self.inner.device):
             # The warm start has trained on this psi already, on more images and for longer than an iteration would.
-            arrived = not self.records and self.settings.start != "previous"
+            arrived = not self.records and not self.settings.train_first
             training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached)
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._hypergradient(rendered, images, cached)
