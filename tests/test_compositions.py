@@ -1,5 +1,6 @@
 """Every choice of every group makes an experiment: what the command line offers can be built."""
 
+import dataclasses
 import itertools
 
 import pytest
@@ -8,6 +9,8 @@ from hydra import compose, initialize_config_dir
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.main import UserError, build, conf_directory
+from neural_sim.parameter.illumination import ProjectedGradient
+from neural_sim.parameter.update import Mirror
 
 CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
@@ -47,14 +50,22 @@ def test_experiments_on_ycb_name_objects_that_exist(name, shared_data):
     assert set(made.distribution.biased) <= set(made.objects.names())
 
 
-def test_auto_sim_differs_from_neural_sim_by_its_estimator_alone():
+def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     plain, auto_sim = experiment(), experiment("baseline=auto_sim")
     assert isinstance(auto_sim.baseline, HypergradientLoop)
-    assert isinstance(plain.gradient, StratifiedEstimator) and isinstance(
-        auto_sim.gradient, ReinforceEstimator
-    )
-    for group in ("outer", "solver", "detector", "training", "parameter", "synthesis"):
+    assert isinstance(plain.gradient, StratifiedEstimator)
+    assert isinstance(auto_sim.gradient, ReinforceEstimator)
+    for group in ("solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
+    steps = {
+        "train_first": True,
+        "update": Mirror(2.0, max_step=1.0),
+        "light_update": ProjectedGradient(0.3, max_step=0.5),
+    }
+    assert auto_sim.outer == dataclasses.replace(plain.outer, **steps)
+    assert experiment("baseline=auto_sim", "outer.update.max_step=2").outer.update == Mirror(
+        2.0, max_step=2.0
+    )
 
 
 def test_lights_want_a_renderer_that_knows_them():
