@@ -9,7 +9,6 @@ from hydra import compose, initialize_config_dir
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.main import UserError, build, conf_directory
-from neural_sim.parameter.illumination import ProjectedGradient
 from neural_sim.parameter.update import Mirror
 
 CONF = conf_directory()
@@ -57,11 +56,7 @@ def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     assert isinstance(auto_sim.gradient, ReinforceEstimator)
     for group in ("solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
-    steps = {
-        "train_first": True,
-        "update": Mirror(2.0, max_step=1.0),
-        "light_update": ProjectedGradient(0.3, max_step=0.5),
-    }
+    steps = {"train_first": True, "update": Mirror(2.0, max_step=1.0)}
     assert auto_sim.outer == dataclasses.replace(plain.outer, **steps)
     assert experiment("baseline=auto_sim", "outer.update.max_step=2").outer.update == Mirror(
         2.0, max_step=2.0
