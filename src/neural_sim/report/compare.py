@@ -103,7 +103,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
     """A share in points with its interval; in bold where it is certain and that is asked for."""
     digits = 0 if unit else 1
-    text = f"{100 * estimate.value:.{digits}f}{unit and ' ' + unit}"
+    text = f"{100 * estimate.value:.{digits}f}" + (f" {unit}" if unit else "")
     if estimate.low is None or estimate.high is None:
         return text
     text = f"**{text}**" if sure and estimate.certain else text
