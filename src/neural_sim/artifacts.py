@@ -74,8 +74,10 @@ class Artifacts:
         files = {g: sources[g].digest() for g in groups if hasattr(sources.get(g), "digest")}
         return {group: self.x.config[group] for group in groups} | ({"files": files} if files else {})
 
-    def _fetch(self, stage: str, kind: str, what: str, key: dict[str, Any], make: Callable[[], Any]) -> Any:
-        """A result from the store, or made now if its stage is among those asked for."""
+    def _fetch(
+        self, stage: str, kind: str, what: str, key: dict[str, Any], make: Callable[[], Any], keep: bool = True
+    ) -> Any:  # fmt: skip
+        """A result from the store, or made now if its stage is among those asked for; kept in memory unless told."""
 
         def make_if_asked() -> Any:
             if stage not in self.x.stages:
@@ -89,7 +91,7 @@ class Artifacts:
             return self._held[name]
         entry = self.store.fetch(kind, key, make_if_asked)
         self.account.note(stage, entry, what)
-        if kind != "views":  # large, and asked for once, to make a field
+        if keep:
             self._held[name] = entry.value
         return entry.value
 
@@ -104,7 +106,7 @@ class Artifacts:
             return codec.pack_views(self.x.views.render(self.mesh_renderer, self.meshes[name]))
 
         key = self._views_key(name)
-        return self._fetch("views", "views", f"views of {name}", key, make)
+        return self._fetch("views", "views", f"views of {name}", key, make, keep=False)  # large, read once
 
     def _field_key(self, name: str) -> dict[str, Any]:
         version = code_version("field", "renderer/nerf", "cameras")
