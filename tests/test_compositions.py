@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
 from neural_sim.parameter.update import Mirror
 
@@ -41,6 +42,14 @@ def test_every_experiment_has_biased_objects_at_every_gap(name, gap):
     initial, target = (made.distribution.psi(which, names) for which in ("initial", "target"))
     equal = [bool((a - b).abs().max() < 1e-9) for a, b in zip(initial, target, strict=True)]
     assert all(equal) if gap == "same" else not any(equal)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_papers_variant_takes_every_experiment(name):
+    made = experiment(f"+experiment={name}", "+variant=paper")
+    assert made.baseline.name == "neural_sim_paper" and isinstance(made.gradient, PathwiseEstimator)
+    poses = [node for what, node in made.config["parameter"].items() if what == "pose"]
+    assert all(node["bin_mean"] == "linear" for node in poses)
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*_ycb.yaml")))
