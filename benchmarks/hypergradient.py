@@ -32,7 +32,7 @@ from neural_sim.field.training import load_field, save_field
 from neural_sim.gradient.pathwise import contract, patch_rays
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import RIGID, pose_rates
-from neural_sim.types import Maps, PinholeCamera, SceneDraw
+from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 PATCHES = (64, 128, 256, 512, 4096)
 NUMBERS = (1, 2, 4, 12)
@@ -87,7 +87,10 @@ def reverse(of: Case, patch: int) -> Tensor:
     for pixels in torch.arange(len(opacity), device=of.pose.device).split(patch):
         numbers = torch.zeros_like(total, requires_grad=True)
         pose = of.pose + torch.einsum("m,mnij->nij", numbers, of.rates)
-        rendered = of.renderer.render_rays(of.field, patch_rays(of.camera, pose, pixels))
+        rays = patch_rays(of.camera, pose, pixels)
+        # Most of these matrices are no rotations; the renderer's tangents keep directions of unit length.
+        rays = Rays(rays.origins, torch.nn.functional.normalize(rays.directions, dim=-1))
+        rendered = of.renderer.render_rays(of.field, rays)
         (part,) = torch.autograd.grad(
             rendered, numbers, (rgb[pixels], opacity[pixels]), materialize_grads=True
         )

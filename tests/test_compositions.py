@@ -79,12 +79,6 @@ def test_lights_want_a_renderer_that_knows_them():
         experiment("parameter=[illumination]", "renderer=nerf_w", "views.lights.rig.anchors=4")
 
 
-def test_the_pathwise_gradient_does_not_zoom_by_focal_length():
-    with pytest.raises(UserError, match=r"parameter\.zoom\.by"):
-        experiment("parameter=[zoom]", "parameter.zoom.by=focal_length", "gradient=pathwise")
-    assert experiment("parameter=[zoom]", "parameter.zoom.by=focal_length").distribution.names == ("zoom",)
-
-
 def test_what_is_fixed_says_which_distribution():
     kinds = {name: experiment(f"baseline={name}").baseline for name in ("ns", "oracle")}
     assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}

@@ -63,6 +63,16 @@ def test_every_method_learns_every_parameter(folder, what):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("what", RUNS)
+def test_the_papers_variant_learns_every_parameter(folder, what):
+    run = folder / f"{what}_paper"
+    _run(folder, *RUNS[what], f"name={what}", "+variant=paper", "scale=smoke", f"hydra.run.dir={run}")
+    found = json.loads((run / "results.json").read_text())
+    assert found["method"] == "neural_sim_paper" and found["curve"][-1]["products"] > 0
+    assert any(psi["learned"] != psi["initial"] for held in found["psi"].values() for psi in held.values())
+
+
+@pytest.mark.slow
 def test_the_comparison_reads_the_sweep_back(folder):
     _sweep(folder, "pose")
     _run(

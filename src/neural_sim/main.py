@@ -90,7 +90,6 @@ def build(config: DictConfig) -> Experiment:
 def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     """p_psi over all parameters, as far as views, renderer and estimator can serve it."""
     from neural_sim.parameter.product import SceneDistribution
-    from neural_sim.synthesis.scene import RelaxedDraws
 
     try:
         made = SceneDistribution.of(parameters.values(), parts["unlearned"])
@@ -101,11 +100,6 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
         lights = "one fixed light" if rig is None else f"{rig.anchors} anchor lights"
         raise UserError(
             f"parameter.illumination: want renderer=nerf_w with {made.light.anchors} anchors, got {lights}"
-        )
-    focal = any(factor.coordinate == "magnification" for factor in made.binned)
-    if focal and isinstance(parts["gradient"].draws, RelaxedDraws):
-        raise UserError(
-            "parameter.zoom.by: gradient=pathwise differentiates by distance, not by focal_length"
         )
     return made
 

@@ -152,6 +152,8 @@ ROOMS_CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.
 class Rooms:
     """Four images of one textured block, their detector, and everything between psi and their losses."""
 
+    camera = ROOMS_CAMERA
+
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(5)
         self.field = GridField().double().eval()

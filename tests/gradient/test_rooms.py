@@ -11,7 +11,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import image_cotangent, scores
-from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents
+from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents, psi_contributions
+from neural_sim.outer.binding import rendered_path
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.zoom import Zoom
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
@@ -20,6 +24,8 @@ from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted
 from neural_sim.synthesis.motion import moved_by
+from neural_sim.synthesis.scene import RelaxedDraws, Scene
+from neural_sim.types import Maps
 
 DOUBLE = torch.float64
 COUNT = 4
@@ -82,6 +88,39 @@ def test_patches_and_tangents_agree_on_the_field(rooms):
         assert float((patches[name] - value).abs().max()) < 1e-10
         assert float((forward[name] - value).abs().max()) < 1e-8
     assert moved_by(batch.path.relaxed, rooms.psi) == ("phi",)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_the_focal_length_of_every_image_against_central_differences(rooms, mode, generator):
+    """From psi through the scene's own draw, each image at a focal length of its own, to random cotangents of maps."""
+    distribution = SceneDistribution.of([Zoom(bins=3, by="focal_length", range=(0.6, 1.8), temperature=0.8)])
+    scene = Scene(
+        ("block",),
+        (rooms.field,),
+        NerfRenderer(termination=0.0),
+        rooms.camera,
+        rooms.synthesizer,
+        distribution,
+    )
+    psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
+    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    assert len(part.draw.magnification.unique()) == COUNT
+    maps = Maps(
+        *(torch.randn(value.shape, generator=generator, dtype=DOUBLE) for value in (part.rgb, part.opacity))
+    )
+    path = rendered_path(scene, 0, part)
+    along = contract(part.tangents or {}, maps)
+    along = along or draw_cotangents(path.render_rays, scene.camera, part.draw, maps, 500)
+    found = psi_contributions(path.relaxed, psi, along).sum(0)
+
+    def energy(psi):
+        again = scene.render(0, path.relaxed(psi), part.noise, torch.Generator())
+        return float((again.rgb * maps.rgb).sum() + (again.opacity * maps.opacity).sum())
+
+    steps = 1e-6 * torch.eye(3, dtype=DOUBLE)
+    expected = torch.tensor([(energy(psi + e) - energy(psi - e)) / 2e-6 for e in steps], dtype=DOUBLE)
+    assert float(expected.norm()) > 0.1
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_tangents_replace_the_second_render(rooms, pathwise):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from neural_sim import cameras
 from neural_sim.field.grid import GridField
@@ -172,7 +173,9 @@ def test_values_and_derivatives_of_a_quality_are_those_of_one_function(
     )
 
     def replayed(pose: torch.Tensor) -> torch.Tensor:
-        rgb, opacity = renderer.render_rays(field, flat(cameras.rays(camera, pose)))
+        rays = flat(cameras.rays(camera, pose))
+        # Rates of any matrix, under which directions would not stay of unit length by themselves.
+        rgb, opacity = renderer.render_rays(field, Rays(rays.origins, normalize(rays.directions, dim=-1)))
         return torch.cat([rgb, opacity[:, None]], -1)
 
     first = replayed(poses)

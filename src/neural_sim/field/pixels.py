@@ -54,7 +54,7 @@ def pixel_rays(
     camera: PinholeCamera, camera_to_world: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
 ) -> Rays:
     """Rays (*m, rays, 3) of the pixels with the given flat indices: those of ``cameras.rays``, linear in the pose like
-    them, so that the rays of a pose's rate are the rays' rates."""
+    them."""
     per_view = camera.height * camera.width
     inside, focal = pixel % per_view, focal_length(camera)
     x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
@@ -65,6 +65,19 @@ def pixel_rays(
     pose = camera_to_world.index_select(-3, torch.div(pixel, per_view, rounding_mode="floor"))
     # The arithmetic of the estimators' rays: a sample that lands in another cell has another derivative.
     return Rays(pose[..., :3, 3], torch.einsum("...rij,rj->...ri", pose[..., :3, :3], local))
+
+
+def ray_rates(
+    camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
+) -> Rays:
+    """Rates (*m, rays, 3) of these pixels' rays where the camera-to-world matrices move at ``rates``.
+
+    Directions stay of unit length: what a rate has along them is taken out (rounding for a camera that turns; for one
+    whose focal length changes it is the derivative of the normalisation).
+    """
+    moved = pixel_rays(camera, rates, pixel)
+    along = (moved.directions * rays.directions).sum(-1, keepdim=True)
+    return Rays(moved.origins, moved.directions - along * rays.directions)
 
 
 def _strip(

@@ -30,6 +30,7 @@ from neural_sim.gradient.base import (
 )
 from neural_sim.gradient.mixed import ThetaMode, input_cotangents
 from neural_sim.parameter.factor import Relaxation
+from neural_sim.parameter.product import COORDINATES
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.synthesis.scene import RelaxedDraws
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -137,39 +138,46 @@ def map_cotangents(
 
 
 def patch_rays(
-    camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], pixels: Int[Tensor, "r"]
+    camera: PinholeCamera,
+    camera_to_world: Float[Tensor, "n 4 4"],
+    pixels: Int[Tensor, "r"],
+    magnification: Float[Tensor, "n"] | None = None,
 ) -> Rays:
-    """Rays of the pixels with the given flat indices into [n, height, width]; differentiable in the poses."""
+    """Rays of the pixels with the given flat indices into [n, height, width]; differentiable in the poses, and in the
+    images' focal lengths in units of the camera's own."""
     local = cameras.pixel_directions(camera, dtype=camera_to_world.dtype, device=camera_to_world.device)
     per_image = camera.height * camera.width
-    poses = camera_to_world[pixels // per_image]
-    directions = torch.einsum("rij,rj->ri", poses[:, :3, :3], local.reshape(-1, 3)[pixels % per_image])
-    return Rays(poses[:, :3, 3], directions)
+    image, local = pixels // per_image, local.reshape(-1, 3)[pixels % per_image]
+    if magnification is not None:
+        narrowed = torch.cat([local[:, :2] / magnification[image, None], local[:, 2:]], -1)
+        local = narrowed / narrowed.norm(dim=-1, keepdim=True)
+    poses = camera_to_world[image]
+    return Rays(poses[:, :3, 3], torch.einsum("rij,rj->ri", poses[:, :3, :3], local))
 
 
 def draw_cotangents(
     render_rays: RenderRays, camera: PinholeCamera, draw: SceneDraw, maps: Maps, patch_size: int
 ) -> dict[str, Float[Tensor, "n"]]:
-    """Cotangents of the draw's numbers, phi, rho and distance: the second forward and the only backward
-    (Tools 2, 3).
+    """Cotangents of the draw's coordinates: the second forward and the only backward (Tools 2, 3).
 
     Memory is that of ``patch_size`` rays. Pixels whose cotangent is exactly zero are left out, which changes
     nothing.
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
-    numbers = dict(
-        zip(RIGID, moved([getattr(draw, name).detach() for name in RIGID], rgb.device), strict=True)
-    )
+    drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
+    there = moved([number.detach() for number in drawn.values()], rgb.device)
+    numbers = dict(zip(drawn, there, strict=True))
     total = {name: torch.zeros_like(number) for name, number in numbers.items()}
     for pixels in live.split(patch_size) if len(live) else ():
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}
         with torch.enable_grad():
-            rendered = render_rays(patch_rays(camera, cameras.orbit(**leaves), pixels))
+            poses = cameras.orbit(*(leaves[name] for name in RIGID))
+            rendered = render_rays(patch_rays(camera, poses, pixels, leaves.get("magnification")))
         parts = torch.autograd.grad(
             rendered, list(leaves.values()), (rgb[pixels], opacity[pixels]), materialize_grads=True
         )
-        for name, part in zip(RIGID, parts, strict=True):
+        for name, part in zip(leaves, parts, strict=True):
             total[name] += part
     return total
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
-from neural_sim.field.pixels import pixel_rays, seen_pixels
+from neural_sim.field.pixels import pixel_rays, ray_rates, seen_pixels
 from neural_sim.field.rendering import (
     SAMPLES_AT_ONCE,
     render_packed,
@@ -112,6 +112,7 @@ class NerfRenderer:
     ) -> tuple[Maps, list[Maps]]:
         """What ``render`` gives, and its m derivatives where the cameras move at ``rates`` (then a moving light's).
 
+        Rays' directions stay of unit length whatever the rates, so that those of a focal length can be among them.
         The derivatives ride along with the render; memory beyond the maps is that of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
@@ -119,9 +120,9 @@ class NerfRenderer:
         tangents = camera_to_world.new_zeros(len(rates) + field.light_rates, *shape)
         for seen in seen_pixels(field, camera, camera_to_world, self.rays_per_chunk, self.cull):
             rays = pixel_rays(camera, camera_to_world, seen.pixel)
-            ray_rates = pixel_rays(camera, rates, seen.pixel)
+            moving = ray_rates(camera, rays, rates, seen.pixel)
             samples_at_once = min(at_once(SAMPLES_AT_ONCE, value.device), 4 * self.rays_per_chunk)
-            pixels, moved = render_with_tangents(field, rays, ray_rates, self.termination, samples_at_once)
+            pixels, moved = render_with_tangents(field, rays, moving, self.termination, samples_at_once)
             value.view(-1, 4).index_copy_(0, seen.pixel, pixels)
             tangents.view(len(tangents), -1, 4).index_copy_(1, seen.pixel, moved)
         return _maps(value), [_maps(tangent) for tangent in tangents]

@@ -14,6 +14,8 @@ from neural_sim.types import SceneDraw
 
 RIGID = ("phi", "rho", "distance")
 """The coordinates that place the camera; the fourth, the magnification, leaves it where it is."""
+SHRINK = (-1.0, -1.0, 0.0, 0.0)
+"""What a camera's axes x and y do to a pixel's direction, by the logarithm of the focal length."""
 
 
 def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tensor, "K"]) -> tuple[str, ...]:
@@ -37,21 +39,26 @@ def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
 
 
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
-    """Derivatives of every image's camera-to-world pose by each of its draw's ``names``.
+    """Derivatives of every image's camera-to-world matrix by each of its draw's ``names``.
+
+    The matrix takes a pixel's direction into the world. At a camera of focal length m, a longer one narrows that
+    direction's x and y as a matrix with shorter axes would, d(x/m)/dm = -(x/m)/m, but for the direction's length, which
+    :func:`~neural_sim.field.pixels.ray_rates` keeps.
 
     Raises:
-        ValueError: no name, or one that does not place the camera.
+        ValueError: no name, or one that no camera follows.
     """
-    if not names or set(names) - set(RIGID):
-        raise ValueError(f"pose_rates: want names among {RIGID}, got {tuple(names)}")
-    numbers = {name: getattr(draw, name).detach() for name in RIGID}
+    drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
+    if not names or set(names) - set(drawn):
+        raise ValueError(f"pose_rates: want names of the draw's among {COORDINATES}, got {tuple(names)}")
+    numbers = {name: drawn[name].detach() for name in RIGID}
     still = {name: torch.zeros_like(number) for name, number in numbers.items()}
-    rates = [
-        torch.func.jvp(
-            lambda moved: cameras.orbit(**moved),
-            (numbers,),
-            ({**still, name: torch.ones_like(numbers[name])},),
-        )[1]
-        for name in names
-    ]
-    return torch.stack(rates)
+
+    def rate(name: str) -> Float[Tensor, "n 4 4"]:
+        if name == "magnification":
+            shrink = torch.tensor(SHRINK).to(numbers["phi"]) / drawn[name].detach()[:, None, None]
+            return cameras.orbit(**numbers) * shrink
+        one = {**still, name: torch.ones_like(numbers[name])}
+        return torch.func.jvp(lambda moved: cameras.orbit(**moved), (numbers,), (one,))[1]
+
+    return torch.stack([rate(name) for name in names])

@@ -104,22 +104,21 @@ class Scene:
     @torch.no_grad()
     def _maps(self, label: int, draw: SceneDraw) -> Maps:
         """Premultiplied colour and opacity at given scene parameters."""
-        poses = self._poses(label, draw)
-        if draw.magnification is None:
-            return Maps(*self._render(label, self.camera, poses, draw.weights))
-        each = []  # every image has a camera of its own
-        for i, magnification in enumerate(draw.magnification.tolist()):
-            own = None if draw.weights is None else draw.weights[i : i + 1]
-            camera = magnified(self.camera, magnification)
-            each.append(self._render(label, camera, poses[i : i + 1], own))
-        return Maps(*(torch.cat(parts) for parts in zip(*each, strict=True)))
+        poses, field = self._poses(label, draw), self.fields[label]
 
-    def _render(
-        self, label: int, camera: PinholeCamera, poses: Tensor, weights: Float[Tensor, "n k"] | None
-    ) -> tuple[Tensor, Tensor]:
-        if weights is None:
-            return self.renderer.render(self.fields[label], camera, poses)
-        return self.lit_renderer.render(self.fields[label], camera, poses, weights=weights)
+        def made(camera: PinholeCamera, rows: slice) -> tuple[Tensor, Tensor]:
+            if draw.weights is None:
+                return self.renderer.render(field, camera, poses[rows])
+            return self.lit_renderer.render(field, camera, poses[rows], weights=draw.weights[rows])
+
+        return _joined([Maps(*made(camera, rows)) for camera, rows in self._cameras(draw)])
+
+    def _cameras(self, draw: SceneDraw) -> list[tuple[PinholeCamera, slice]]:
+        """Cameras and the images each takes: one takes all, but every drawn focal length is a camera of its own."""
+        if draw.magnification is None:
+            return [(self.camera, slice(None))]
+        every = enumerate(draw.magnification.tolist())
+        return [(magnified(self.camera, size), slice(i, i + 1)) for i, size in every]
 
     @property
     def lit_renderer(self) -> NerfWRenderer:
@@ -172,17 +171,24 @@ class Scene:
         self, label: int, draw: SceneDraw, names: tuple[str, ...]
     ) -> tuple[Maps, dict[str, Maps]]:
         """The maps, and their derivatives by the named numbers of the draw and by every weight of a light."""
-        poses = self._poses(label, draw)
+        poses, field = self._poses(label, draw), self.fields[label]
         rates = pose_rates(draw, names).to(poses) if names else poses.new_zeros(0, *poses.shape)
-        if draw.weights is None:
-            maps, moved = self.renderer.render_with_tangents(self.fields[label], self.camera, poses, rates)
-            return maps, dict(zip(names, moved, strict=True))
-        count = draw.weights.shape[1]
-        turned = torch.eye(count, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
-        maps, moved = self.lit_renderer.render_with_tangents(
-            self.fields[label], self.camera, poses, rates, weights=draw.weights, weight_rates=turned
-        )
-        return maps, dict(zip((*names, *light_names(count)), moved, strict=True))
+        lights = 0 if draw.weights is None else draw.weights.shape[1]
+        turned = torch.eye(lights, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
+
+        def made(camera: PinholeCamera, rows: slice) -> list[Maps]:
+            if draw.weights is None:
+                maps, moved = self.renderer.render_with_tangents(field, camera, poses[rows], rates[:, rows])
+            else:
+                maps, moved = self.lit_renderer.render_with_tangents(
+                    field, camera, poses[rows], rates[:, rows],
+                    weights=draw.weights[rows], weight_rates=turned[:, rows],
+                )  # fmt: skip
+            return [maps, *moved]
+
+        each = [made(camera, rows) for camera, rows in self._cameras(draw)]
+        maps, *moved = (_joined(parts) for parts in zip(*each, strict=True))
+        return maps, dict(zip((*names, *light_names(lights)), moved, strict=True))
 
     def _draw_relaxed(
         self, label: int, logits: Tensor, count: int, generator: torch.Generator, relaxed: RelaxedDraws
@@ -242,6 +248,13 @@ class Scene:
         draw = replace(draw, weights=alone)
         nuisance = self._nuisance(label, count, generator).select(again)
         return self._compose(label, draw, None, self._maps(label, draw), nuisance)
+
+
+def _joined(parts: Sequence[Maps]) -> Maps:
+    """Maps of consecutive images as one."""
+    if len(parts) == 1:
+        return parts[0]
+    return Maps(torch.cat([part.rgb for part in parts]), torch.cat([part.opacity for part in parts]))
 
 
 def join(parts: Sequence[RenderedObject]) -> LabelledImages:
