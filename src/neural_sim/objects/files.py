@@ -43,7 +43,7 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
         TypeError,
         NotImplementedError,
         AttributeError,
-    ) as error:
+    ) as error:  # whatever trimesh's loaders raise on broken or unknown files; NotImplementedError is one of theirs
         raise ValueError(f"{path}: object {name!r} cannot be read as a mesh: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise ValueError(f"{path}: object {name!r} holds a {type(mesh).__name__}, want a triangle mesh")
