@@ -84,7 +84,9 @@ def test_what_is_fixed_says_which_distribution():
     assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}
 
 
-@pytest.mark.parametrize("override", ["score_at=3", "score_at=[-1]", "baseline.rounds=0", "gap=wide"])
+@pytest.mark.parametrize(
+    "override", ["score_at=3", "score_at=[2]", "score_at=[0]", "baseline.rounds=0", "gap=wide"]
+)
 def test_bad_choices_are_refused_by_name(override):
     with pytest.raises(UserError, match=override.split("=")[0].split(".")[-1]):
         experiment("baseline=lts", "+experiment=zoom_gap", override)

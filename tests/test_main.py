@@ -39,6 +39,12 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     for distribution in results["psi"]["pitcher"]["pose"].values():
         assert sum(distribution) == pytest.approx(1.0, abs=1e-6)
     assert results["symmetric_bins"]["drill"]["pose"] == [[b] for b in range(1, 9)]
+    begun, ended = results["curve"][0], results["curve"][-1]
+    assert [begun[key] for key in ("images", "detector_steps", "cpu_seconds")] == [0, 0, 0.0]
+    # The warm start (6 objects, 12 images each, 3 epochs of 3 batches) is charged beside the iterations.
+    assert ended["images"] == 6 * 12 + sum(record["images"] for record in results["iterations"])
+    assert ended["detector_steps"] == 9 + sum(record["detector_steps"] for record in results["iterations"])
+    assert ended["cpu_seconds"] > sum(record["cpu_seconds"] for record in results["iterations"])
     assert results["psi"]["pitcher"]["pose"]["learned"] != results["psi"]["pitcher"]["pose"]["initial"]
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
     assert figures == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}

@@ -39,7 +39,7 @@ def _sweep(folder, what):
     if not sweep.is_dir():
         _run(
             folder, "-m", *RUNS[what], f"name={what}", "scale=smoke", f"baseline={','.join(BASELINES)}",
-            "score_at=[1]", f"hydra.sweep.dir={sweep}", "hydra.sweep.subdir=${hydra.job.num}",
+            "score_at=[0.5]", f"hydra.sweep.dir={sweep}", "hydra.sweep.subdir=${hydra.job.num}",
         )  # fmt: skip
     return sweep
 

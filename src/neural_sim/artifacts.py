@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -12,9 +13,9 @@ from torch import Tensor
 
 from neural_sim import codec
 from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.cold import train_cold
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.retinanet import Detector, Parameters
-from neural_sim.detector.training import train_detector
 from neural_sim.devices import device_of, placed
 from neural_sim.experiment import Account, Experiment
 from neural_sim.field.base import RadianceField
@@ -22,9 +23,10 @@ from neural_sim.field.training import field_from_state, field_state
 from neural_sim.methods import outer_loop
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.records import Cost
 from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.store import Store, code_version, digest, tensor_digest
-from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.scene import RenderedObject, Scene
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
 
@@ -144,12 +146,8 @@ class Artifacts:
         version = code_version(
             "field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synthesis", "detector", "cameras"
         )
-        return {
-            "fields": [self._field_key(n) for n in self.names],
-            "names": self.names,
-            **parts,
-            "code": version,
-        }
+        fields = [self._field_key(n) for n in self.names]
+        return {"fields": fields, "names": self.names, **parts, "code": version}
 
     @cached_property
     def targets(self) -> dict[str, LabelledImages]:
@@ -204,18 +202,6 @@ class Artifacts:
     def _generator(self, purpose: int) -> torch.Generator:
         return torch.Generator().manual_seed(1_000_003 * (self.x.seed + 1) + purpose)
 
-    def _train_cold(self, psi: Tensor, epochs: int) -> Parameters:
-        """A detector from scratch on images from ``psi``; the same budget and seed whatever the method."""
-        generator = self._generator(1)
-        training = self.x.training
-        images = join(self.scene.training_set(psi, training.images_per_object, generator))
-        params, _ = train_detector(
-            self.detector, placed(self.detector.init(generator), self.device), images, generator, epochs=epochs,
-            batch_size=training.batch_size, learning_rate=training.learning_rate,
-            weight_decay=training.weight_decay, progress=False,
-        )  # fmt: skip
-        return placed(params, torch.device("cpu"))
-
     def _trained_key(self, psi: Tensor) -> dict[str, Any]:
         return {
             "scene": self._scene_key(),
@@ -226,18 +212,31 @@ class Artifacts:
 
     def warm_start(self) -> Parameters:
         """The detector that the psi loop goes on from; with equal epochs it is also the one scored as ``ns``."""
+        return placed(self._warm_start()["params"], self.device)
+
+    def _warm_start(self) -> dict[str, Any]:
         return self._detector(self.psi("initial"), self.x.training.warm_epochs, "warm_start", "warm start")
 
-    def _detector(self, psi: Tensor, epochs: int, stage: str, what: str) -> Parameters:
-        key = {**self._trained_key(psi), "epochs": epochs}
-        found = self._fetch(stage, "detector", what, key, lambda: self._train_cold(psi, epochs))
-        return placed(found, self.device)
+    def _detector(self, psi: Tensor, epochs: int, stage: str, what: str) -> dict[str, Any]:
+        """A detector trained from scratch (``params``), with the same seed whatever the method, and its ``cost``."""
+        key = {**self._trained_key(psi), "epochs": epochs, "cold": code_version("cold")}
+
+        def make() -> dict[str, Any]:
+            held = self.scene, self.detector, self.x.training, psi, epochs, self._generator(1), self.device
+            return train_cold(*held)
+
+        return self._fetch(stage, "detector", what, key, make)
 
     def learned(self) -> dict[str, Any]:
-        """psi before and after every iteration of the method (``trajectory``), and the iterations' records."""
+        """psi before and after every iteration of the method (``trajectory``), the iterations' records, and what was
+        spent before the first of them (``before``): the warm start, which every loop's backbone comes from."""
         method = self.x.baseline
         if isinstance(method, Fixed):
-            return {"trajectory": self.psi(method.which)[None], "records": []}
+            return {
+                "trajectory": self.psi(method.which)[None],
+                "records": [],
+                "before": dataclasses.asdict(Cost()),
+            }
 
         def make() -> Any:
             loop = outer_loop(
@@ -246,7 +245,9 @@ class Artifacts:
             )  # fmt: skip
             found = learn_psi(loop, self.x.progress)
             records = [dataclasses.asdict(record) for record in found.records]
-            return {"trajectory": found.trajectory, "records": records}
+            return {
+                "trajectory": found.trajectory, "records": records, "before": self._warm_start()["cost"]
+            }  # fmt: skip
 
         groups = ["target", "outer"]
         groups += ["gradient", "solver"] if isinstance(method, HypergradientLoop) else ["baseline"]
@@ -271,8 +272,8 @@ class Artifacts:
 
         def make() -> Any:
             what_trained = f"detector trained on {what}"
-            params = self._detector(psi, self.x.training.cold_epochs, "evaluate", what_trained)
-            test = self.targets["test"]
+            trained = self._detector(psi, self.x.training.cold_epochs, "evaluate", what_trained)
+            params, test = placed(trained["params"], self.device), self.targets["test"]
             detections = self.detector.predict(params, test.images)
             return {"ap": evaluate(detections, test, self.names), "detections": detections}
 
@@ -281,17 +282,13 @@ class Artifacts:
 
     def compared(self) -> dict[str, Tensor]:
         """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
-        return {
-            "ns": self.psi("initial"),
-            "learned": self.learned_psi,
-            "matched": self.psi("target"),
-        }
+        return {"ns": self.psi("initial"), "learned": self.learned_psi, "matched": self.psi("target")}
 
     def scored_iterations(self) -> dict[int, Tensor]:
-        """psi at the method's start, after the iterations of ``score_at``, and at its end, by iterations done."""
+        """psi by iterations done: at the start, after the parts of all iterations in ``score_at``, at the end."""
         trajectory = self.learned()["trajectory"]
         last = len(trajectory) - 1
-        asked = sorted({0, last, *(i for i in self.x.score_at if i <= last)})
+        asked = sorted({0, last, *(math.floor(part * last + 0.5) for part in self.x.score_at)})
         return {i: trajectory[i] for i in asked}
 
     def on_the_way(self) -> dict[str, Tensor]:

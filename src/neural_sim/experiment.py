@@ -26,7 +26,7 @@ class Experiment:
 
     name: str
     seed: int
-    score_at: tuple[int, ...]
+    score_at: tuple[float, ...]
     stages: tuple[str, ...]
     store: Path
     mlflow: str

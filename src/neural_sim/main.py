@@ -140,11 +140,13 @@ def _check_top(plain: Mapping[str, Any]) -> None:
     for stage in plain["stages"]:
         if stage not in STAGES:
             raise UserError(f"stages: unknown stage {stage!r}, want some of {', '.join(STAGES)}")
-    whole = isinstance(plain["score_at"], list) and all(
-        type(at) is int and at >= 0 for at in plain["score_at"]
+    parts = isinstance(plain["score_at"], list) and all(
+        type(at) in (int, float) and 0 < at <= 1 for at in plain["score_at"]
     )
-    if not whole:
-        raise UserError(f"score_at must be a list of iterations from 0, got {plain['score_at']!r}")
+    if not parts:
+        raise UserError(
+            f"score_at must be a list of parts of the method's iterations in (0, 1], got {plain['score_at']!r}"
+        )
     if not isinstance(plain["progress"], bool):
         raise UserError(f"progress must be true or false, got {plain['progress']!r}")
     if plain["trainer"]["accelerator"] not in ("cpu", "gpu"):

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from neural_sim.artifacts import Artifacts
 from neural_sim.devices import peak_memory_mb
 from neural_sim.experiment import Experiment
+from neural_sim.outer.records import Cost
 from neural_sim.plan import plan
 from neural_sim.report.run import (
     RunResults,
@@ -93,17 +94,15 @@ class Pipeline:
         )
 
     def curve(self) -> list[dict[str, Any]]:
-        """What the method had spent, and what its psi was worth, at its start, on the way as asked, and at its end."""
-        records = self.made.learned()["records"]
-        points = []
+        """What the method had spent, its warm start included, and what its psi was worth, at its start (which costs
+        nothing), on the way as asked, and at its end."""
+        learned, points = self.made.learned(), []
         for iteration, psi in self.made.scored_iterations().items():
-            spent = {
-                key: sum(record[key] for record in records[:iteration])
-                for key in ("images", "detector_steps", "products", "cpu_seconds")
-            }
-            seconds = sum(_iteration_seconds(record) for record in records[:iteration])
+            spent = (
+                Cost(**learned["before"]) + Cost.of(learned["records"][:iteration]) if iteration else Cost()
+            )
             ap = self.made.scores(psi, f"psi after {iteration} iterations")["ap"]
-            points.append({"iteration": iteration, **spent, "seconds": seconds, "ap": ap})
+            points.append({"iteration": iteration, **dataclasses.asdict(spent), "ap": ap})
         return points
 
     def report(self, folder: Path) -> None:
@@ -122,11 +121,6 @@ class Pipeline:
         track(results, uri, folder)
         print(results.summary())
         print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
-
-
-def _iteration_seconds(record: dict[str, Any]) -> float:
-    """A record's seconds; parts of the hypergradient are parts of a phase that is counted already."""
-    return sum(spent for phase, spent in record["seconds"].items() if not phase.startswith("hypergradient_"))
 
 
 def run(experiment: Experiment, folder: Path) -> float | None:

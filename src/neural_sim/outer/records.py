@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.outer.certificate import Certificate
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What was spent: labelled images made, optimiser steps of detectors, Hessian products, seconds on the wall clock
+    and seconds of all processor cores together."""
+
+    images: int = 0
+    detector_steps: int = 0
+    products: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(
+            self.images + other.images,
+            self.detector_steps + other.detector_steps,
+            self.products + other.products,
+            self.seconds + other.seconds,
+            self.cpu_seconds + other.cpu_seconds,
+        )
+
+    @staticmethod
+    def of(records: Sequence[Mapping[str, Any]]) -> Cost:
+        """The sum over iteration records (as dictionaries). Phases ``hypergradient_*`` are parts of ``hypergradient``,
+        which counts them already."""
+        total = Cost()
+        for record in records:
+            phases = record["seconds"].items()
+            seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
+            counts = (record[key] for key in ("images", "detector_steps", "products"))
+            total += Cost(*counts, seconds=seconds, cpu_seconds=record["cpu_seconds"])
+        return total
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,9 @@ class Comparison:
 
     ``ap`` is the biased objects' mean AP, ``won_back`` the share of the gap from ns to matched, ``ahead`` the
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
-    unit of log seconds, by ``clock``. ``spent`` are means over seeds.
+    unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
+    took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`. ``spent`` are means over seeds, the warm
+    start included.
     """
 
     setting: str
@@ -57,6 +59,8 @@ class Comparison:
     ahead: Mapping[str, Estimate]
     area: Mapping[str, Estimate]
     spent: Mapping[str, Mapping[str, float]]
+    at_equal_cost: Mapping[str, Estimate]
+    equal_cost: float
     clock: Clock = "seconds"
 
 
@@ -92,7 +96,7 @@ def compare(
         runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
         {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
-         for m in methods}, clock,
+         for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock), clock,
     )  # fmt: skip
 
 
@@ -132,6 +136,38 @@ def area_under(
     edges = np.concatenate([[first], seconds[(seconds > first) & (seconds < last)], [last]])
     reached = np.searchsorted(seconds, edges[:-1], side="right") - 1
     return float((ap[reached.clip(0)] * np.diff(np.log(edges))).sum() / math.log(last / first))
+
+
+def ap_at(seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], budget: float) -> float:
+    """AP at a budget of seconds: linear in log seconds between scored points, the start's until the first of them."""
+    begun = seconds > 0.0
+    if not begun.any() or budget <= seconds[begun][0]:
+        return float(ap[0])
+    return float(np.interp(math.log(budget), np.log(seconds[begun]), ap[begun]))
+
+
+def _at_equal_cost(
+    table: Mapping[tuple[str, int], FinishedRun],
+    seeds: Sequence[int],
+    methods: Sequence[str],
+    draws: int,
+    seed: int,
+    clock: Clock,
+) -> tuple[dict[str, Estimate], float]:
+    """Every method's AP at the least seconds that any of them took in all, seed by seed, and those seconds' mean."""
+    curves = {
+        key: biased_ap(run, clock) for key, run in table.items() if key[1] in seeds and key[0] in methods
+    }
+    ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
+    budgets = {s: min(end, default=0.0) for s, end in ends.items()}
+    random, found = np.random.default_rng(seed), {}
+    chosen = random.integers(len(seeds), size=(draws, len(seeds)))
+    for method in methods:
+        reached = np.asarray([ap_at(*curves[method, s], budgets[s]) for s in seeds])
+        found[method] = _estimates(reached.mean(keepdims=True), reached[chosen].mean(1, keepdims=True))[0]
+        if len(seeds) == 1:
+            found[method] = Estimate(found[method].value)
+    return found, _mean(budgets.values())
 
 
 def _areas(
