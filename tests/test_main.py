@@ -97,20 +97,62 @@ def test_help_answers_without_heavy_imports():
     assert done.stdout.strip() == "[]"
 
 
-def _scale_keys(node, prefix=""):
+def _leaves(node, prefix=""):
     for key, value in node.items():
         if isinstance(value, dict):
-            yield from _scale_keys(value, f"{prefix}{key}.")
+            yield from _leaves(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}"
+            yield f"{prefix}{key}", value
+
+
+def _file(path):
+    return dict(_leaves(OmegaConf.to_container(OmegaConf.load(path))))
+
+
+def _unresolved(*overrides):
+    return OmegaConf.to_container(_config(*overrides), resolve=False)
+
+
+SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
+
+
+def test_scales_set_the_same_keys_of_the_budget_and_nothing_else():
+    smoke, *others = [_unresolved(f"scale={scale}") for scale in ("smoke", *SCALES)]
+    budgets = [dict(_leaves(made.pop("budget"))) for made in (smoke, *others)]
+    assert all(made == smoke for made in others)
+    assert all(set(budget) == set(budgets[0]) for budget in budgets)
+    text = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
+    assert not [key for key in budgets[0] if f"${{budget.{key}}}" not in text], "read by no file"
 
 
 def test_experiments_set_no_key_that_a_scale_sets():
-    scales, experiments = set(), set()
-    for folder, keys in (("scale", scales), ("experiment", experiments)):
-        for path in (CONF / folder).glob("*.yaml"):
-            keys |= set(_scale_keys(OmegaConf.to_container(OmegaConf.load(path))))
-    assert scales and experiments and not scales & experiments
+    scaled = {key for key, value in _leaves(_unresolved()) if str(value).startswith("${budget.")}
+    set_by_experiments = {key for path in (CONF / "experiment").glob("*.yaml") for key in _file(path)}
+    assert {"views.count", "outer.iterations", "target.val_per_object"} <= scaled
+    assert set_by_experiments and not scaled & set_by_experiments
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_scale_goes_with_labelled_photographs(scale, tmp_path):
+    annotations = tmp_path / "val.json"
+    annotations.write_text("{}")
+    made = build(_config("target=coco", f"target.annotations={annotations}", f"scale={scale}"))
+    assert made.target.annotations == str(annotations)
+    assert made.training.image_size == made.config["budget"]["training"]["image_size"]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_what_a_scale_sets_can_be_overridden_where_it_is_used(scale):
+    overrides = {
+        "views.count": 30,
+        "training.image_size": 72,
+        "outer.iterations": 3,
+        "target.val_per_object": 10,
+    }
+    made = build(_config(f"scale={scale}", *(f"{key}={value}" for key, value in overrides.items())))
+    assert made.views.count == 30 and made.training.image_size == 72
+    assert made.outer.iterations == 3 and made.target.val_per_object == 10
+    assert made.views.image_size == made.config["budget"]["views"]["image_size"]
 
 
 def _choices():

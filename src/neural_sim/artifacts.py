@@ -142,12 +142,21 @@ class Artifacts:
         return self.x.distribution.psi(which, self.names)
 
     def _scene_key(self) -> dict[str, Any]:
-        parts = self._config("renderer", "parameter", "unlearned", "synthesis", "training")
+        parts = self._config("renderer", "unlearned", "synthesis", "training")
+        parts["factors"] = [factor.drawn for factor in self.x.distribution.factors]
         version = code_version(
             "field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synthesis", "detector", "cameras"
         )
         fields = [self._field_key(n) for n in self.names]
         return {"fields": fields, "names": self.names, **parts, "code": version}
+
+    def _targets_key(self) -> dict[str, Any]:
+        return {
+            "objects": self.digests, "names": self.names, "seed": self.x.seed,
+            **self._config("target", "parameter", "unlearned", "synthesis", "views"),
+            "size": self.x.training.image_size,
+            "code": code_version(*MESHES_DRAWN, "target", "synthesis", *DISTRIBUTIONS),
+        }  # fmt: skip
 
     @cached_property
     def targets(self) -> dict[str, LabelledImages]:
@@ -166,13 +175,7 @@ class Artifacts:
             )
             return {name: codec.pack_images(images) for name, images in made.items()}
 
-        key = {
-            "objects": self.digests, "names": self.names, "seed": self.x.seed,
-            **self._config("target", "parameter", "unlearned", "synthesis", "views"),
-            "size": self.x.training.image_size,
-            "code": code_version(*MESHES_DRAWN, "target", "synthesis", *DISTRIBUTIONS),
-        }  # fmt: skip
-        entry = self.store.fetch("target", key, make)
+        entry = self.store.fetch("target", self._targets_key(), make)
         return {name: codec.unpack_images(held) for name, held in entry.value.items()}
 
     @cached_property
@@ -203,12 +206,10 @@ class Artifacts:
         return torch.Generator().manual_seed(1_000_003 * (self.x.seed + 1) + purpose)
 
     def _trained_key(self, psi: Tensor) -> dict[str, Any]:
-        return {
-            "scene": self._scene_key(),
-            **self._config("detector"),
-            "psi": tensor_digest([psi]),
-            "seed": self.x.seed,
-        }
+        """Of what is drawn from psi: by its probabilities, whatever floor or relaxation the method has besides."""
+        p = self.x.distribution.probabilities(psi.detach().cpu().double())
+        drawn = tensor_digest([(p[name] * 1e12).round() for name in self.x.distribution.names])
+        return {"scene": self._scene_key(), **self._config("detector"), "p": drawn, "seed": self.x.seed}
 
     def warm_start(self) -> Parameters:
         """The detector that the psi loop goes on from; with equal epochs it is also the one scored as ``ns``."""
@@ -249,10 +250,10 @@ class Artifacts:
                 "trajectory": found.trajectory, "records": records, "before": self._warm_start()["cost"]
             }  # fmt: skip
 
-        groups = ["target", "outer"]
+        groups = ["outer", "parameter"]
         groups += ["gradient", "solver"] if isinstance(method, HypergradientLoop) else ["baseline"]
         key = {
-            "warm_start": self._trained_key(self.psi("initial")), **self._config(*groups),
+            "warm_start": self._trained_key(self.psi("initial")), "target": self._targets_key(), **self._config(*groups),
             "code": code_version("outer", "gradient", "solver", "baseline", "methods", "parameter/update"),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
@@ -277,7 +278,11 @@ class Artifacts:
             detections = self.detector.predict(params, test.images)
             return {"ap": evaluate(detections, test, self.names), "detections": detections}
 
-        key = {"trained": self._trained_key(psi), **self._config("target"), "code": code_version("target")}
+        key = {
+            "trained": self._trained_key(psi),
+            "epochs": self.x.training.cold_epochs,
+            "target": self._targets_key(),
+        }
         return self._fetch("evaluate", "evaluate", f"scores of the detector trained on {what}", key, make)
 
     def compared(self) -> dict[str, Tensor]:

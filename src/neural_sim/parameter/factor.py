@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -104,6 +104,12 @@ class BinnedFactor:
         for name in self.beliefs.biased or {}:
             for which in ("initial", "target"):
                 self.probabilities(which, name)
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """What draws of given probabilities depend on; how they are relaxed, and from which logits, is left out."""
+        names = ("coordinate", "bins", "low", "high", "geometric", "periodic")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def size(self) -> int:

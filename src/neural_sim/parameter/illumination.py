@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -75,6 +75,11 @@ class Illumination:
     def name(self) -> str:
         """Of the factor."""
         return "illumination"
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """What images under given weights depend on."""
+        return {"anchors": self.anchors}
 
     @property
     def size(self) -> int:
