@@ -142,8 +142,8 @@ class Artifacts:
         return self.x.distribution.psi(which, self.names)
 
     def _scene_key(self) -> dict[str, Any]:
-        parts = self._config("renderer", "unlearned", "synthesis", "training")
-        parts["factors"] = [factor.drawn for factor in self.x.distribution.factors]
+        parts, drawn = self._config("renderer", "synthesis", "training"), self.x.distribution
+        parts |= {"factors": [factor.drawn for factor in drawn.factors], "ranges": dict(drawn.ranges)}
         version = code_version(
             "field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synthesis", "detector", "cameras"
         )
@@ -164,15 +164,8 @@ class Artifacts:
         camera = self.x.views.camera(self.x.training.image_size)
 
         def make() -> Any:
-            made = self.x.target.sets(
-                self.meshes,
-                self.mesh_renderer,
-                self.x.distribution,
-                camera,
-                self.x.synthesis,
-                self.x.seed,
-                self.x.views.rig,
-            )
+            drawn = self.x.distribution, camera, self.x.synthesis, self.x.seed, self.x.views.rig
+            made = self.x.target.sets(self.meshes, self.mesh_renderer, *drawn)
             return {name: codec.pack_images(images) for name, images in made.items()}
 
         entry = self.store.fetch("target", self._targets_key(), make)
@@ -208,7 +201,7 @@ class Artifacts:
     def _trained_key(self, psi: Tensor) -> dict[str, Any]:
         """Of what is drawn from psi: by its probabilities, whatever floor or relaxation the method has besides."""
         p = self.x.distribution.probabilities(psi.detach().cpu().double())
-        drawn = tensor_digest([(p[name] * 1e12).round() for name in self.x.distribution.names])
+        drawn = tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.x.distribution.names])
         return {"scene": self._scene_key(), **self._config("detector"), "p": drawn, "seed": self.x.seed}
 
     def warm_start(self) -> Parameters:
@@ -253,7 +246,8 @@ class Artifacts:
         groups = ["outer", "parameter"]
         groups += ["gradient", "solver"] if isinstance(method, HypergradientLoop) else ["baseline"]
         key = {
-            "warm_start": self._trained_key(self.psi("initial")), "target": self._targets_key(), **self._config(*groups),
+            "warm_start": self._trained_key(self.psi("initial")), "target": self._targets_key(),
+            **self._config(*groups),
             "code": code_version("outer", "gradient", "solver", "baseline", "methods", "parameter/update"),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)

@@ -1,0 +1,35 @@
+"""Which settings a stored detector depends on: what its images are drawn from, not how a method relaxes the draws."""
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim.artifacts import Artifacts
+from neural_sim.main import build, conf_directory
+
+
+def keys(tmp_path, *overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        config = compose(
+            "config", ["+experiment=pose_gap", "scale=smoke", *overrides, f"paths.store={tmp_path}"]
+        )
+    made = Artifacts(build(config))
+    return made._trained_key(made.psi("initial")), made._targets_key()
+
+
+@pytest.mark.parametrize("other", ["floor=0.0", "temperature=1.0", "bin_mean=linear"])
+def test_methods_that_relax_differently_share_the_detectors_of_a_distribution(tmp_path, other):
+    assert keys(tmp_path)[0] == keys(tmp_path, f"parameter.pose.{other}")[0]
+
+
+@pytest.mark.parametrize(
+    "other",
+    ["seed=1", "parameter.pose.bins=9", "parameter.pose.other_range_deg=[-30,30]", "unlearned.distance=[2.5,4.0]",
+     "training.cold_epochs=4", "detector=micro", "parameter.pose.initial={dominant: 1}", "gap=uniform"],
+)  # fmt: skip
+def test_what_images_are_drawn_from_tells_detectors_apart(tmp_path, other):
+    assert keys(tmp_path)[0] != keys(tmp_path, other)[0]
+
+
+def test_detectors_do_not_depend_on_the_target_but_its_images_do(tmp_path):
+    ours, other = keys(tmp_path), keys(tmp_path, "parameter.pose.target={dominant: 1}")
+    assert ours[0] == other[0] and ours[1] != other[1]
