@@ -146,8 +146,8 @@ class Outer:
     renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
     objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
     ``on_untrusted`` is what happens to a step that fails ``trust``; ``keep`` takes it whole, as the paper does. Every
-    ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite differences of a problem retrained on ``certify_per_bin`` images
-    of every bin: 2 k - 1 trainings to stationarity.
+    ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite differences of a problem
+    retrained on ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
     """
 
     update: Update
