@@ -10,7 +10,10 @@ from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
-from neural_sim.parameter.update import Mirror
+from neural_sim.outer.inner import pooled
+from neural_sim.parameter.illumination import PlainProjectedGradient
+from neural_sim.parameter.update import SGD, Mirror
+from neural_sim.synthesis.scene import HardDraws
 
 CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
@@ -70,6 +73,80 @@ def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     assert experiment("baseline=auto_sim", "outer.update.max_step=2").outer.update == Mirror(
         2.0, max_step=2.0
     )
+
+
+def _differences(one, other, where=""):
+    """The keys, with dots, in which two configurations differ."""
+    if not (isinstance(one, dict) and isinstance(other, dict)):
+        return set() if one == other else {where}
+    return {
+        found
+        for key in one.keys() | other.keys()
+        for found in _differences(one.get(key), other.get(key), f"{where}.{key}".lstrip("."))
+    }
+
+
+PAIRS = [
+    ("neural_sim", "neural_sim_pathwise"),
+    ("neural_sim", "neural_sim_reinforce"),
+    ("neural_sim_pathwise", "neural_sim_reinforce"),
+    ("neural_sim_paper", "neural_sim_paper_reinforce"),
+]
+
+
+@pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("pair", PAIRS, ids="-".join)
+def test_estimators_are_compared_in_one_loop(pair, scale):
+    one, other = (experiment(f"baseline={name}", f"scale={scale}") for name in pair)
+    differ = _differences(one.config, other.config)
+    assert {"baseline.name", "gradient._target_"} <= differ
+    assert all(key == "baseline.name" or key.startswith("gradient.") for key in differ)
+    assert type(one.gradient) is not type(other.gradient)
+    for made, name in ((one, pair[0]), (other, pair[1])):
+        wanted = {"paper": PathwiseEstimator, "pathwise": PathwiseEstimator, "reinforce": ReinforceEstimator}
+        assert isinstance(made.gradient, wanted.get(name.rsplit("_", 1)[1], StratifiedEstimator))
+
+
+def test_none_is_the_old_name_of_neural_sim():
+    assert (
+        experiment("baseline=none").config == experiment("baseline=neural_sim").config == experiment().config
+    )
+
+
+@pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])
+def test_the_papers_method_is_what_the_paper_says_at_every_scale(scale):
+    made = experiment(
+        "baseline=neural_sim_paper", f"scale={scale}", "parameter=[pose,zoom,illumination]", "renderer=nerf_w"
+    )
+    assert (made.gradient.mode, made.gradient.relaxation) == ("reverse", "gumbel_softmax")
+    assert all(factor.floor == 0.0 and factor.bin_mean == "linear" for factor in made.distribution.binned)
+    assert all(factor.temperature == 0.1 for factor in made.distribution.binned)
+    assert made.distribution.light.constraint == "affine"
+    outer = made.outer
+    assert (outer.epochs, outer.start, outer.train_first, outer.final_step) == (2, "previous", True, 1.0)
+    assert (outer.curvature_images, outer.pool_per_bin, outer.on_untrusted) == (0, 0, "keep")
+    assert outer.images_per_object == (6 if scale == "smoke" else 50)
+    assert isinstance(outer.update, SGD) and (outer.update.momentum, outer.update.max_step) == (0.9, None)
+    assert isinstance(outer.light_update, PlainProjectedGradient) and outer.light_update.momentum == 0.9
+
+
+@pytest.mark.parametrize("key", ["max_step", "shrink"])
+def test_the_plain_step_of_lights_knows_no_other_keys(key):
+    with pytest.raises(UserError, match=f"outer.light_update.{key}: unknown key"):
+        experiment("baseline=neural_sim_paper", f"+outer.light_update.{key}=1")
+
+
+def test_lights_are_explored_where_a_method_scores_its_draws_alone():
+    lights = ["parameter=[pose,illumination]", "renderer=nerf_w"]
+    explores = {"lts", "auto_sim", "neural_sim_reinforce", "neural_sim_paper_reinforce"}
+    hard = {*explores, "neural_sim", "ns", "oracle", "random_search", "bayes_opt"}
+    for name in hard:
+        made = experiment(f"baseline={name}", *lights)
+        assert made.draws == HardDraws(explore=name in explores)
+        assert not pooled(made.outer, made.draws, made.distribution)
+    for name in ("lts", "random_search", "bayes_opt"):  # no light moves: images come from a pool
+        made = experiment(f"baseline={name}")
+        assert pooled(made.outer, made.draws, made.distribution)
 
 
 def test_lights_want_a_renderer_that_knows_them():

@@ -16,7 +16,7 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.settings import Outer, Training, Views
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.store import Entry
-from neural_sim.synthesis.scene import Draws, HardDraws
+from neural_sim.synthesis.scene import HARD, Draws, HardDraws
 from neural_sim.synthesis.training_set import Synthesizer
 
 
@@ -49,10 +49,10 @@ class Experiment:
 
     @property
     def draws(self) -> Draws:
-        """How the method wants its images drawn: as its estimator does, or so that they have a density."""
-        return (
-            self.gradient.draws if isinstance(self.baseline, HypergradientLoop) else HardDraws(explore=True)
-        )
+        """How the method wants its images drawn: as its estimator does, or as a method that sees rewards says."""
+        if isinstance(self.baseline, HypergradientLoop):
+            return self.gradient.draws
+        return HARD if isinstance(self.baseline, Fixed) else HardDraws(explore=self.baseline.explores)
 
 
 @dataclass(frozen=True)

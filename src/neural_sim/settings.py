@@ -10,7 +10,7 @@ import torch
 
 from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.illumination import ProjectedGradient
+from neural_sim.parameter.illumination import LightUpdate, ProjectedGradient
 from neural_sim.parameter.update import Update
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import Quality
@@ -19,7 +19,7 @@ from neural_sim.renderer.views import render_views
 from neural_sim.types import PinholeCamera, PosedViews
 
 Start = Literal["previous", "warm", "fresh"]
-OnUntrusted = Literal["shrink", "skip", "stop"]
+OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
 
 def _at_least(where: str, smallest: float, **values: float) -> None:
@@ -145,9 +145,9 @@ class Outer:
     anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
     renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
     objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
-    ``on_untrusted`` is what happens to a step that fails ``trust``. Every ``certify_every`` steps (0: never) one
-    object's gradient, in turn, is compared with finite differences of a problem retrained on ``certify_per_bin`` images
-    of every bin: 2 k - 1 trainings to stationarity.
+    ``on_untrusted`` is what happens to a step that fails ``trust``; ``keep`` takes it whole, as the paper does. Every
+    ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite differences of a problem
+    retrained on ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
     """
 
     update: Update
@@ -165,7 +165,7 @@ class Outer:
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"
     learned: tuple[str, ...] | None = None
-    light_update: ProjectedGradient = field(default_factory=ProjectedGradient)
+    light_update: LightUpdate = field(default_factory=ProjectedGradient)
     certify_every: int = 0
     certify_per_bin: int = 1
 

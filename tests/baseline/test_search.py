@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from neural_sim.baseline.search import BayesOpt, RandomSearch
+from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
@@ -30,6 +31,29 @@ def test_the_best_psi_so_far_is_reported_and_the_first_is_the_start(method):
         best = max(best, reward(asked))
         assert reward(search.psi) == best
     assert best > reward(PSI) + 0.3
+
+
+def test_the_first_trial_of_bayesian_optimisation_is_the_start_itself():
+    """A dominant bin's logit lies beyond the reach, and so may a weight of a light on the affine plane."""
+    biased = {"mug": {"initial": {"dominant": 2}}}
+    lights = Illumination(
+        3, "affine", initial=[0.1, 0.2, 0.7], biased={"mug": {"initial": [5.0, -3.5, -0.5]}}
+    )
+    scene = SceneDistribution.of([Pose(biased=biased), Zoom(biased=biased), lights])
+    start = scene.psi("initial", ["mug", "can"])
+    assert float(start[0, :8].max()) > 3.0
+    search = BayesOpt(reach=3.0).begin(scene, start, torch.Generator().manual_seed(0))
+    assert torch.equal(search.ask(), start)
+    search.tell(1.0, [])
+    assert search._study.trials[0].params == {f"psi_{i}": v for i, v in enumerate(start.flatten().tolist())}
+    for _ in range(20):  # later ones keep to the reach but where the start lies beyond it
+        asked = scene.split(search.ask())
+        bins = torch.cat([asked["pose"], asked["zoom"]], -1)
+        beyond = torch.cat([scene.split(start)[name] for name in ("pose", "zoom")], -1)
+        assert (bins <= beyond.clamp_min(3.0)).all() and (bins >= beyond.clamp_max(-3.0)).all()
+        torch.testing.assert_close(asked["illumination"].sum(-1), torch.ones(2, dtype=torch.float64))
+        search.tell(0.0, [])
+    assert torch.equal(search.psi, start)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)

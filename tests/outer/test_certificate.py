@@ -64,7 +64,8 @@ def test_a_good_step_is_kept_with_everything_recorded():
     ],
 )
 @pytest.mark.parametrize(
-    ("on_untrusted", "action"), [("shrink", "shrunk"), ("skip", "skipped"), ("stop", "stopped")]
+    ("on_untrusted", "action"),
+    [("shrink", "shrunk"), ("keep", "kept"), ("skip", "skipped"), ("stop", "stopped")],
 )
 def test_each_demand_is_doubted_by_name_and_handled_as_configured(found, cosine, doubt, on_untrusted, action):
     certificate = judge(found, cosine, on_untrusted=on_untrusted)
@@ -81,7 +82,8 @@ def test_what_does_not_exist_is_not_doubted():
 
 
 def test_a_gradient_that_is_not_finite_is_never_followed():
-    for on_untrusted, action in (("shrink", "skipped"), ("skip", "skipped"), ("stop", "stopped")):
+    actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
+    for on_untrusted, action in actions.items():
         certificate = judge(result(gradient=(math.nan, 0.0)), on_untrusted=on_untrusted)
         assert certificate.action == action and "not finite" in certificate.doubts
 

@@ -231,22 +231,23 @@ def test_the_pool_holds_every_combination_of_bins(scene):
     assert pool.probes(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
 
 
-@pytest.mark.parametrize("action", ["skip", "stop", "shrink"])
-def test_untrusted_steps_are_skipped_stop_the_loop_or_are_shrunk(scene, action):
+@pytest.mark.parametrize("action", ["skip", "stop", "shrink", "keep"])
+def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, action):
     estimator = StratifiedEstimator(probes_per_bin=2)
     learned = learn_psi(
         _module(scene, estimator, 2, detector=MICRO, trust=NOTHING_WILL_DO, on_untrusted=action), False
     )
     assert all("signal" in record.certificate.doubts for record in learned.records)
     assert len(learned.records) == (1 if action == "stop" else 2)
-    if action != "shrink":
+    if action not in ("shrink", "keep"):
         assert not learned.last.any()
         return
-    one = learn_psi(_module(scene, estimator, 1, detector=MICRO, trust=NOTHING_WILL_DO), False).last
+    settings = {"trust": NOTHING_WILL_DO, "on_untrusted": action}
+    one = learn_psi(_module(scene, estimator, 1, detector=MICRO, **settings), False).last
     free = learn_psi(
         _module(scene, estimator, 1, detector=MICRO, trust=Trust(None, None, None, None)), False
     ).last
-    torch.testing.assert_close(one, 0.25 * free)
+    torch.testing.assert_close(one, (0.25 if action == "shrink" else 1.0) * free)
 
 
 @pytest.mark.parametrize(

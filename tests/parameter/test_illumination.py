@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from neural_sim.parameter.illumination import Illumination, ProjectedGradient
+from neural_sim.parameter.illumination import Illumination, PlainProjectedGradient, ProjectedGradient
 from neural_sim.parameter.update import UpdateState
 
 DOUBLE = torch.float64
@@ -100,11 +100,51 @@ def test_steps_lead_to_the_constrained_optimum_of_a_quadratic(constraint, genera
     torch.testing.assert_close(psi.sum(-1), torch.ones(2, dtype=DOUBLE))
 
 
-def test_a_gradient_that_is_not_finite_moves_nothing():
+@pytest.mark.parametrize("constraint", ["simplex", "affine"])
+def test_the_plain_step_is_momentum_and_projection_written_out(constraint, generator):
+    illumination = Illumination(anchors=5, constraint=constraint)
+    update = PlainProjectedGradient(learning_rate=0.4, momentum=0.7)
+    psi = illumination.project(normal(generator, 3, 5))
+    state, gradients = UpdateState.zeros(psi), 10.0 * normal(generator, 6, 3, 5)
+    for done in range(6):
+        velocity = sum(0.7 ** (done - k) * gradients[k] for k in range(done + 1))
+        free = psi - 0.4 * velocity
+        psi, state = update.step(psi, gradients[done], torch.full_like(psi, 1e9), state, illumination.project)
+        for row, point in zip(psi, free, strict=True):
+            torch.testing.assert_close(row, nearest_by_enumeration(point, constraint), rtol=0, atol=1e-12)
+
+
+def test_plain_steps_on_the_plane_follow_the_recursion_of_heavy_ball(generator):
+    """On the affine plane the projection takes out the mean of a step and nothing else, so that momentum on
+    |w - t|^2 / 2 is the heavy ball: e_{n+1} = (1 + m - r) e_n - m e_{n-1} for e = w - t within the plane."""
+    illumination, rate, momentum = Illumination(anchors=5, constraint="affine"), 0.3, 0.9
+    best = illumination.project(normal(generator, 2, 5))
+    wanted = best + normal(generator, 2, 1)  # off the plane, along its normal
+    psi = illumination.project(normal(generator, 2, 5))
+    update, state, errors = PlainProjectedGradient(rate, momentum), UpdateState.zeros(psi), [psi - best]
+    for _ in range(40):
+        psi, state = update.step(psi, psi - wanted, torch.zeros_like(psi), state, illumination.project)
+        errors.append(psi - best)
+        torch.testing.assert_close(psi.sum(-1), torch.ones(2, dtype=DOUBLE))
+    torch.testing.assert_close(errors[1], (1.0 - rate) * errors[0], rtol=0, atol=1e-12)
+    for before, now, after in zip(errors, errors[1:], errors[2:], strict=False):
+        expected = (1.0 + momentum - rate) * now - momentum * before
+        torch.testing.assert_close(after, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("update", [ProjectedGradient, PlainProjectedGradient])
+@pytest.mark.parametrize("bad", [{"learning_rate": 0.0}, {"learning_rate": 0.1, "momentum": 1.0}])
+def test_bad_settings_of_steps_name_their_key(update, bad):
+    with pytest.raises(ValueError, match=rf"outer\.light_update\.{list(bad)[-1]}"):
+        update(**bad)
+
+
+@pytest.mark.parametrize("update", [ProjectedGradient(), PlainProjectedGradient(learning_rate=1.0)])
+def test_a_gradient_that_is_not_finite_moves_nothing(update):
     illumination = Illumination(anchors=3)
     psi = torch.tensor([[0.2, 0.3, 0.5]], dtype=DOUBLE)
     broken = torch.tensor([[math.nan, 0.0, 1.0]], dtype=DOUBLE)
-    moved, state = ProjectedGradient().step(
+    moved, state = update.step(
         psi, broken, torch.zeros_like(psi), UpdateState.zeros(psi), illumination.project
     )
     torch.testing.assert_close(moved, psi)

@@ -29,6 +29,17 @@ def test_sgd_matches_torch():
     torch.testing.assert_close(psi, reference.detach())
 
 
+def test_sgd_without_a_bound_takes_the_whole_step():
+    """Under a constant gradient g the n-th velocity is g (1 - 0.9^n) / 0.1, and psi has moved by the sum of them."""
+    psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
+    gradient = torch.tensor([[40.0, -50.0, 10.0]], dtype=torch.float64)
+    update, state, moved = SGD(learning_rate=3.0, momentum=0.9, max_step=None), UpdateState.zeros(psi), psi
+    for _ in range(5):
+        moved, state = update.step(moved, psi.log_softmax(-1), gradient, torch.full_like(psi, 1e9), state)
+    velocities = sum((1.0 - 0.9**n) / 0.1 for n in range(1, 6))
+    torch.testing.assert_close(moved, psi - 3.0 * velocities * gradient)
+
+
 def test_adam_matches_torch_up_to_centring():
     psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
     reference = torch.nn.Parameter(psi.clone())
@@ -83,7 +94,9 @@ def test_steps_are_finite_and_bounded_whatever_the_scale(update, scale):
     assert moved.abs().max() <= update.max_step * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("update", [SGD(learning_rate=1e3), Adam(), Mirror()])
+@pytest.mark.parametrize(
+    "update", [SGD(learning_rate=1e3), SGD(learning_rate=1e3, max_step=None), Adam(), Mirror()]
+)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e308])
 def test_a_gradient_that_is_not_finite_is_refused_and_forgotten(update, bad):
     psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
@@ -152,7 +165,8 @@ def test_mirror_goes_on_after_a_cliff():
 
 
 @pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0), lambda: Adam(betas=(1.0, 0.9)),
-                                  lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0)])  # fmt: skip
+                                  lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0),
+                                  lambda: SGD(max_step=0.0)])  # fmt: skip
 def test_bad_settings_are_refused(make):
     with pytest.raises(ValueError, match=r"outer\.update"):
         make()

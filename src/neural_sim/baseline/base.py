@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import torch
 from jaxtyping import Float
@@ -35,8 +35,12 @@ class Search(Protocol):
 
 
 class RewardMethod(Protocol):
-    """A configured method. ``rounds`` of draw, train and reward are made for each outer iteration of the budget."""
+    """A configured method. ``rounds`` of draw, train and reward are made for each outer iteration of the budget.
 
+    ``explores`` says whether it scores its draws, so that they need a density: lights are then drawn around psi's.
+    """
+
+    explores: ClassVar[bool]
     name: str
     rounds: int
 

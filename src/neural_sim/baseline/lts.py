@@ -7,6 +7,7 @@ set. One number tells all objects and bins how they did, so that thousands of ro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -22,6 +23,9 @@ from neural_sim.types import SceneDraw
 class LearningToSimulate:
     """Ascent along ``(R - b) d log p(training set) / d psi`` with a moving average b of past rewards.
 
+    The first reward has no past. Its round is kept until the second, drawn from the same psi, gives it a baseline: each
+    of the two rewards is then the other's (leave one out, which biases neither), and psi steps along both.
+
     Args:
         name: in reports.
         learning_rate: logits a step at an advantage of one standard deviation of past rewards.
@@ -33,6 +37,7 @@ class LearningToSimulate:
         ValueError: any of these out of its range.
     """
 
+    explores: ClassVar[bool] = True
     name: str = "lts"
     learning_rate: float = 0.5
     decay: float = 0.8
@@ -52,13 +57,14 @@ class LearningToSimulate:
 
 
 class Policy:
-    """See :class:`LearningToSimulate`; the first reward only sets the moving average."""
+    """See :class:`LearningToSimulate`."""
 
     def __init__(
         self, settings: LearningToSimulate, distribution: SceneDistribution, psi: Float[Tensor, "objects K"]
     ) -> None:
         self._settings, self._distribution, self._psi = settings, distribution, psi
         self._mean, self._variance, self._told = 0.0, 0.0, 0
+        self._first = torch.zeros_like(psi)  # the first round's score
 
     @property
     def psi(self) -> Float[Tensor, "objects K"]:
@@ -69,11 +75,16 @@ class Policy:
 
     def tell(self, reward: float, draws: Draws) -> None:
         advantage = self._advantage(reward)
-        if advantage == 0.0:
-            return
         slope = torch.stack(
             [score(self._distribution, psi, drawn) for psi, drawn in zip(self._psi, draws, strict=True)]
         )
+        if self._told == 1:
+            self._first = slope
+            return
+        if advantage == 0.0:
+            return
+        if self._told == 2:  # R_1 - R_2 is the first round's advantage, R_2 - R_1 the second's
+            slope = slope - self._first
         # A sum of n scores has a spread of sqrt(n): taken out, so that the rate is in logits.
         size = max(len(draws[0]), 1) ** 0.5
         step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)

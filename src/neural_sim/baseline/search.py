@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -48,6 +48,7 @@ class RandomSearch:
         ValueError: a number of rounds that is not positive.
     """
 
+    explores: ClassVar[bool] = False
     name: str = "random_search"
     rounds: int = 2
 
@@ -82,12 +83,14 @@ class _Random(Incumbent):
 class BayesOpt:
     """Tree-structured Parzen estimators (Bergstra et al. 2011) over the logits, by Optuna's ask and tell.
 
-    ``reach`` is the range of every logit about 0. Optuna is imported only when a run begins.
+    Every logit, and every weight of a light, is sought in [-``reach``, ``reach``], widened where the start lies outside
+    so that the start is among what is sought. Optuna is imported only when a run begins.
 
     Raises:
         ValueError: a reach or number of rounds that is not positive.
     """
 
+    explores: ClassVar[bool] = False
     name: str = "bayes_opt"
     reach: float = 3.0
     rounds: int = 2
@@ -116,21 +119,21 @@ class _Bayes(Incumbent):
         distribution: SceneDistribution,
     ) -> None:
         super().__init__(psi)
-        self._reach, self._study, self._distribution = reach, study, distribution
-        start = psi.clamp(-reach, reach).flatten().tolist()
-        study.enqueue_trial({f"psi_{i}": value for i, value in enumerate(start)})
+        self._study, self._distribution = study, distribution
+        start = {f"psi_{i}": value for i, value in enumerate(psi.flatten().tolist())}
+        self._ranges = {name: (min(-reach, value), max(reach, value)) for name, value in start.items()}
+        study.enqueue_trial(start)
         self._trial: Any = None
+        self._values = psi
 
     def ask(self) -> Float[Tensor, "objects K"]:
-        self._asked = self.propose()
-        return self._asked
+        self._trial = self._study.ask()
+        values = [self._trial.suggest_float(name, *ends) for name, ends in self._ranges.items()]
+        self._values = torch.tensor(values, dtype=self.psi.dtype).view_as(self.psi)
+        return super().ask()
 
     def propose(self) -> Float[Tensor, "objects K"]:
-        self._trial = self._study.ask()
-        values = [
-            self._trial.suggest_float(f"psi_{i}", -self._reach, self._reach) for i in range(self.psi.numel())
-        ]
-        return self._distribution.constrained(torch.tensor(values, dtype=self.psi.dtype).view_as(self.psi))
+        return self._distribution.constrained(self._values)
 
     def tell(self, reward: float, draws: Draws) -> None:
         super().tell(reward, draws)

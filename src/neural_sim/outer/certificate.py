@@ -14,7 +14,9 @@ from neural_sim.settings import OnUntrusted, Trust
 from neural_sim.solver.solution import Status
 
 Action = Literal["kept", "shrunk", "skipped", "stopped"]
-_ACTIONS: Mapping[OnUntrusted, Action] = {"shrink": "shrunk", "skip": "skipped", "stop": "stopped"}
+_ACTIONS: Mapping[OnUntrusted, Action] = {
+    "shrink": "shrunk", "keep": "kept", "skip": "skipped", "stop": "stopped"
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ def certify(
     finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())
     found = _doubts(result, check, trust) + ([] if finite else ["not finite"])
     action: Action = "kept" if not found else _ACTIONS[on_untrusted]
-    if not finite and action == "shrunk":
+    if not finite and action in ("shrunk", "kept"):
         action = "skipped"
     spectrum, solution = result.damping.spectrum, result.solution
     return Certificate(

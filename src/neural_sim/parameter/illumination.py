@@ -19,7 +19,7 @@ from torch import Tensor
 from neural_sim.parameter.distributions import Specification, distribution
 from neural_sim.parameter.factor import Beliefs, Gap
 from neural_sim.parameter.simplex import project_simplex, project_sum
-from neural_sim.parameter.update import Mirror, UpdateState
+from neural_sim.parameter.update import SGD, Mirror, UpdateState, check_rates
 
 Constraint = Literal["simplex", "affine"]
 
@@ -150,7 +150,7 @@ class ProjectedGradient:
     shrink: bool = True
 
     def __post_init__(self) -> None:
-        self._free()
+        check_rates(self.learning_rate, self.max_step, "outer.light_update", momentum=self.momentum)
 
     def _free(self) -> Mirror:
         return Mirror(self.learning_rate, self.momentum, self.max_step, self.shrink)
@@ -166,6 +166,40 @@ class ProjectedGradient:
         """Weights after one step, and the state to pass to the next; a gradient that is not finite moves neither."""
         moved, after = self._free().step(psi, torch.zeros_like(psi), gradient, standard_error, state)
         return project(moved), after
+
+
+@dataclass(frozen=True)
+class PlainProjectedGradient:
+    """Projected gradient descent as it stands in books, with momentum: the paper's step of lights (Sec. 3.3).
+
+    ``v <- momentum v + gradient``, ``psi <- project(psi - learning_rate v)``: no gradient's size is taken out, nothing
+    is shrunk or bounded. ``learning_rate`` is in weights per unit of the gradient.
+
+    Raises:
+        ValueError: a rate that is not positive, a momentum outside [0, 1).
+    """
+
+    learning_rate: float
+    momentum: float = 0.9
+
+    def __post_init__(self) -> None:
+        check_rates(self.learning_rate, None, "outer.light_update", momentum=self.momentum)
+
+    def step(
+        self,
+        psi: Float[Tensor, "objects k"],
+        gradient: Float[Tensor, "objects k"],
+        standard_error: Float[Tensor, "objects k"],
+        state: UpdateState,
+        project: Callable[[Tensor], Tensor],
+    ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
+        """Weights after one step, and the state to pass to the next; a gradient that is not finite moves neither."""
+        free = SGD(self.learning_rate, self.momentum, max_step=None)
+        moved, after = free.step(psi, torch.zeros_like(psi), gradient, standard_error, state)
+        return project(moved), after
+
+
+LightUpdate = ProjectedGradient | PlainProjectedGradient
 
 
 def _affine_numbers(values: object, anchors: int, where: str) -> Float[Tensor, "k"]:

@@ -1,4 +1,4 @@
-"""Steps of psi from a hypergradient in logits, each bounded so that one noisy gradient cannot collapse p."""
+"""Steps of psi from a hypergradient in logits, bounded so that one noisy gradient cannot collapse p."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ class UpdateState:
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
-def _check(learning_rate: float, max_step: float, **rates: float) -> None:
+def check_rates(
+    learning_rate: float, max_step: float | None, where: str = "outer.update", **rates: float
+) -> None:
+    """Raises ``ValueError`` for a setting out of its range, with its key in the node ``where``."""
     if not learning_rate > 0.0:
-        raise ValueError(f"outer.update.learning_rate must be positive, got {learning_rate}")
-    if not max_step > 0.0:
-        raise ValueError(f"outer.update.max_step must be positive, got {max_step}")
+        raise ValueError(f"{where}.learning_rate must be positive, got {learning_rate}")
+    if max_step is not None and not max_step > 0.0:
+        raise ValueError(f"{where}.max_step must be positive, got {max_step}")
     for name, rate in rates.items():
         if not 0.0 <= rate < 1.0:
-            raise ValueError(f"outer.update.{name} must lie in [0, 1), got {rate}")
+            raise ValueError(f"{where}.{name} must lie in [0, 1), got {rate}")
 
 
 def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:
@@ -71,21 +74,26 @@ def _accept(
 
 @dataclass(frozen=True)
 class SGD:
-    """Gradient descent with momentum on the logits (the paper: rate 1e-5 on its own loss scale, momentum 0.9)."""
+    """Gradient descent with momentum on the logits (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
+
+    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; steps are as long as that says where ``max_step``
+    is None, as in the paper.
+    """
 
     learning_rate: float = 1e-5
     momentum: float = 0.9
-    max_step: float = 0.5
+    max_step: float | None = 0.5
 
     def __post_init__(self) -> None:
-        _check(self.learning_rate, self.max_step, momentum=self.momentum)
+        check_rates(self.learning_rate, self.max_step, momentum=self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
         """psi after one step, and the state to pass to the next."""
         velocity = self.momentum * state.first + gradient
-        moved = psi + bound(-self.learning_rate * velocity, self.max_step)
+        step = -self.learning_rate * velocity
+        moved = psi + (step if self.max_step is None else bound(step, self.max_step))
         return _accept(psi, moved, state, velocity, state.second, state.noise)
 
 
@@ -99,7 +107,7 @@ class Adam:
     max_step: float = 0.5
 
     def __post_init__(self) -> None:
-        _check(self.learning_rate, self.max_step, beta1=self.betas[0], beta2=self.betas[1])
+        check_rates(self.learning_rate, self.max_step, beta1=self.betas[0], beta2=self.betas[1])
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
@@ -136,7 +144,7 @@ class Mirror:
     shrink: bool = True
 
     def __post_init__(self) -> None:
-        _check(self.learning_rate, self.max_step, momentum=self.momentum)
+        check_rates(self.learning_rate, self.max_step, momentum=self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState

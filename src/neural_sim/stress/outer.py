@@ -195,10 +195,10 @@ def loop(scope: Scope) -> Checks:
     was done, zero moves nothing.
     """
     iterations = 2
-    actions = {"shrink": "skipped", "skip": "skipped", "stop": "stopped"}
+    actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
     trials: tuple[tuple[float, OnUntrusted], ...] = (
         (math.nan, "shrink"), (1e30, "shrink"), (math.nan, "skip"), (math.nan, "stop"), (math.inf, "shrink"),
-        (0.0, "shrink"),
+        (0.0, "shrink"), (math.nan, "keep"),
     )  # fmt: skip
     for value, choice in trials if scope.full else trials[:2]:
         learned = learn_psi(_module(Constant(value), choice, iterations, scope), progress=False)
