@@ -8,7 +8,7 @@ import neural_sim
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "cameras", "devices", "objects", "field", "renderer", "parameter", "synthesis", "target",
          "detector", "solver", "gradient", "settings", "baseline", "outer", "stress", "store", "codec", "report",
-         "experiment", "plan", "methods", "cold", "artifacts", "pipeline", "studies",
+         "experiment", "plan", "methods", "cold", "versions", "artifacts", "pipeline", "studies",
          "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 

@@ -34,7 +34,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     assert {"experiment", "method", "seed", "psi", "ap", "seconds", "peak_memory_mb", "left_out"} <= set(
         results
     )
-    assert set(results["ap"]) == {"ns", "learned", "matched"}
+    assert set(results["ap"]) == {"ns", "learned", "matched"} and 0.0 <= results["validation_ap"] <= 1.0
     assert set(results["psi"]["pitcher"]["pose"]) == {"initial", "learned", "target"}
     for distribution in results["psi"]["pitcher"]["pose"].values():
         assert sum(distribution) == pytest.approx(1.0, abs=1e-6)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neural_sim import codec
+from neural_sim import codec, versions
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.cold import train_cold
 from neural_sim.detector.metrics import evaluate
@@ -29,18 +29,6 @@ from neural_sim.store import Store, code_version, digest, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import LabelledImages
-
-DISTRIBUTIONS = tuple(
-    f"parameter/{name}"
-    for name in ("bins", "distributions", "factor", "illumination", "pose", "product", "zoom")
-)
-"""What draws scenes; how psi steps (``parameter/update``) matters to the psi loop alone."""
-
-MESHES_DRAWN = (
-    "objects",
-    *(f"renderer/{name}" for name in ("mesh", "raycast", "surface", "lighting", "rig")),
-)
-"""What draws images from meshes."""
 
 
 class Artifacts:
@@ -100,7 +88,7 @@ class Artifacts:
     # --- views and fields: per object, shared by all runs ---
 
     def _views_key(self, name: str) -> dict[str, Any]:
-        version = code_version(*MESHES_DRAWN, "renderer/views", "cameras")
+        version = code_version(*versions.VIEWS)
         return {"object": self.digests[name], **self._config("views"), "code": version}
 
     def views(self, name: str) -> Any:
@@ -111,7 +99,7 @@ class Artifacts:
         return self._fetch("views", "views", f"views of {name}", key, make, keep=False)  # large, read once
 
     def _field_key(self, name: str) -> dict[str, Any]:
-        version = code_version("field", "renderer/nerf", "cameras")
+        version = code_version(*versions.FIELDS)
         return {"views": self._views_key(name), **self._config("field"), "code": version}
 
     def field(self, name: str) -> dict[str, Any]:
@@ -144,18 +132,15 @@ class Artifacts:
     def _scene_key(self) -> dict[str, Any]:
         parts, drawn = self._config("renderer", "synthesis", "training"), self.x.distribution
         parts |= {"factors": [factor.drawn for factor in drawn.factors], "ranges": dict(drawn.ranges)}
-        version = code_version(
-            "field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synthesis", "detector", "cameras"
-        )
         fields = [self._field_key(n) for n in self.names]
-        return {"fields": fields, "names": self.names, **parts, "code": version}
+        return {"fields": fields, "names": self.names, **parts, "code": code_version(*versions.DETECTORS)}
 
     def _targets_key(self) -> dict[str, Any]:
         return {
             "objects": self.digests, "names": self.names, "seed": self.x.seed,
             **self._config("target", "parameter", "unlearned", "synthesis", "views"),
             "size": self.x.training.image_size,
-            "code": code_version(*MESHES_DRAWN, "target", "synthesis", *DISTRIBUTIONS),
+            "code": code_version(*versions.TARGETS),
         }  # fmt: skip
 
     @cached_property
@@ -180,7 +165,7 @@ class Artifacts:
     def _equivalent(self, name: str, angle: str) -> list[list[int]]:
         key = {
             "object": self.digests[name], "factor": angle, **self._config("parameter", "unlearned", "views"),
-            "code": code_version(*MESHES_DRAWN, "target", *DISTRIBUTIONS),
+            "code": code_version(*versions.MESHES_DRAWN, "target", *versions.DISTRIBUTIONS),
         }  # fmt: skip
 
         def make() -> list[list[int]]:
@@ -248,7 +233,7 @@ class Artifacts:
         key = {
             "warm_start": self._trained_key(self.psi("initial")), "target": self._targets_key(),
             **self._config(*groups),
-            "code": code_version("outer", "gradient", "solver", "baseline", "methods", "parameter/update"),
+            "code": code_version(*versions.LOOPS),
         }  # fmt: skip
         return self._fetch("psi", "psi", "psi loop", key, make)
 
@@ -262,22 +247,25 @@ class Artifacts:
         drawn = self.scene.training_set(psi, self.x.training.images_per_object, self._generator(1))
         return [dataclasses.replace(part, images=part.images.to("cpu")) for part in drawn]
 
-    def scores(self, psi: Tensor, what: str) -> dict[str, Any]:
-        """AP on the test set of a detector trained cold on images from ``psi``, and its detections."""
+    def scores(self, psi: Tensor, what: str, part: str = "test") -> dict[str, Any]:
+        """AP on one part of the target set of a detector trained cold on images from ``psi``, and its detections."""
 
         def make() -> Any:
             what_trained = f"detector trained on {what}"
             trained = self._detector(psi, self.x.training.cold_epochs, "evaluate", what_trained)
-            params, test = placed(trained["params"], self.device), self.targets["test"]
-            detections = self.detector.predict(params, test.images)
-            return {"ap": evaluate(detections, test, self.names), "detections": detections}
+            images = self.targets[part]
+            detections = self.detector.predict(placed(trained["params"], self.device), images.images)
+            return {"ap": evaluate(detections, images, self.names), "detections": detections}
 
-        key = {
-            "trained": self._trained_key(psi),
-            "epochs": self.x.training.cold_epochs,
-            "target": self._targets_key(),
-        }
-        return self._fetch("evaluate", "evaluate", f"scores of the detector trained on {what}", key, make)
+        trained, epochs = self._trained_key(psi), self.x.training.cold_epochs
+        key = {"trained": trained, "epochs": epochs, "part": part, "target": self._targets_key()}
+        what_scored = f"{part} scores of the detector trained on {what}"
+        return self._fetch("evaluate", "evaluate", what_scored, key, make)
+
+    def validation_ap(self) -> float:
+        """AP on ``val`` of the detector trained cold on the learned distribution: what settings are chosen by. ``val``
+        has steered psi too, so it is no estimate of AP elsewhere; nothing of ``test`` is in it."""
+        return self.scores(self.learned_psi, "learned", "val")["ap"]["ap"]
 
     def compared(self) -> dict[str, Tensor]:
         """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""

@@ -61,6 +61,7 @@ class Pipeline:
             scored = {**self.made.compared(), **self.made.on_the_way()}
             for what, psi in tqdm(scored.items(), desc=name, disable=not self.x.progress, leave=False):
                 self.made.scores(psi, what)
+            self.made.validation_ap()
 
     def results(self) -> RunResults:
         """What there is to report: a run without evaluation has no AP."""
@@ -84,6 +85,7 @@ class Pipeline:
             probabilities={which: self.x.distribution.probabilities(value) for which, value in psi.items()},
             records=self.made.learned()["records"],
             ap=scores,
+            validation_ap=self.made.validation_ap() if evaluated else None,
             fields={name: self.made.field(name)["history"] for name in self.made.names},
             seconds=dict(self.made.account.seconds),
             memory=peak_memory_mb(self.made.device),
@@ -126,7 +128,8 @@ class Pipeline:
 def run(experiment: Experiment, folder: Path) -> float | None:
     """Run the stages asked for, in order; the report lands in ``folder``.
 
-    Returns the AP of the detector trained on the learned distribution, which a sweep may optimise; None without one.
+    Returns what a sweep may maximise, :meth:`Artifacts.validation_ap`: the test set has no part in it. None without
+    the evaluate stage.
     """
     pipeline = Pipeline(experiment)
     pipeline.made.account.left_out += plan(experiment, len(pipeline.made.names))
@@ -142,4 +145,4 @@ def run(experiment: Experiment, folder: Path) -> float | None:
             pipeline.report(folder)
     if "evaluate" not in experiment.stages:
         return None
-    return pipeline.made.scores(pipeline.made.learned_psi, "learned")["ap"]["ap"]
+    return pipeline.made.validation_ap()

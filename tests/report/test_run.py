@@ -34,13 +34,13 @@ def results():
         {"ns": scores, "learned": scores, "matched": scores}, {"a": [{"psnr": 30.0, "ssim": 0.9}], "b": []},
         {"psi": 1.5}, {"peak_memory_mb": 512.0},
         [{"stage": "views", "what": "views of a", "why": "found in the store", "share": 1.0, "seconds": 2.0}],
-        {"seed": 3, "parameter": {"pose": {"bins": 4}}},
+        {"seed": 3, "parameter": {"pose": {"bins": 4}}}, 0.25,
     )  # fmt: skip
 
 
 def test_results_are_json_by_the_standard(results, tmp_path):
     held = json.loads(write_results(results, tmp_path).read_text(), parse_constant=pytest.fail)
-    assert held["ap"]["ns"]["per_class"]["b"] is None
+    assert held["ap"]["ns"]["per_class"]["b"] is None and held["validation_ap"] == 0.25
     assert held["total_variation"]["a"]["pose"] == {"initial": pytest.approx(0.6), "learned": 0.0}
     assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
     assert held["images_without_box"] == 6
@@ -50,7 +50,8 @@ def test_results_are_json_by_the_standard(results, tmp_path):
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = "untrusted psi steps: 2 of 2; shrunk 2; signal 2; cosine with retrained differences 0.90, 0.90"
-    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", "without a box: 6", trust):
+    images = ("validation images, learned: 25.0", "without a box: 6")
+    for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", *images, trust):
         assert word in text
 
 
@@ -80,7 +81,7 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
     run = client.get_run(track(results, uri, tmp_path / "run"))
     assert run.info.status == "FINISHED" and run.data.tags["method"] == "neural_sim"
     assert run.data.params["parameter.pose.bins"] == "4"
-    assert run.data.metrics["evaluate/learned/ap"] == 0.5
+    assert run.data.metrics["evaluate/learned/ap"] == 0.5 and run.data.metrics["validation_ap"] == 0.25
     assert "evaluate/ns/ap_b" not in run.data.metrics
     steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/pose/bin_1")
     assert [point.step for point in steps] == [0, 1]

@@ -27,8 +27,10 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class RunResults:
     """Everything the report shows. ``probabilities`` are those of initial, learned and target, by factor, [objects, k];
-    ``ap`` maps ns, learned, matched to scores. ``curve`` has what the method had spent (images, detector_steps,
-    products, seconds) and what its psi was worth (``ap``) at every iteration that was scored.
+    ``ap`` maps ns, learned, matched to scores on the test set. ``validation_ap`` is that of the learned distribution's
+    detector on the validation images, which steered psi too: settings are chosen by it, nothing is reported by it.
+    ``curve`` has what the method had spent (images, detector_steps, products, seconds) and what its psi was worth
+    (``ap``) at every iteration that was scored.
 
     ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
     (from 1), by object and angle, whose views an object's symmetry makes the same.
@@ -47,6 +49,7 @@ class RunResults:
     memory: Mapping[str, float]
     left_out: Sequence[Mapping[str, Any]]
     config: Mapping[str, Any]
+    validation_ap: float | None = None
     curve: Sequence[Mapping[str, Any]] = ()
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
 
@@ -70,6 +73,7 @@ class RunResults:
                 "total_variation": self.total_variations(),
                 "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
+                "validation_ap": self.validation_ap,
                 "curve": list(self.curve),
                 "certificates": untrusted(self.records),
                 "images_without_box": self.images_without_box(),
@@ -108,6 +112,9 @@ class RunResults:
         for method, scores in self.ap.items():
             values = [*(scores["per_class"][name] for name in self.names), scores["ap"]]
             lines.append(f"{method:<20}" + "".join(f"{100 * value:>13.1f}" for value in values))
+        if self.validation_ap is not None:
+            score = f"{100 * self.validation_ap:.1f}"
+            lines.append(f"AP on the validation images, learned: {score} (to choose settings by)")
         distances = self.total_variations()
         for factor in self.factors:
             lines.append(f"distance to target, {factor}")

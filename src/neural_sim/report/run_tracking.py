@@ -18,6 +18,8 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
     """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
     metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}
     metrics |= results.memory
+    if results.validation_ap is not None:
+        metrics["validation_ap"] = results.validation_ap
     for which, scores in results.ap.items():
         metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
         metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
