@@ -135,7 +135,9 @@ def test_experiments_set_no_key_that_a_scale_sets():
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_scale_goes_with_labelled_photographs(scale, tmp_path):
     annotations = tmp_path / "val.json"
-    annotations.write_text("{}")
+    annotations.write_text(
+        json.dumps({"images": [{"id": 1, "file_name": "a"}], "categories": [], "annotations": []})
+    )
     made = build(_config("target=coco", f"target.annotations={annotations}", f"scale={scale}"))
     assert made.target.annotations == str(annotations)
     assert made.training.image_size == made.config["budget"]["training"]["image_size"]

@@ -92,8 +92,12 @@ def test_the_digest_follows_the_photos_not_their_place(
     first = PhotoFolder(photos).digest()
     moved = photos.rename(tmp_path_factory.mktemp("elsewhere") / "photos")
     assert PhotoFolder(moved).digest() == first
+    held = bytearray((moved / "ramp.png").read_bytes())
+    held[-1] ^= 1  # the size stays
+    (moved / "ramp.png").write_bytes(held)
+    second = PhotoFolder(moved).digest()
     Image.new("RGB", (9, 9)).save(moved / "new.png")
-    assert PhotoFolder(moved).digest() != first
+    assert len({first, second, PhotoFolder(moved).digest()}) == 3
 
 
 def test_missing_empty_and_broken_photos_are_refused_with_their_path(tmp_path: Path) -> None:

@@ -96,10 +96,13 @@ def test_images_may_lie_elsewhere_and_be_limited(tmp_path: Path) -> None:
         CocoTarget(path).load(NAMES, 16, 16)
 
 
-def test_the_digest_follows_labels_and_photos(tmp_path: Path) -> None:
+def test_the_digest_follows_the_contents_of_labels_and_photos(tmp_path: Path) -> None:
     path = write(tmp_path)
     digests = [CocoTarget(path).digest(), CocoTarget(path, limit=1).digest()]
-    Image.new("RGB", (41, 20), "red").save(tmp_path / "wide.png")
+    photo = tmp_path / "wide.png"
+    held = bytearray(photo.read_bytes())
+    held[-1] ^= 1  # the size stays
+    photo.write_bytes(held)
     digests.append(CocoTarget(path).digest())
     write(tmp_path, annotations=[])
     digests.append(CocoTarget(path).digest())
@@ -107,15 +110,83 @@ def test_the_digest_follows_labels_and_photos(tmp_path: Path) -> None:
     assert len(set(digests)) == 3
 
 
-def test_sets_split_the_file(tmp_path: Path) -> None:
+def sets_of(target: CocoTarget, seed: int = 3) -> dict[str, LabelledImages]:
     camera, synthesizer = PinholeCamera(24, 16, 0.7), Synthesizer(ProceduralClutter())
     meshes = {name: normalise(trimesh.creation.box(), name, "test") for name in NAMES}
-    target = CocoTarget(write(tmp_path), val_fraction=0.5)
-    made = target.sets(meshes, RaycastRenderer(), SceneDistribution.of([Pose()]), camera, synthesizer, seed=3)
+    return target.sets(meshes, RaycastRenderer(), SceneDistribution.of([Pose()]), camera, synthesizer, seed)
+
+
+def test_sets_split_the_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        made = sets_of(CocoTarget(write(tmp_path), val_fraction=0.5))
     assert {name: part.images.shape for name, part in made.items()} == {
         "val": (1, 3, 16, 24), "test": (1, 3, 16, 24),
     }  # fmt: skip
     assert {len(made[name].labels[made[name].present]) for name in made} == {0, 2}
+    assert "look like" not in caplog.text
+
+
+SCENES = {"kitchen": 5, "hall": 4, "yard": 3}
+
+
+def videos(folder: Path) -> Path:
+    """Frames of three scenes, each a picture of its own under a camera that moves by a pixel in forty; the blue of
+    each pixel in the middle row says which scene."""
+    generator, images, annotations = torch.Generator().manual_seed(7), [], []
+    for scene, (name, count) in enumerate(SCENES.items()):
+        (folder / name).mkdir()
+        large = ProceduralClutter().draw(1, 60, 60, generator)[0]
+        large[2, 20:40] = (scene + 1) / 4
+        for frame in range(count):
+            pixels = (255 * large[:, 10 : 10 + 40, frame : frame + 40]).byte().movedim(0, -1).numpy()
+            Image.fromarray(pixels).save(folder / name / f"{frame}.png")
+            number = len(images)
+            images.append({"id": number, "file_name": f"{name}/{frame}.png", "scene": scene})
+            annotations.append({"image_id": number, "category_id": 7, "bbox": [8, 8, 20, 20]})
+    document = {"images": images, "categories": [{"id": 7, "name": "mug"}], "annotations": annotations}
+    path = folder / "val.json"
+    path.write_text(json.dumps(document))
+    return path
+
+
+def scenes_in(part: LabelledImages) -> list[int]:
+    blue = part.images[:, 2, part.images.shape[2] // 2, part.images.shape[3] // 2]
+    return (4 * blue - 1).round().long().tolist()
+
+
+@pytest.mark.parametrize("split_by", [r"^(\w+)/", "attribute:scene"])
+def test_frames_of_a_scene_stay_together(
+    tmp_path: Path, split_by: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = videos(tmp_path)
+    with caplog.at_level(logging.INFO):
+        made = sets_of(CocoTarget(path, val_fraction=0.3, split_by=split_by))
+    # Of 12 images 4 are wanted: the hall's. 3.6 is nearer to 4 than to the yard's 3.
+    assert scenes_in(made["val"]) == [1] * 4
+    assert sorted(scenes_in(made["test"])) == [0] * 5 + [2] * 3
+    assert "makes 3 groups; val has 4 of 12 images (val_fraction 0.3)" in caplog.text
+    assert "look like" not in caplog.text
+
+
+def test_frames_of_a_scene_in_both_parts_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = videos(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        made = sets_of(CocoTarget(path))
+    shared = set(scenes_in(made["val"])) & set(scenes_in(made["test"]))
+    alike = sum(scene in shared for scene in scenes_in(made["test"]))
+    assert alike and f"val.json: {alike} of 8 test images look like one of val (" in caplog.text
+    assert "keep them together by target.split_by" in caplog.text
+
+
+def test_groups_are_checked_before_any_photo_is_read(tmp_path: Path) -> None:
+    path = videos(tmp_path)
+    for wrong in ("(", r"^(\d+)/", "attribute:video"):
+        with pytest.raises(ValueError, match=r"^target\.split_by=.*val\.json: "):
+            CocoTarget(path, split_by=wrong)
+    with pytest.raises(ValueError, match=r"want at least two groups, got \['kitchen'\]"):
+        CocoTarget(path, split_by=r"^(\w+)/", limit=5)
 
 
 @pytest.mark.parametrize(

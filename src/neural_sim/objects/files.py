@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,12 @@ def file_digest(*paths: Path) -> str:
         if path.is_file():
             state.update(path.read_bytes())
     return state.hexdigest()
+
+
+def content_digest(files: Mapping[str, Path]) -> str:
+    """SHA-256 over names and contents, which a file's place does not change; a missing file counts as an empty one."""
+    lines = (f"{name} {file_digest(path)}\n" for name, path in files.items())
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:

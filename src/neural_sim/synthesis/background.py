@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from neural_sim.devices import moved
+from neural_sim.objects.files import content_digest
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 # Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
@@ -190,10 +191,13 @@ class PhotoFolder:
                 images[index] = self._crop(photo, height, width, *uniform[index])
         return images.to(device)
 
+    @cached_property
+    def _digest(self) -> str:
+        return content_digest({path.relative_to(self.root).as_posix(): path for path in self.files})
+
     def digest(self) -> str:
-        """SHA-256 of the photographs' names and sizes in bytes, for store keys."""
-        lines = (f"{path.relative_to(self.root).as_posix()} {path.stat().st_size}\n" for path in self.files)
-        return hashlib.sha256("".join(lines).encode()).hexdigest()
+        """SHA-256 of the photographs' names and contents, for store keys."""
+        return self._digest
 
     def _crop(self, photo: Image.Image, height: int, width: int, u: float, v: float, w: float) -> Tensor:
         scale = min(photo.width / width, photo.height / height) * (self.smallest + (1.0 - self.smallest) * w)

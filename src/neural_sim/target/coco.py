@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,16 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from neural_sim.objects.files import content_digest
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
-from neural_sim.target.split import split
+from neural_sim.target.near_duplicates import near_duplicates, thumbnail
+from neural_sim.target.split import joined, split
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -33,6 +37,17 @@ REQUIRED: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
+class _Photo:
+    """A letterboxed photograph with its boxes [b, 4] and labels [b]; how many boxes were too small."""
+
+    image: Tensor
+    boxes: Tensor
+    labels: Tensor
+    dropped: int
+    thumbnail: Tensor
+
+
+@dataclass(frozen=True)
 class CocoTarget:
     """Photographs with a COCO ``annotations`` file, letterboxed to the detector's image size.
 
@@ -41,12 +56,18 @@ class CocoTarget:
         images: the folder its ``file_name`` entries start from; None: the file's own.
         categories: category name -> object name, null to leave a category out. Names not listed stand for
             themselves.
-        val_fraction: share of the images that steers psi; the rest is scored once.
+        val_fraction: share of the images that steers psi; the rest is scored once. With ``split_by`` as near to it as
+            whole groups come, see :func:`neural_sim.target.split.split`.
+        split_by: what images belong together and so lie in one part, as frames of one video must:
+            ``attribute:<name>`` of the file's image entries, or a regular expression on ``file_name``, see
+            :func:`neural_sim.target.groups.groups_of`. None: every image is its own group, and near-duplicates in both
+            parts are warned of.
         limit: at most so many images, the first by id.
         minimum_side: boxes with a side shorter than this many pixels after resizing are dropped and counted.
 
     Raises:
-        ValueError: no such file, or a number out of its range.
+        ValueError: no such file, one that is not in COCO form, a number out of its range, or images that
+            ``split_by`` does not put into two or more groups.
     """
 
     annotations: str | Path
@@ -55,6 +76,7 @@ class CocoTarget:
     val_fraction: float = 0.3
     limit: int | None = None
     minimum_side: float = 2.0
+    split_by: str | None = None
 
     def __post_init__(self) -> None:
         if not self._file.is_file():
@@ -63,6 +85,9 @@ class CocoTarget:
             raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
         if self.limit is not None and self.limit < 1:
             raise ValueError(f"target.limit must be at least 1 or null, got {self.limit}")
+        if not self._entries:
+            raise ValueError(f"{self._file}: holds no images")
+        _ = self._groups  # refused here rather than after the fields are fitted
 
     @property
     def _file(self) -> Path:
@@ -72,13 +97,29 @@ class CocoTarget:
     def _folder(self) -> Path:
         return self._file.parent if self.images is None else Path(self.images).expanduser()
 
+    @cached_property
+    def _document(self) -> dict[str, Any]:
+        return _read(self._file)
+
+    @cached_property
+    def _entries(self) -> list[dict[str, Any]]:
+        return sorted(self._document["images"], key=lambda entry: entry["id"])[: self.limit]
+
+    @cached_property
+    def _groups(self) -> Sequence[str | int]:
+        """Of each entry, what it must not be parted from."""
+        if self.split_by is None:
+            return range(len(self._entries))
+        return groups_of(self._entries, self.split_by, self._file)
+
+    @cached_property
+    def _digest(self) -> str:
+        names = [str(entry["file_name"]) for entry in self._document["images"]]
+        return content_digest({"": self._file, **{name: self._folder / name for name in names}})
+
     def digest(self) -> str:
-        """SHA-256 of the annotations and of the photographs' sizes in bytes, for store keys."""
-        state = hashlib.sha256(self._file.read_bytes())
-        for entry in _read(self._file)["images"]:
-            path = self._folder / entry["file_name"]
-            state.update(f"{entry['file_name']} {path.stat().st_size if path.is_file() else None}\n".encode())
-        return state.hexdigest()
+        """SHA-256 of the contents of annotations and photographs, for store keys."""
+        return self._digest
 
     def sets(
         self,
@@ -91,30 +132,51 @@ class CocoTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
-        generator = torch.Generator().manual_seed(seed)
-        val, test = split(self.load(list(meshes), camera.height, camera.width), self.val_fraction, generator)
-        return {"val": val, "test": test}
+        photos = self._photos(list(meshes), camera.height, camera.width)
+        pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
+        groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
+        val, test = split(groups, self.val_fraction, torch.Generator().manual_seed(seed))
+        if self.split_by is None:
+            self._warn_of_duplicates(torch.stack([photo.thumbnail for photo in photos]), val, test)
+        else:
+            _log.info(
+                "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g)",
+                self._file, self.split_by, len(set(self._groups)), len(val), len(photos), self.val_fraction,
+            )  # fmt: skip
+        images = _assemble(photos)
+        return {"val": images.select(val), "test": images.select(test)}
 
     def load(self, class_names: Sequence[str], height: int, width: int) -> LabelledImages:
         """All images; labels are positions in ``class_names``. Crowd annotations are left out, boxes clipped.
 
         Raises:
-            ValueError: malformed JSON, a category that is no class, an image that is missing or unreadable.
+            ValueError: a category that is no class, an image that is missing or unreadable.
         """
-        data = _read(self._file)
-        labels = self._labels(data["categories"], class_names)
-        entries = sorted(data["images"], key=lambda entry: entry["id"])[: self.limit]
-        if not entries:
-            raise ValueError(f"{self._file}: holds no images")
-        by_image: dict[Any, list[dict[str, Any]]] = {entry["id"]: [] for entry in entries}
-        for item in data["annotations"]:
+        return _assemble(self._photos(class_names, height, width))
+
+    def _photos(self, class_names: Sequence[str], height: int, width: int) -> list[_Photo]:
+        labels = self._labels(self._document["categories"], class_names)
+        by_image: dict[Any, list[dict[str, Any]]] = {entry["id"]: [] for entry in self._entries}
+        for item in self._document["annotations"]:
             if not item.get("iscrowd", 0) and item["image_id"] in by_image:
                 by_image[item["image_id"]].append(item)
-        loaded = [self._image(e, by_image[e["id"]], labels, height, width) for e in entries]
-        dropped = sum(count for _, _, _, count in loaded)
+        photos = [self._photo(e, by_image[e["id"]], labels, height, width) for e in self._entries]
+        dropped = sum(photo.dropped for photo in photos)
         if dropped:
             _log.warning("%s: %d boxes shorter than %g px dropped", self._file, dropped, self.minimum_side)
-        return _assemble([(image, boxes, label) for image, boxes, label, _ in loaded])
+        return photos
+
+    def _warn_of_duplicates(self, thumbnails: Tensor, val: Tensor, test: Tensor) -> None:
+        """Detectors that have steered psi on one frame of a video know the next: AP on it says little."""
+        found = near_duplicates(thumbnails[val], thumbnails[test])
+        if found.test:
+            names = [str(self._entries[int(rows[i[0]])]["file_name"])
+                     for rows, i in ((test, found.test), (val, found.val))]  # fmt: skip
+            _log.warning(
+                "%s: %d of %d test images look like one of val (%s like %s); if they are of one video, scene or "
+                "capture, keep them together by target.split_by",
+                self._file, len(found.test), found.compared, *names,
+            )  # fmt: skip
 
     def _labels(self, categories: list[dict[str, Any]], class_names: Sequence[str]) -> dict[Any, int | None]:
         """Category id -> class index, None for a category left out."""
@@ -133,15 +195,14 @@ class CocoTarget:
             _log.warning("%s: no category for object %s, which gets no score", self._file, name)
         return {key: None if name is None else list(class_names).index(name) for key, name in named.items()}
 
-    def _image(
+    def _photo(
         self,
         entry: dict[str, Any],
         annotations: list[dict[str, Any]],
         labels: dict[Any, int | None],
         height: int,
         width: int,
-    ) -> tuple[Tensor, Tensor, Tensor, int]:
-        """Image, boxes [b, 4], labels [b] and the number of boxes dropped."""
+    ) -> _Photo:
         path = self._folder / entry["file_name"]
         try:
             with Image.open(path) as photo:
@@ -157,7 +218,8 @@ class CocoTarget:
         boxes = placing.boxes(corners)
         large = ((boxes[:, 2:] - boxes[:, :2]) >= self.minimum_side).all(-1)
         classes = torch.tensor([labels[item["category_id"]] for item in kept], dtype=torch.long)
-        return image, boxes[large], classes[large], int((~large).sum())
+        inside = image[:, placing.top :, placing.left :][:, : placing.inner_height, : placing.inner_width]
+        return _Photo(image, boxes[large], classes[large], int((~large).sum()), thumbnail(inside))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -178,11 +240,11 @@ def _read(path: Path) -> dict[str, Any]:
     return data
 
 
-def _assemble(loaded: list[tuple[Tensor, Tensor, Tensor]]) -> LabelledImages:
-    most = max(1, *(len(boxes) for _, boxes, _ in loaded))
-    boxes = torch.zeros(len(loaded), most, 4)
-    labels = torch.full((len(loaded), most), -1)
-    for row, (_, box, label) in enumerate(loaded):
-        boxes[row, : len(box)], labels[row, : len(box)] = box, label
-    images = torch.stack([image for image, _, _ in loaded])
-    return LabelledImages(images, boxes, labels, torch.full((len(loaded),), -1))
+def _assemble(photos: Sequence[_Photo]) -> LabelledImages:
+    most = max(1, *(len(photo.boxes) for photo in photos))
+    boxes = torch.zeros(len(photos), most, 4)
+    labels = torch.full((len(photos), most), -1)
+    for row, photo in enumerate(photos):
+        boxes[row, : len(photo.boxes)], labels[row, : len(photo.boxes)] = photo.boxes, photo.labels
+    images = torch.stack([photo.image for photo in photos])
+    return LabelledImages(images, boxes, labels, torch.full((len(photos),), -1))

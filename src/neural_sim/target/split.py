@@ -1,41 +1,87 @@
-"""Validation and test parts of one labelled set."""
+"""Validation and test parts of one labelled set, whole groups of images in each."""
 
 from __future__ import annotations
 
-import hashlib
+from collections.abc import Hashable, Sequence
 
 import torch
-
-from neural_sim.types import LabelledImages
+from jaxtyping import Int
+from torch import Tensor
 
 
 def split(
-    images: LabelledImages, fraction: float, generator: torch.Generator
-) -> tuple[LabelledImages, LabelledImages]:
-    """A random ``fraction`` of the images for validation and the rest for test: disjoint, neither empty.
+    groups: Sequence[Hashable], fraction: float, generator: torch.Generator
+) -> tuple[Int[Tensor, "val"], Int[Tensor, "test"]]:
+    """Rows of the images for validation and of those for test, by the group of each image.
 
-    Images of equal pixels, such as a photograph that is listed twice, go to the same part, which may make validation
-    larger than its fraction. Raises ``ValueError`` where one part would be empty.
+    All images of a group land in the same part, and neither part is empty. Groups are put in random order. Validation
+    gets as many images as groups allow that is nearest to ``fraction`` of all, the smaller of two equally near; of
+    the choices of groups that have that number, the one that needs the fewest groups in that order. Where every image
+    is a group of its own, that is a random part of exactly the size asked for.
+
+    Raises:
+        ValueError: a fraction outside (0, 1), one that leaves a part empty, or fewer than two groups.
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"target: the validation fraction must lie in (0, 1), got {fraction}")
-    different = _equal(images)
-    wanted = round(fraction * len(images))
-    parts: tuple[list[int], list[int]] = ([], [])
-    for place in torch.randperm(len(different), generator=generator).tolist():
-        parts[len(parts[0]) >= wanted].extend(different[place])
-    if not all(parts):
+    wanted = round(fraction * len(groups))
+    if not 0 < wanted < len(groups):
         raise ValueError(
-            f"target: {fraction} of {len(images)} images, {len(different)} of them different, leaves validation or "
-            "test empty; give more images"
+            f"target: {fraction} of {len(groups)} images leaves validation or test empty; give more images"
         )
-    val, test = (images.select(torch.tensor(part, device=images.images.device)) for part in parts)
-    return val, test
+    members: dict[Hashable, list[int]] = {}
+    for row, group in enumerate(groups):
+        members.setdefault(group, []).append(row)
+    if len(members) < 2:
+        raise ValueError(f"target: want at least two groups of images for two parts, got {len(members)}")
+    order, rows = torch.randperm(len(members), generator=generator).tolist(), list(members.values())
+    shuffled = [rows[i] for i in order]
+    chosen = nearest([len(group) for group in shuffled], wanted)
+    parts = ([], [])
+    for i, group in enumerate(shuffled):
+        parts[i not in chosen].extend(group)
+    return torch.tensor(parts[0]), torch.tensor(parts[1])
 
 
-def _equal(images: LabelledImages) -> list[list[int]]:
-    """Indices of the images, those of equal pixels together, in the order of the first of each."""
-    groups: dict[bytes, list[int]] = {}
-    for index, image in enumerate(images.images.cpu()):
-        groups.setdefault(hashlib.sha256(image.numpy().tobytes()).digest(), []).append(index)
-    return list(groups.values())
+def nearest(sizes: Sequence[int], wanted: int) -> set[int]:
+    """Positions whose ``sizes`` add up to what is nearest to ``wanted`` of all sums but none and all.
+
+    Subset sum by dynamic programming: bit s of ``reached`` says whether the sizes so far can add up to s,
+    ``last[s]`` is the position that first made it so.
+    """
+    reached, last = 1, {}
+    for i, size in enumerate(sizes):
+        fresh = (reached << size) & ~reached
+        reached |= fresh
+        while fresh:
+            total = (fresh & -fresh).bit_length() - 1
+            fresh &= fresh - 1
+            last[total] = i
+        if wanted in last:
+            break
+    total = min((s for s in last if s < sum(sizes)), key=lambda s: (abs(s - wanted), s))
+    chosen = set()
+    while total:
+        chosen.add(last[total])
+        total -= sizes[last[total]]
+    return chosen
+
+
+def joined(groups: Sequence[Hashable], equal: Sequence[Hashable]) -> list[int]:
+    """Groups of images of which those that share a value of ``equal`` (such as a digest of pixels) are one.
+
+    Returns a number for each image, the row of the first image of its joined group.
+    """
+    first: dict[tuple[str, Hashable], int] = {}
+    parent = list(range(len(groups)))
+
+    def root(row: int) -> int:
+        while parent[row] != row:
+            row = parent[row]
+        return row
+
+    for row, keys in enumerate(zip(groups, equal, strict=True)):
+        for kind, key in zip(("group", "equal"), keys, strict=True):
+            a, b = root(row), root(first.setdefault((kind, key), row))
+            parent[max(a, b)] = min(a, b)
+    return [root(row) for row in range(len(groups))]
