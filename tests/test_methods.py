@@ -88,23 +88,3 @@ def test_the_comparison_reads_the_sweep_back(folder):
     assert comparison["methods"][0] == "neural_sim" and {"lts", "auto_sim"} <= set(comparison["methods"])
     assert (folder / "compare" / "figures" / "pose.png").stat().st_size > 5000
     assert "of the gap won back" in (folder / "compare" / "compare.md").read_text()
-
-
-@pytest.mark.slow
-def test_the_way_between_two_lights_leaves_opacity_alone(folder):
-    arguments = ["+experiment=illumination_interpolation", "scale=smoke", "objects.names=[drill,mug]"]
-    _run(folder, *arguments, f"hydra.run.dir={folder / 'way'}")
-    held = json.loads((folder / "way" / "interpolation.json").read_text())
-    assert max(held["opacity_change"].values()) <= 1e-6
-    assert (folder / "way" / "figures" / "interpolation.png").stat().st_size > 5000
-
-
-@pytest.mark.slow
-def test_every_temperature_is_held_against_the_truth(folder):
-    _run(folder, "+experiment=gumbel_temperature", "scale=smoke", f"hydra.run.dir={folder / 'temperatures'}")
-    held = json.loads((folder / "temperatures" / "temperatures.json").read_text())
-    assert [truth["object"] for truth in held["truths"]] == ["pitcher", "drill"]
-    assert len(held["rows"]) == 12 and all(row["images"] > 0 for row in held["rows"])
-    cold = held["rows"][0]
-    assert cold["temperature"] == 0.01 and cold["shares"][6] > 0.8
-    assert (folder / "temperatures" / "figures" / "temperatures.png").stat().st_size > 5000

@@ -1,0 +1,144 @@
+"""Small data in the place of the paths that documented commands name: each path stands for one kind of data."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from documented import PAGES, ROOT
+from PIL import Image
+
+from neural_sim.objects.procedural import Procedural
+from neural_sim.synthesis.background import ProceduralClutter
+
+COLOURS = np.array(
+    [[200, 40, 40], [40, 70, 200], [230, 200, 40], [60, 160, 70], [240, 240, 240], [120, 60, 30]], np.uint8
+)
+
+
+def ycb(root: Path) -> Path:
+    """A box with six differently coloured sides for every YCB object that documentation or experiments name."""
+    texts = [
+        path.read_text(encoding="utf-8") for path in (*PAGES, *(ROOT / "conf" / "experiment").glob("*.yaml"))
+    ]
+    for number, name in enumerate(sorted(set(re.findall(r"\b0\d\d_[a-z_]+[a-z]\b", " ".join(texts))))):
+        folder = root / name / "google_16k"
+        folder.mkdir(parents=True)
+        extents = 0.04 + 0.03 * ((number + np.arange(3)) % 5)
+        corners = trimesh.creation.box(extents)
+        lines = ["mtllib textured.mtl", "usemtl material"]
+        lines += [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in corners.vertices]
+        lines += [f"vt {(side + 0.5) / 6:.5f} 0.5" for side in range(6)]
+        for corner, normal in zip(corners.faces, corners.face_normals, strict=True):
+            axis = int(np.abs(normal).argmax())
+            side = 2 * axis + int(normal[axis] > 0) + 1
+            lines.append("f " + " ".join(f"{vertex + 1}/{side}" for vertex in corner))
+        (folder / "textured.obj").write_text("\n".join(lines) + "\n")
+        (folder / "textured.mtl").write_text("newmtl material\nmap_Kd texture_map.jpg\n")
+        stripes = np.roll(COLOURS, number, axis=0)[None].repeat(8, 0).repeat(8, 1)
+        Image.fromarray(stripes).save(folder / "texture_map.jpg", quality=95)
+    return root
+
+
+def bop(root: Path) -> Path:
+    """Two coloured boxes in millimetres with their diameters."""
+    root.mkdir(parents=True)
+    info = {}
+    for number, extents in enumerate(((60.0, 80.0, 150.0), (90.0, 90.0, 40.0)), 1):
+        mesh = _coloured(trimesh.creation.box(extents), number)
+        mesh.export(root / f"obj_{number:06d}.ply")
+        info[str(number)] = {"diameter": float(np.linalg.norm(extents))}
+    (root / "models_info.json").write_text(json.dumps(info))
+    return root
+
+
+def meshes(root: Path) -> Path:
+    """A mesh in each of the formats that the documentation names."""
+    root.mkdir(parents=True)
+    shapes = {
+        "block.obj": trimesh.creation.box((0.1, 0.2, 0.3)),
+        "rod.ply": trimesh.creation.cylinder(0.05, 0.3),
+        "cone.glb": trimesh.creation.cone(0.1, 0.2),
+        "ball.stl": trimesh.creation.icosphere(2, 0.1),
+    }
+    for number, (name, mesh) in enumerate(shapes.items()):
+        _coloured(mesh, number).export(root / name)
+    return root
+
+
+def coco(path: Path) -> Path:
+    """Frames of four videos, a folder each, with a box of each of two of the embedded objects in every frame."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names, generator = Procedural().names(), torch.Generator().manual_seed(1)
+    images, annotations = [], []
+    for video in range(4):
+        folder = path.parent / f"video{video}"
+        folder.mkdir()
+        wall = ProceduralClutter().draw(1, 110, 130, generator)[0]
+        for frame in range(4):
+            picture = (255 * wall[:, :90, 3 * frame : 3 * frame + 120]).byte().movedim(0, -1).numpy().copy()
+            for slot, label in enumerate((video % len(names), (video + 2) % len(names))):
+                left, top = 8 + 55 * slot + 2 * frame, 20 + 10 * slot
+                picture[top : top + 40, left : left + 36] = COLOURS[label % 6]
+                annotations.append({"id": len(annotations), "image_id": len(images), "category_id": label,
+                                    "bbox": [left, top, 36, 40], "area": 1440, "iscrowd": 0})  # fmt: skip
+            name = f"{folder.name}/{frame:04d}.png"
+            Image.fromarray(picture).save(path.parent / name)
+            images.append({"id": len(images), "file_name": name, "width": 120, "height": 90, "scene": video})
+    categories = [{"id": label, "name": name} for label, name in enumerate(names)]
+    path.write_text(json.dumps({"images": images, "annotations": annotations, "categories": categories}))
+    return path
+
+
+def backgrounds(root: Path) -> Path:
+    """Four photographs."""
+    root.mkdir(parents=True)
+    for number, picture in enumerate(ProceduralClutter().draw(4, 96, 128, torch.Generator().manual_seed(2))):
+        pixels = (255 * picture).byte().movedim(0, -1).numpy()
+        Image.fromarray(pixels).save(root / f"{number}.jpg")
+    return root
+
+
+MAKERS: dict[str, Callable[[Path], Path]] = {
+    "/data/ycb": ycb,
+    "../shared/ycb": ycb,
+    "/data/models": bop,
+    "/data/meshes": meshes,
+    "/data/val.json": coco,
+    "/data/backgrounds": backgrounds,
+}
+"""What the documentation's paths stand for."""
+
+
+class MadeData:
+    """Data under ``root`` for the paths in commands, each made when it is first asked for."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.made: dict[Callable[[Path], Path], Path] = {}
+
+    def localise(self, word: str) -> str:
+        """The word with a documented path replaced by that of made data.
+
+        Raises ``AssertionError`` for a path that stands for no data.
+        """
+        key, equals, value = word.rpartition("=")
+        if value in MAKERS:
+            make = MAKERS[value]
+            if make not in self.made:
+                self.made[make] = make(self.root / make.__name__ / Path(value).name)
+            return f"{key}{equals}{self.made[make]}"
+        if value.startswith(("/", "~", "../")):
+            raise AssertionError(f"{word}: say in {Path(__file__).name} what {value} stands for")
+        return word
+
+
+def _coloured(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
+    colours = COLOURS[(number + np.arange(len(mesh.vertices))) % 6]
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
+    return mesh

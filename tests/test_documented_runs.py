@@ -1,0 +1,177 @@
+"""Every documented run as it is written, through the command line, at smoke scale, on data made here and on one store:
+it ends well and leaves what the documentation promises. Sweeps are cut to their first seed. Comparisons come last,
+after the runs that they compare."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from documented import ROOT, Command, commands
+from documented_data import MadeData
+from hydra import compose, initialize_config_dir
+
+from neural_sim.main import conf_directory
+
+pytestmark = pytest.mark.slow
+
+
+def _configuration(job):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return compose("config", job)
+
+
+def _compares(command):
+    return any(word.startswith("compare.") or word == "+experiment=compare" for word in command.overrides)
+
+
+class Runs:
+    """Runs commands once each, in folders of their own under one root, with one store and one MLflow."""
+
+    def __init__(self, root):
+        self.root, self.data = root, MadeData(root / "data")
+        self.folders: dict[Command, object] = {}
+
+    def words(self, command):
+        """The command's overrides, with the first of its seeds and made data for its paths."""
+        return [
+            self.data.localise(word) for word in (command.cut(1) if command.multirun else command.overrides)
+        ]
+
+    def folder(self, command):
+        """Where the command left its files, which it must have done without an error."""
+        if command not in self.folders:
+            folder = self.root / "runs" / str(len(self.folders))
+            added = [] if any(word.startswith("scale=") for word in command.overrides) else ["scale=smoke"]
+            added += [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
+            added.append(f"hydra.{'sweep' if command.multirun else 'run'}.dir={folder}")
+            run = [sys.executable, "-m", "src.main", *sorted(command.flags), *self.words(command), *added]
+            done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=3000)
+            assert done.returncode == 0, (
+                f"{command.where}: {' '.join(run)}\n{done.stdout[-1000:]}{done.stderr[-3000:]}"
+            )
+            self.folders[command] = folder
+        return self.folders[command]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    return Runs(tmp_path_factory.mktemp("documented"))
+
+
+ALL = [command for command in commands("main") if "--help" not in command.flags]
+
+
+@pytest.mark.parametrize("command", sorted(ALL, key=_compares), ids=lambda command: command.where)
+def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
+    jobs = command.jobs(seeds=1)
+    configurations = [_configuration([runs.data.localise(word) for word in job]) for job in jobs]
+    if (
+        any(config.trainer.accelerator == "gpu" for config in configurations)
+        and not torch.cuda.is_available()
+    ):
+        pytest.skip("no CUDA device")
+    if _compares(command):
+        _run_what_is_compared(runs, set(configurations[0].compare.experiments))
+    folder = runs.folder(command)
+    folders = [path.parent.parent for path in folder.glob("**/.hydra/config.yaml")]
+    assert len(folders) == len(jobs)
+    kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
+             "temperatures": _temperatures}  # fmt: skip
+    for job, config in zip(folders, [_of(path) for path in folders], strict=True):
+        kinds.get(next((key for key in kinds if key in config), ""), _run)(job, config)
+
+
+def _of(folder):
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_container(OmegaConf.load(folder / ".hydra" / "config.yaml"), resolve=True)
+
+
+def _run_what_is_compared(runs, experiments):
+    for command in ALL:
+        if command.multirun and experiments & {_configuration(job).name for job in command.jobs(seeds=1)}:
+            runs.folder(command)
+
+
+def _run(folder, config):
+    """README, What a run leaves."""
+    results = json.loads((folder / "results.json").read_text())
+    assert set(results["ap"]) == {"ns", "learned", "matched"}
+    assert (results["experiment"], results["seed"]) == (config["name"], config["seed"])
+    assert {"seconds", "peak_memory_mb", "left_out"} <= set(results)
+    for factors in results["psi"].values():
+        assert set(factors) == set(config["parameter"])
+        assert all(set(psi) == {"initial", "learned", "target"} for psi in factors.values())
+    if config["baseline"]["name"].startswith("neural_sim"):
+        assert len(results["iterations"]) == config["outer"]["iterations"]
+    # A method without iterations has no psi over them.
+    promised = {
+        "ap",
+        "training_images",
+        "detections",
+        *(f"psi_{p}" for p in config["parameter"] if results["iterations"]),
+    }
+    assert promised <= {path.stem for path in (folder / "figures").glob("*.png")}
+    made = json.loads((folder / "training_set" / "annotations.json").read_text())
+    assert len(made["images"]) == len(results["psi"]) * config["training"]["images_per_object"]
+    assert all(
+        (folder / "training_set" / image["file_name"]).is_file() and image["pose"] for image in made["images"]
+    )
+
+
+def _comparison(folder, config):
+    found = {held["setting"]: held for held in json.loads((folder / "compare.json").read_text())}
+    text = (folder / "compare.md").read_text()
+    assert set(config["compare"]["experiments"]) <= set(found)
+    for setting, held in found.items():
+        assert held["methods"][0] == config["compare"]["reference"] and len(held["methods"]) > 1
+        assert (folder / "figures" / f"{setting.replace(', ', '_')}.png").stat().st_size > 5000
+        assert all(f"\n| {method} |" in text for method in held["methods"])
+    assert "of the gap won back" in text
+
+
+def _interpolation(folder, config):
+    held = json.loads((folder / "interpolation.json").read_text())
+    assert max(held["opacity_change"].values()) <= 1e-6  # float32: the light has no part in it
+    assert (folder / "figures" / "interpolation.png").stat().st_size > 5000
+
+
+def _temperatures(folder, config):
+    held = json.loads((folder / "temperatures.json").read_text())
+    names, values = config["objects"]["names"], config["temperatures"]["values"]
+    assert [truth["object"] for truth in held["truths"]] == names
+    assert len(held["rows"]) == len(names) * len(values) and all(row["images"] > 0 for row in held["rows"])
+    # Nearly exact draws lie where p puts them: 0.86 on the first object's dominant bin, 7.
+    cold = held["rows"][0]
+    assert cold["temperature"] == min(values) and cold["shares"][6] > 0.8
+    assert (folder / "figures" / "temperatures.png").stat().st_size > 5000
+
+
+def _stress(folder, config):
+    held = json.loads((folder / "stress.json").read_text())
+    assert held and (folder / "stress.md").stat().st_size > 1000
+
+
+def test_help_lists_the_keys():
+    done = subprocess.run(
+        [sys.executable, "-m", "src.main", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert all(f"\n{key}:\n" in done.stdout for key in ("views", "training", "outer", "objects"))
+
+
+def test_mlflow_knows_the_documented_options():
+    environment = {**os.environ, "MLFLOW_DISABLE_TELEMETRY": "true"}
+    done = subprocess.run(
+        [sys.executable, "-m", "mlflow", "ui", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=environment,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    options = {word for command in commands("mlflow") for word in command.arguments if word.startswith("--")}
+    assert options and all(option in done.stdout for option in options)
