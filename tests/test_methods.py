@@ -84,7 +84,9 @@ def test_the_comparison_reads_the_sweep_back(folder):
         "compare.draws=20",
         f"hydra.run.dir={folder / 'compare'}",
     )
-    (comparison,) = json.loads((folder / "compare" / "compare.json").read_text())
+    document = json.loads((folder / "compare" / "compare.json").read_text())
+    (comparison,) = document["comparisons"]
     assert comparison["methods"][0] == "neural_sim" and {"lts", "auto_sim"} <= set(comparison["methods"])
+    assert {run["run"].split()[0] for run in document["left_out"]} == {"ns", "oracle"}
     assert (folder / "compare" / "figures" / "pose.png").stat().st_size > 5000
     assert "of the gap won back" in (folder / "compare" / "compare.md").read_text()

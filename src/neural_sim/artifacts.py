@@ -60,9 +60,14 @@ class Artifacts:
 
     def _config(self, *groups: str) -> dict[str, Any]:
         """Groups as configured, with the digests of the files they read where they read any."""
-        sources = {"synthesis": self.x.synthesis.background, "target": self.x.target}
-        files = {g: sources[g].digest() for g in groups if hasattr(sources.get(g), "digest")}
+        files = {group: found for group, found in self.files.items() if group in groups}
         return {group: self.x.config[group] for group in groups} | ({"files": files} if files else {})
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Digests of the photographs and annotations that groups read, by group."""
+        sources = {"synthesis": self.x.synthesis.background, "target": self.x.target}
+        return {group: held.digest() for group, held in sources.items() if hasattr(held, "digest")}
 
     def _fetch(
         self, stage: str, kind: str, what: str, key: dict[str, Any], make: Callable[[], Any], keep: bool = True

@@ -12,11 +12,13 @@ from typing import Any
 
 from tqdm import tqdm
 
+from neural_sim import versions
 from neural_sim.artifacts import Artifacts
 from neural_sim.devices import peak_memory_mb
 from neural_sim.experiment import Experiment
 from neural_sim.outer.records import Cost
 from neural_sim.plan import plan
+from neural_sim.report.identity import identity
 from neural_sim.report.run import (
     RunResults,
     write_detections,
@@ -26,6 +28,7 @@ from neural_sim.report.run import (
 )
 from neural_sim.report.run_tracking import track
 from neural_sim.report.tracking import tracking_uri
+from neural_sim.store import code_version
 from neural_sim.synthesis.scene import join
 
 _log = logging.getLogger(__name__)
@@ -93,7 +96,14 @@ class Pipeline:
             config=self.x.config,
             curve=self.curve() if evaluated else (),
             symmetric_bins=self.made.symmetric_bins,
+            identity=self.identity(),
         )
+
+    def identity(self) -> dict[str, Any]:
+        """What says which runs this one can be compared with."""
+        files = {"objects": self.made.digests, **self.made.files}
+        code = {"scoring": code_version(*versions.SCORING), "method": code_version(*versions.LOOPS)}
+        return identity(self.x.config, files, code, self.made.targets["test"])
 
     def curve(self) -> list[dict[str, Any]]:
         """What the method had spent, its warm start included, and what its psi was worth, at its start (which costs

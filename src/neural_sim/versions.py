@@ -21,3 +21,5 @@ DETECTORS = ("field", "renderer/nerf", "renderer/nerf_w", *DISTRIBUTIONS, "synth
 """What draws a training set from psi, trains a detector on it and scores it."""
 LOOPS = ("outer", "gradient", "solver", "baseline", "methods", "parameter/update")
 """What moves psi."""
+SCORING = tuple(sorted({*VIEWS, *FIELDS, *TARGETS, *DETECTORS}))
+"""All that AP depends on beside psi."""

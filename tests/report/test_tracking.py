@@ -12,18 +12,18 @@ def test_tracking_uri_keeps_uris_and_makes_paths_absolute(tmp_path):
         tracking.tracking_uri("")
 
 
-def test_only_finished_files_that_are_asked_for_come_back_the_latest_run_first(tmp_path):
+def test_runs_come_back_with_their_files_the_latest_first(tmp_path):
     uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
-    for number, names in enumerate((["a.json", "b.json"], ["a.json"], ["a.json", "b.json", "big.bin"])):
+    for number, names in enumerate((["a.json", "b.json"], ["a.json"])):
         folder = tmp_path / str(number)
         folder.mkdir()
         for name in names:
             (folder / name).write_text(f"{number}")
         tracking.log_run(uri, "gap", f"run {number}", {}, {}, {}, {}, folder)
-    found = tracking.finished_files(uri, "gap", ("a.json", "b.json"))
-    assert [{name: path.read_text() for name, path in run.items()} for run in found] == [
-        {"a.json": "2", "b.json": "2"},
-        {"a.json": "0", "b.json": "0"},
-    ]
+    found = tracking.runs(uri, "gap")
+    assert [(run.name, run.status, set(run.files)) for run in found] == [
+        ("run 1", "FINISHED", {"a.json"}), ("run 0", "FINISHED", {"a.json", "b.json"}),
+    ]  # fmt: skip
+    assert found[1].fetch("b.json").read_text() == "0"
     with pytest.raises(ValueError, match=r"no experiment 'other', only \['gap'\]"):
-        tracking.finished_files(uri, "other", ("a.json",))
+        tracking.runs(uri, "other")

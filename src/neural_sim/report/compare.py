@@ -11,7 +11,8 @@ from typing import Any, get_args
 
 from neural_sim.report import figures, tracking
 from neural_sim.report.curves import curves
-from neural_sim.report.finished import FinishedRun, finished_runs
+from neural_sim.report.finished import FinishedRun, candidates, read_run
+from neural_sim.report.selection import Group, LeftOut, Selection
 from neural_sim.report.statistics import BOUNDS, Clock, Comparison, Estimate, compare
 
 
@@ -43,43 +44,86 @@ class Compare:
             raise ValueError(f"compare.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
     def run(self, uri: str, seed: int, config: Mapping[str, Any], folder: Path) -> list[Comparison]:
-        """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow."""
-        runs = finished_runs(uri, self.experiments)
-        settings = {run.setting: [other for other in runs if other.setting == run.setting] for run in runs}
-        found = [compare(held, self.reference, self.draws, seed, self.clock) for held in settings.values()]
-        folder.mkdir(parents=True, exist_ok=True)
-        document = [dataclasses.asdict(comparison) for comparison in found]
-        (folder / "compare.json").write_text(json.dumps(document, indent=1))
-        text = "\n\n".join(markdown(c, settings[c.setting]) for c in found)
-        (folder / "compare.md").write_text(text + "\n")
-        for comparison in found:
-            held = [run for run in settings[comparison.setting] if run.seed in comparison.seeds]
-            name = comparison.setting.replace(", ", "_")
-            figures.save(curves(comparison, held), folder / "figures" / f"{name}.png")
-        metrics = {
-            f"{c.setting.replace(', ', '_')}/{method}/ap": c.ap[method].value
-            for c in found
-            for method in c.methods
-        }
-        tags = {"compared": ",".join(settings)}
-        tracking.log_run(
-            uri, "compare", ", ".join(settings), tags, tracking.flatten(config), metrics, {}, folder
+        """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow.
+
+        Raises:
+            ValueError: no such experiment, or no run that can be compared, with the reasons.
+        """
+        chosen = Selection(candidates(uri, self.experiments), self.reference)
+        if not chosen.groups:
+            why = "; ".join(f"{reason}: {', '.join(runs)}" for reason, runs in by_reason(chosen.left_out))
+            raise ValueError(
+                f"compare.experiments: no evaluated run of compare.reference={self.reference!r} on biased objects in "
+                f"{', '.join(self.experiments)}" + (f" ({why})" if why else "")
+            )
+        found, parts, documents = [], [], []
+        for group in chosen.groups:
+            runs = [read_run(run) for run in group.runs]
+            comparison = compare(runs, self.reference, self.draws, seed, self.clock)
+            comparison = dataclasses.replace(comparison, setting=group.label)
+            found.append(comparison)
+            parts.append(markdown(comparison, runs, group.heading))
+            documents.append(dataclasses.asdict(comparison) | _sources(group))
+            figures.save(curves(comparison, runs), folder / "figures" / f"{_slug(comparison)}.png")
+        text = "\n\n".join([*parts, *left_out_table(chosen.left_out)])
+        left = [dataclasses.asdict(run) for run in chosen.left_out]
+        (folder / "compare.json").write_text(
+            json.dumps({"comparisons": documents, "left_out": left}, indent=1)
         )
+        (folder / "compare.md").write_text(text + "\n")
+        metrics = {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in found for method in c.methods}
+        labels = [comparison.setting for comparison in found]
+        tracking.log_run(
+            uri, "compare", ", ".join(labels), {"compared": ",".join(labels)}, tracking.flatten(config), metrics,
+            {}, folder,
+        )  # fmt: skip
         print(text)
         print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
         return found
 
 
-def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
-    """The table of one setting, its differences, and the distances of the learned distributions."""
+def _slug(comparison: Comparison) -> str:
+    """The setting as part of a file's or a metric's name."""
+    return comparison.setting.replace(", ", "_").replace(" ", "_")
+
+
+def _sources(group: Group) -> dict[str, Any]:
+    """What a table was made from, for compare.json."""
+    rows = [{"method": r.method, "seed": r.seed, "run": r.name, "run_id": r.run_id} for r in group.runs]
+    return {"heading": group.heading, "scoring": group.runs[0].results["scoring"], "runs": rows}
+
+
+def by_reason(left_out: Sequence[LeftOut]) -> list[tuple[str, list[str]]]:
+    """Runs with the first digits of their ids, by why they were left out."""
+    found: dict[str, list[str]] = {}
+    for run in left_out:
+        found.setdefault(run.reason, []).append(f"{run.run} ({run.run_id[:8]})")
+    return list(found.items())
+
+
+def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
+    """A section of compare.md, none where every run was compared."""
+    if not left_out:
+        return []
+    lines = ["## Left out", "", "| runs | why |", "|---|---|"]
+    for reason, runs in by_reason(left_out):
+        cells = (", ".join(runs), reason)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |")
+    return ["\n".join(lines)]
+
+
+def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
+    """The table of one setting, its differences, and the distances of the learned distributions. ``heading`` says what
+    these runs have for themselves among others of the setting."""
     c, count = comparison, len(comparison.seeds)
     unit = "seconds" if c.clock == "seconds" else "CPU seconds"
     lines = [
-        f"## {c.setting}",
+        f"## {c.setting}" + (f": {heading}" if heading else ""),
         f"Seed{'s' if count > 1 else ''} {', '.join(map(str, c.seeds))}; "
         f"AP (0.50 to 0.95) of {', '.join(runs[0].results['biased'])} in points, "
         "with 95 % bootstrap intervals over seeds and test images"
         + (" (one seed: over images alone)." if count == 1 else "."),
+        *_on_other_devices(runs),
         "",
         f"| method | AP | of the gap won back | {c.reference} ahead by | area ahead by "
         f"| AP after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
@@ -103,6 +147,18 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun]) -> str:
     lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]
     lines += ["|---|" + "---|" * (1 + len(c.methods))]
     return "\n".join(lines + _distances(c, runs))
+
+
+def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
+    """A warning where the seconds of a table come from devices of several kinds."""
+    kinds: dict[str, list[str]] = {}
+    for run in runs:
+        kind = run.results["config"]["trainer"]["accelerator"]
+        kinds.setdefault(kind, []).append(f"{run.method} seed {run.seed}")
+    named = "; ".join(f"{kind}: {', '.join(which)}" for kind, which in kinds.items())
+    return ["", f"Seconds are not comparable, the runs were made on devices of several kinds ({named})."] * (
+        len(kinds) > 1
+    )
 
 
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:

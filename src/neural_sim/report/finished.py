@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,35 @@ from neural_sim.report.bootstrap import Matches, match
 from neural_sim.types import LabelledImages
 
 WHICH = ("ns", "learned", "matched")
+FILES = ("results.json", "detections.json")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A run found in MLflow: its results.json, or why there is none to compare (``unusable``).
+
+    ``detections`` fetches its detections.json.
+    """
+
+    name: str
+    run_id: str
+    experiment: str
+    results: Mapping[str, Any] = field(default_factory=dict)
+    detections: Callable[[], Path] = Path
+    unusable: str | None = None
+
+    @property
+    def method(self) -> str:
+        return self.results["method"]
+
+    @property
+    def seed(self) -> int:
+        return self.results["seed"]
+
+    @property
+    def setting(self) -> str:
+        """The experiment, with its gap unless that is the experiment's own."""
+        return setting_of(self.results)
 
 
 @dataclass(frozen=True)
@@ -36,39 +65,44 @@ class FinishedRun:
     @property
     def setting(self) -> str:
         """The experiment, with its gap unless that is the experiment's own."""
-        gap = self.results["gap"]
-        return self.results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
+        return setting_of(self.results)
 
     def spent(self, key: str) -> float:
         """What the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
         return float(self.results["curve"][-1][key])
 
 
-def finished_runs(uri: str, experiments: Sequence[str]) -> list[FinishedRun]:
-    """The latest evaluated run of every method, seed and setting of MLflow experiments.
+def setting_of(results: Mapping[str, Any]) -> str:
+    """The experiment of a results.json, with its gap unless that is the experiment's own."""
+    gap = results["gap"]
+    return results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
+
+
+def candidates(uri: str, experiments: Sequence[str]) -> list[Candidate]:
+    """The runs of MLflow experiments, those of each the newest first.
 
     Raises:
-        ValueError: no such experiment, or none with an evaluated run.
+        ValueError: no such experiment.
     """
-    found: dict[tuple[str, str, int], FinishedRun] = {}
-    for experiment in experiments:
-        for files in tracking.finished_files(uri, experiment, ("results.json", "detections.json")):
-            run = read_run(*files.values())
-            if run is not None:
-                found.setdefault((run.setting, run.method, run.seed), run)
-    if not found:
-        raise ValueError(
-            f"compare.experiments: no run of {', '.join(experiments)} in {uri} was evaluated on biased objects"
+    return [_candidate(run, name) for name in dict.fromkeys(experiments) for run in tracking.runs(uri, name)]
+
+
+def _candidate(run: tracking.LoggedRun, experiment: str) -> Candidate:
+    missing = [name for name in FILES if name not in run.files]
+    if run.status != "FINISHED":
+        return Candidate(run.name, run.run_id, experiment, unusable=f"its status in MLflow is {run.status}")
+    if missing:
+        return Candidate(
+            run.name, run.run_id, experiment, unusable=f"it was not evaluated: it left no {missing[0]}"
         )
-    return list(found.values())
+    results = json.loads(run.fetch(FILES[0]).read_text())
+    return Candidate(run.name, run.run_id, experiment, results, lambda: run.fetch(FILES[1]))
 
 
-def read_run(results_file: Path, detections_file: Path) -> FinishedRun | None:
-    """A run from its results.json and detections.json; None where it has no biased object to compare by."""
-    results = json.loads(results_file.read_text())
-    if not results["biased"] or not results["curve"]:
-        return None
-    held = json.loads(detections_file.read_text())
+def read_run(candidate: Candidate) -> FinishedRun:
+    """A run with biased objects, its detections matched to the test set's boxes."""
+    results = candidate.results
+    held = json.loads(candidate.detections().read_text())
     names, count = list(results["psi"]), held["images"]
     truth = _images(held["truth"], count)
     labels = [names.index(name) for name in results["biased"]]

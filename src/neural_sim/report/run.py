@@ -33,7 +33,8 @@ class RunResults:
     (``ap``) at every iteration that was scored.
 
     ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
-    (from 1), by object and angle, whose views an object's symmetry makes the same.
+    (from 1), by object and angle, whose views an object's symmetry makes the same. ``identity`` says which runs
+    this one can be compared with, see :func:`identity.identity`.
     """
 
     experiment: str
@@ -52,6 +53,7 @@ class RunResults:
     validation_ap: float | None = None
     curve: Sequence[Mapping[str, Any]] = ()
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
+    identity: Mapping[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
@@ -82,6 +84,7 @@ class RunResults:
                 "seconds": dict(self.seconds),
                 **self.memory,
                 "left_out": list(self.left_out),
+                **self.identity,
             }
         )
 

@@ -6,7 +6,8 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,10 +71,19 @@ def log_run(
     return run_id
 
 
-def finished_files(uri: str, experiment: str, names: Sequence[str]) -> list[dict[str, Path]]:
-    """The artifacts ``names`` of an experiment's finished runs that have them all, the latest run first.
+@dataclass(frozen=True)
+class LoggedRun:
+    """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one."""
 
-    Nothing else is fetched from a remote store.
+    run_id: str
+    name: str
+    status: str
+    files: frozenset[str]
+    fetch: Callable[[str], Path]
+
+
+def runs(uri: str, experiment: str) -> list[LoggedRun]:
+    """All runs of an experiment that are not deleted, the latest first.
 
     Raises:
         ValueError: no experiment of that name.
@@ -89,11 +99,21 @@ def finished_files(uri: str, experiment: str, names: Sequence[str]) -> list[dict
         if found is None:
             known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
             raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
-        order = ["attributes.start_time DESC"]
-        runs = client.search_runs([found.experiment_id], "attributes.status = 'FINISHED'", order_by=order)
-        ids = [run.info.run_id for run in runs]
-        complete = [i for i in ids if {item.path for item in client.list_artifacts(i)}.issuperset(names)]
-        return [{name: Path(client.download_artifacts(i, name)) for name in names} for i in complete]
+        order, logged, token = ["attributes.start_time DESC"], [], None
+        while token != "":
+            page = client.search_runs([found.experiment_id], order_by=order, page_token=token)
+            logged += [_logged(client, run.info) for run in page]
+            token = page.token or ""
+    return logged
+
+
+def _logged(client: Any, info: Any) -> LoggedRun:
+    files = frozenset(item.path for item in client.list_artifacts(info.run_id))
+
+    def fetch(name: str) -> Path:
+        return Path(client.download_artifacts(info.run_id, name))
+
+    return LoggedRun(info.run_id, info.run_name, info.status, files, fetch)
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,0 +1,113 @@
+"""What makes two runs comparable: digests of what is scored, of a run's whole settings, and of its test set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from neural_sim.report.tracking import flatten
+from neural_sim.store import digest, tensor_digest
+from neural_sim.types import LabelledImages
+
+KEYS = ("scoring", "configuration", "test_set")
+"""Of results.json, see :func:`identity`."""
+SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
+"""Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
+METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "label_gradient")
+"""Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the rest says where
+it starts and what it aims at."""
+RUN_KEYS = ("seed", "score_at", "stages", "progress", "paths", "trainer")
+"""What runs of the same settings may differ by."""
+SHOWN = 3
+"""Differences that are named; the rest is counted."""
+
+
+def identity(
+    config: Mapping[str, Any],
+    files: Mapping[str, Any],
+    code: Mapping[str, str],
+    test: LabelledImages,
+) -> dict[str, Any]:
+    """What results.json carries for a comparison.
+
+    Args:
+        config: the resolved configuration.
+        files: digests of what the run reads: ``objects`` by name in their order, and files of other groups.
+        code: versions of the code, ``scoring`` of what trains and scores a detector, ``method`` of what moves psi.
+        test: the test set.
+
+    Returns:
+        ``scoring``: digest of all that must be equal for the AP of two methods to be comparable; ``configuration``:
+        digest of all settings but ``RUN_KEYS``, so that a method's seeds share it; ``test_set``: digest of the test
+        images and labels; and ``config``, ``files`` and ``code``, to say what differs.
+    """
+    scored = {"config": scored_config(config), "files": files, "names": list(files["objects"])}
+    settings = {key: value for key, value in config.items() if key not in RUN_KEYS}
+    return {
+        "scoring": digest({**scored, "code": code["scoring"]}),
+        "configuration": digest({"config": settings, "code": code["method"]}),
+        "test_set": tensor_digest([test.images, test.boxes, test.labels]),
+        "config": dict(config),
+        "files": dict(files),
+        "code": dict(code),
+    }
+
+
+def scored_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a configuration that AP depends on, whichever method is scored. Objects go by their contents."""
+    parameters = {name: _without_choices(node) for name, node in config["parameter"].items()}
+    return {**{group: _without_choices(config[group]) for group in SCORED}, "parameter": parameters}
+
+
+def _without_choices(node: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in node.items() if key not in METHOD_KEYS}
+
+
+def scored_values(results: Mapping[str, Any]) -> dict[str, Any]:
+    """All that goes into the digest ``scoring``, flat, by the names that a reader of a comparison sees."""
+    config = {**scored_config(results["config"]), "objects": results["config"]["objects"]}
+    files = {f"contents of {key}": _short(value) for key, value in flatten(results["files"]).items()}
+    return {**flatten(config), **files, "code that trains and scores": results["code"]["scoring"][:8]}
+
+
+def all_values(results: Mapping[str, Any]) -> dict[str, Any]:
+    """All that goes into the digests ``configuration`` and ``scoring``, flat."""
+    config = {key: value for key, value in results["config"].items() if key not in RUN_KEYS}
+    method = {"code of the method": results["code"]["method"][:8]}
+    return {**flatten(config), **scored_values(results), **method}
+
+
+def differing(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names whose values are not the same in all mappings; ``_target_``, the class that a group names, comes first."""
+    names = list(dict.fromkeys(name for values in all_of for name in values))
+    found = [n for n in names if any(v.get(n, _ABSENT) != all_of[0].get(n, _ABSENT) for v in all_of)]
+    return sorted(found, key=lambda name: not name.endswith("_target_"))
+
+
+def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """The first few differences in words, with both values: ``views.count is 8, not 100; ... and 4 more``."""
+    names = differing([here, there])
+    parts = [f"{n} is {_shown(here, n)}, not {_shown(there, n)}" for n in names[:SHOWN]]
+    return "; ".join(parts) + _more(names)
+
+
+def headings(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What each mapping has for itself: ``views.count=8, ... and 4 more``; empty for a single one."""
+    names = differing(all_of)
+    return [", ".join(f"{n}={_shown(v, n)}" for n in names[:SHOWN]) + _more(names) for v in all_of]
+
+
+def _more(names: Sequence[str]) -> str:
+    return f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+
+
+_ABSENT = object()
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    value = values.get(name, _ABSENT)
+    return "absent" if value is _ABSENT else str(value)[:80]
+
+
+def _short(value: Any) -> str:
+    return str(value)[:8]

@@ -1,0 +1,124 @@
+"""A whole comparison of small made-up runs, from MLflow to compare.md and compare.json."""
+
+import json
+
+import pytest
+
+from neural_sim.report import tracking
+from neural_sim.report.compare import Compare
+
+CONFIG = {
+    **{group: {"size": 1} for group in (
+        "objects", "views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")},
+    "parameter": {"pose": {"bins": 8}}, "trainer": {"accelerator": "cpu"},
+}  # fmt: skip
+BOX = [1.0, 1.0, 8.0, 8.0]
+
+
+def detections(found, images=8):
+    """One mug an image, ``found`` of them detected exactly and nothing else: AP is about that share."""
+
+    def rows(which):
+        return [{"image_id": i, "category_id": 1, "bbox": BOX, "score": 1.0 - 0.01 * i} for i in which]
+
+    learned = rows(range(found))
+    return {
+        "images": images, "truth": rows(range(images)), "ns": rows(range(2)), "learned": learned,
+        "matched": rows(range(images)),
+    }  # fmt: skip
+
+
+def results(method, seed, ap, scoring="s", config=(), **changes):
+    point = {"images": 10, "detector_steps": 1, "products": 0, "seconds": 5.0, "cpu_seconds": 4.0}
+    curve = [
+        {key: value * when for key, value in point.items()} | {"ap": {"per_class": {"mug": score}}}
+        for when, score in ((0, 0.2), (1, ap))
+    ]
+    return {
+        "experiment": "gap", "gap": "disjoint", "method": method, "seed": seed, "biased": ["mug"], "curve": curve,
+        "psi": {"mug": {}}, "total_variation": {"mug": {"pose": {"initial": 0.8, "learned": 1.0 - ap}}},
+        "scoring": scoring, "configuration": f"{method} {scoring}", "test_set": f"images of {seed}",
+        "config": {**CONFIG, **dict(config)}, "files": {"objects": {"mug": "1" * 64}},
+        "code": {"scoring": "a" * 12, "method": "b" * 12}, **changes,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory):
+    """Two methods on two seeds, a later smoke run of one of them, a run of an older version, and one not evaluated."""
+    folder = tmp_path_factory.mktemp("compare")
+    uri = tracking.tracking_uri(str(folder / "mlflow.db"))
+    old = results("lts", 0, 0.5)
+    for key in ("scoring", "configuration", "test_set", "config", "files", "code"):
+        del old[key]
+    written = [old, results("neural_sim", 0, 0.75), results("neural_sim", 1, 0.75)]
+    written += [results("lts", 0, 0.5), results("lts", 1, 0.5)]
+    written += [
+        results("lts", 0, 0.125, scoring="t", config={"views": {"size": 0}}),
+        {"method": "lts", "seed": 5},
+    ]
+    for number, held in enumerate(written):
+        run = folder / str(number)
+        run.mkdir()
+        (run / "results.json").write_text(json.dumps(held))
+        if "curve" in held:
+            found = round(8 * held["curve"][-1]["ap"]["per_class"]["mug"])
+            (run / "detections.json").write_text(json.dumps(detections(found)))
+        tracking.log_run(uri, "gap", f"{held['method']} seed {held['seed']}", {}, {}, {}, {}, run)
+    return uri
+
+
+def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, capsys):
+    (found,) = Compare(("gap",), draws=5).run(database, 0, {"name": "compare"}, tmp_path)
+    assert found.methods == ("neural_sim", "lts") and found.seeds == (0, 1)
+    assert found.ap["lts"].value == pytest.approx(0.5, abs=0.01)
+    document = json.loads((tmp_path / "compare.json").read_text())
+    (table,) = document["comparisons"]
+    assert table["scoring"] == "s" and table["heading"] == ""
+    assert [(run["method"], run["seed"]) for run in table["runs"]] == [
+        ("neural_sim", 0), ("neural_sim", 1), ("lts", 0), ("lts", 1),
+    ]  # fmt: skip
+    told = {(run["run"], run["reason"].split(",")[0].split(";")[0]) for run in document["left_out"]}
+    assert told == {
+        ("lts seed 0", "no run of neural_sim is scored in the same way"),
+        ("lts seed 0", "an older version wrote it"),
+        ("lts seed 5", "it was not evaluated: it left no detections.json"),
+    }
+    text = (tmp_path / "compare.md").read_text()
+    assert text.startswith("## gap\n") and "views.size is 0, not 1" in text.split("## Left out")[1]
+    assert "Seconds are not comparable" not in text and text.strip() in capsys.readouterr().out
+    assert (tmp_path / "figures" / "gap.png").stat().st_size > 5000
+
+
+def test_two_ways_of_scoring_are_two_tables_whose_headings_say_how_they_differ(database, tmp_path):
+    found = Compare(("gap",), reference="lts", draws=5).run(database, 0, {"name": "compare"}, tmp_path)
+    assert [comparison.methods for comparison in found] == [("lts",), ("lts", "neural_sim")]
+    text = (tmp_path / "compare.md").read_text()
+    assert "## gap, scoring t: views.size=0\n" in text and "## gap, scoring s: views.size=1\n" in text
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
+        "gap_scoring_t.png",
+        "gap_scoring_s.png",
+    }
+
+
+def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"no evaluated run of compare.reference='ours'.*has no run of this setting"
+    ):
+        Compare(("gap",), reference="ours", draws=5).run(database, 0, {}, tmp_path)
+    with pytest.raises(ValueError, match="no experiment 'other'"):
+        Compare(("other",), draws=5).run(database, 0, {}, tmp_path)
+
+
+def test_seconds_of_several_kinds_of_device_are_called_so(tmp_path):
+    uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
+    for method, kind in (("neural_sim", "gpu"), ("lts", "cpu")):
+        run = tmp_path / method
+        run.mkdir()
+        held = results(method, 0, 0.5, config={"trainer": {"accelerator": kind}})
+        (run / "results.json").write_text(json.dumps(held))
+        (run / "detections.json").write_text(json.dumps(detections(4)))
+        tracking.log_run(uri, "gap", method, {}, {}, {}, {}, run)
+    Compare(("gap",), draws=5).run(uri, 0, {}, tmp_path / "compare")
+    text = (tmp_path / "compare" / "compare.md").read_text()
+    assert "Seconds are not comparable" in text and "cpu: lts seed 0" in text
