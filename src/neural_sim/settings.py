@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import torch
 
 from neural_sim.cameras import orbit
+from neural_sim.gradient.significance import SMALLEST
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.illumination import LightUpdate, ProjectedGradient
 from neural_sim.parameter.update import Update
@@ -105,26 +106,35 @@ class Trust:
     """What a psi step's hypergradient must meet to be trusted; None makes no demand.
 
     ``max_residual`` of the adjoint solve, relative; ``max_stationarity`` of ``|dL_train/dtheta|``; ``max_sensitivity``
-    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); ``min_signal_to_noise`` of the best
-    psi component of all objects; ``min_cosine`` with the retrained finite difference (wants ``outer.certify_every``).
-    ``shrink`` is the part of an untrusted step that is taken where ``outer.on_untrusted`` says shrink.
+    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); ``min_cosine`` with the retrained
+    finite difference (wants ``outer.certify_every``). These speak of all objects. ``level`` speaks of each object and
+    factor of psi: the probability with which an iteration's derivative that is zero passes for one that is not (see
+    ``gradient.significance``). ``shrink`` is the part of an untrusted step that is taken where ``outer.on_untrusted``
+    says shrink.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
     """
 
     max_residual: float | None = 0.1
     max_stationarity: float | None = None
     max_sensitivity: float | None = None
-    min_signal_to_noise: float | None = 1.0
     min_cosine: float | None = 0.0
+    level: float | None = 0.05
     shrink: float = 0.25
 
     def __post_init__(self) -> None:
         limits = {
             "max_residual": self.max_residual, "max_stationarity": self.max_stationarity,
-            "max_sensitivity": self.max_sensitivity, "min_signal_to_noise": self.min_signal_to_noise,
+            "max_sensitivity": self.max_sensitivity,
         }  # fmt: skip
         _at_least("outer.trust", 0, **{name: limit for name, limit in limits.items() if limit is not None})
         if self.min_cosine is not None and not -1.0 <= self.min_cosine <= 1.0:
             raise ValueError(f"outer.trust.min_cosine must lie in [-1, 1], got {self.min_cosine}")
+        if self.level is not None and not SMALLEST <= self.level < 1.0:
+            raise ValueError(
+                f"outer.trust.level must lie in [{SMALLEST}, 1), below which no p-value lies, got {self.level}"
+            )
         if not 0.0 < self.shrink < 1.0:
             raise ValueError(f"outer.trust.shrink must lie in (0, 1), got {self.shrink}")
 
@@ -145,9 +155,11 @@ class Outer:
     anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
     renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
     objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
-    ``on_untrusted`` is what happens to a step that fails ``trust``; ``keep`` takes it whole, as the paper does. Every
-    ``certify_every`` steps (0: never) one object's gradient, in turn, is compared with finite differences of a problem
-    retrained on ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
+    ``on_untrusted`` is what happens to a step that fails ``trust``: the step of one factor of one object where its
+    derivative is not significant, of all where the doubt is about all. ``keep`` takes it whole, as the paper does;
+    ``stop`` skips the former, and ends the loop at the latter or where no object is left. Every ``certify_every`` steps
+    (0: never) one object's gradient, in turn, is compared with finite differences of a problem retrained on
+    ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
     """
 
     update: Update

@@ -69,7 +69,7 @@ class Bilevel:
         self.gumbel, self.within, self.other = draw(images, bins), draw(images), draw(images)
         self.background, self.targets = draw(images, 3, 2, 3).sigmoid(), draw(images, 2)
         self.val_images, self.val_targets = draw(5, 18), draw(5, 2)
-        self.psi = draw(bins)
+        self.psi, self.distribution = draw(bins), SceneDistribution.of([Pose(bins=bins)])
         self.centres = torch.arange(bins, dtype=DOUBLE) * (2 * math.pi / bins)
 
     def relaxed(self, psi):
@@ -104,9 +104,7 @@ class Bilevel:
         count = len(draw)
         path = RenderedPath(self.relaxed, render_rays, self.compose, CAMERA, rgb, opacity)
         weights = torch.full((count,), 1.0 / count, dtype=DOUBLE)
-        return ObjectImages(
-            self.psi, lambda psi: torch.log_softmax(psi, -1), images, torch.arange(count), weights, draw, path
-        )
+        return ObjectImages(self.psi, self.distribution, images, torch.arange(count), weights, draw, path)
 
     def inner(self, images):
         params = self.minimiser(self.psi)

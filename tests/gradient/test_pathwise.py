@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.gradient.base import from_contributions
+from neural_sim.gradient.base import from_contributions, group_sums
 from neural_sim.gradient.pathwise import (
     PathwiseEstimator,
     contract,
@@ -124,18 +124,18 @@ def test_standard_error_is_that_of_a_sum():
     rows = torch.tensor([[1.0, 2.0], [3.0, 2.0], [2.0, 2.0], [6.0, 2.0]], dtype=DOUBLE)
     derivative = from_contributions(rows)
     torch.testing.assert_close(derivative.standard_error[0], rows[:, 0].var().mul(4).sqrt())
-    assert derivative.standard_error[1] == 0.0 and derivative.signal_to_noise[1] == torch.inf
-    assert from_contributions(rows[:1]).signal_to_noise.tolist() == [0.0, 0.0]
+    assert derivative.standard_error[1] == 0.0
+    assert from_contributions(rows[:1]).standard_error.tolist() == [torch.inf, torch.inf]
 
 
 def test_standard_error_counts_pairs_as_one():
     """Draws a, a, b, b, ... know no more than a, b, ... do, twice as large; plain counting would say less."""
     once = torch.tensor([[1.0], [3.0], [2.0], [6.0]], dtype=DOUBLE)
-    twice = from_contributions(once.repeat_interleave(2, 0), group=2)
+    twice = from_contributions(group_sums(once.repeat_interleave(2, 0), 2))
     expected = from_contributions(2.0 * once)
     assert twice.value == expected.value and twice.standard_error == expected.standard_error
     with pytest.raises(ValueError, match="multiple of the group of 2, got 3"):
-        from_contributions(once[:3], group=2)
+        group_sums(once[:3], 2)
 
 
 @pytest.mark.parametrize(

@@ -1,31 +1,36 @@
-"""What a step's certificate doubts, what follows from it, and how it is told."""
+"""What an iteration's certificate doubts, what follows from it for each object's step, and how it is told."""
 
 import dataclasses
 import math
+from collections import Counter
 
 import pytest
+import scipy.stats
 import torch
 
+from neural_sim.gradient.base import Losses, ObjectImages, Probes
+from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import certify, line, untrusted
 from neural_sim.outer.retrained import Check, FiniteDifference
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.settings import Trust
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.lanczos import Spectrum
 from neural_sim.solver.solution import Solution, Status
+from neural_sim.types import SceneDraw
 
 SPECTRUM = Spectrum(-1.0, 9.0, 0.1, 0.1, 12, True)
 STRICT = Trust(max_stationarity=2.0, max_sensitivity=0.5, min_cosine=0.5)
 
 
-def result(
-    gradient=(1.0, -1.0), snr=((3.0, 0.2), (0.5, 0.4)), status=Status.CONVERGED, residual=0.01, **changes
-):
+def result(gradient=(1.0, -1.0), p_values=(0.01, 0.04), status=Status.CONVERGED, residual=0.01, **changes):
     names = ("a", "b")
     made = Hypergradient(
         psi_gradients={name: torch.tensor(gradient) for name in names},
         standard_errors={name: torch.ones(2) for name in names},
-        signal_to_noise={name: torch.tensor(row) for name, row in zip(names, snr, strict=True)},
+        p_values={name: {"pose": p} for name, p in zip(names, p_values, strict=True)},
         solution=Solution(torch.ones(3), status, 7, residual, (0.1, 9.0), 8, False),
         damping=Damped(3.0, SPECTRUM), sensitivity=0.2, stationarity=1.5, validation_norm=2.5, raises=1,
     )  # fmt: skip
@@ -37,18 +42,24 @@ def checked(cosine):
 
 
 def judge(found, cosine=None, trust=STRICT, on_untrusted="shrink"):
-    return certify(found, ("a", "b"), None if cosine is None else checked(cosine), trust, on_untrusted)
+    check = None if cosine is None else checked(cosine)
+    return certify(found, ("a", "b"), ("pose",), check, trust, on_untrusted)
+
+
+def actions(certificate):
+    return [certificate.actions[name]["pose"] for name in ("a", "b")]
 
 
 def test_a_good_step_is_kept_with_everything_recorded():
     certificate = judge(result(), cosine=0.8)
-    assert certificate.doubts == [] and certificate.action == "kept"
+    assert certificate.doubts == [] and actions(certificate) == ["kept", "kept"]
+    assert not certificate.stopped and not certificate.void
     assert (
         certificate.solver_status == "CONVERGED" and certificate.solver_steps == 7 and certificate.raises == 1
     )
     assert (certificate.curvature_min, certificate.curvature_max, certificate.damping) == (-1.0, 9.0, 3.0)
     assert certificate.condition == pytest.approx(12.0 / 2.0)
-    assert certificate.signal_to_noise == [pytest.approx([3.0, 0.2]), pytest.approx([0.5, 0.4])]
+    assert certificate.p_values == {"a": {"pose": 0.01}, "b": {"pose": 0.04}}
     assert (certificate.cosine, certificate.sensitivity, certificate.stationarity) == (0.8, 0.2, 1.5)
 
 
@@ -59,7 +70,6 @@ def test_a_good_step_is_kept_with_everything_recorded():
         (result(status=Status.NEGATIVE_CURVATURE), None, "solver"),
         (result(stationarity=2.1), None, "stationarity"),
         (result(sensitivity=0.6), None, "sensitivity"),
-        (result(snr=((0.9, 0.2), (0.5, 0.4))), None, "signal"),
         (result(), 0.4, "cosine"),
     ],
 )
@@ -67,11 +77,88 @@ def test_a_good_step_is_kept_with_everything_recorded():
     ("on_untrusted", "action"),
     [("shrink", "shrunk"), ("keep", "kept"), ("skip", "skipped"), ("stop", "stopped")],
 )
-def test_each_demand_is_doubted_by_name_and_handled_as_configured(found, cosine, doubt, on_untrusted, action):
+def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
+    found, cosine, doubt, on_untrusted, action
+):
     certificate = judge(found, cosine, on_untrusted=on_untrusted)
-    assert certificate.doubts == [doubt] and certificate.action == action
+    assert certificate.doubts == [doubt] and actions(certificate) == [action] * 2
+    assert certificate.stopped == (action == "stopped") and certificate.void == (action != "shrunk")
     free = Trust(None, None, None, None, None)
     assert judge(found, cosine, free).doubts == (["solver"] if doubt == "solver" else [])
+
+
+@pytest.mark.parametrize(
+    ("p_values", "on_untrusted", "expected"),
+    [
+        ((0.05, 0.051), "shrink", ["kept", "shrunk"]),
+        ((0.9, 0.001), "skip", ["skipped", "kept"]),
+        ((0.9, 0.001), "stop", ["skipped", "kept"]),
+        ((0.9, 0.2), "shrink", ["shrunk", "shrunk"]),
+        ((0.9, 0.2), "skip", ["skipped", "skipped"]),
+        ((0.9, 0.2), "stop", ["stopped", "stopped"]),
+    ],
+)
+def test_an_object_without_signal_holds_up_no_other(p_values, on_untrusted, expected):
+    """``stop`` ends the loop only where no object is left. What was skipped for want of signal joins the momentum."""
+    certificate = judge(result(p_values=p_values), on_untrusted=on_untrusted)
+    assert certificate.doubts == [] and actions(certificate) == expected
+    assert certificate.stopped == certificate.void == ("stopped" in expected)
+    assert actions(judge(result(p_values=p_values), trust=Trust(level=None))) == ["kept", "kept"]
+
+
+def test_each_factor_is_judged_by_itself():
+    found = result()
+    found.p_values["a"]["zoom"], found.p_values["b"]["zoom"] = 0.5, 0.02
+    certificate = certify(found, ("a", "b"), ("pose", "zoom"), None, STRICT, "skip")
+    assert certificate.actions == {
+        "a": {"pose": "kept", "zoom": "skipped"},
+        "b": {"pose": "kept", "zoom": "kept"},
+    }
+
+
+def test_only_objects_that_move_have_actions_and_what_was_not_tested_is_kept():
+    found = dataclasses.replace(result(), p_values={})
+    certificate = certify(found, ("b",), ("pose",), None, STRICT, "shrink")
+    assert certificate.actions == {"b": {"pose": "kept"}} and certificate.p_values == {}
+
+
+def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(generator):
+    """The default estimator's own p-values, 50 iterations: noise is kept with the probability that the level says."""
+    each, level, runs = 16, 0.05, 50
+    bins = torch.arange(8).repeat_interleave(each)
+    distribution = SceneDistribution.of([Pose()])
+    still = torch.zeros(len(bins))
+    batch = ObjectImages(
+        torch.zeros(8, dtype=torch.float64), distribution, torch.zeros(len(bins), 3, 1, 1), torch.arange(len(bins)),
+        torch.full((len(bins),), 1.0 / len(bins)), SceneDraw(still, still, still, bins[:, None]),
+    )  # fmt: skip
+
+    def scores_are_the_vector(params, index):
+        return params["w"][index]
+
+    losses = Losses(scores_are_the_vector, None, scores_are_the_vector)
+    params = {"w": torch.zeros(len(bins), dtype=torch.float64)}
+    names, kept = [f"noise {i}" for i in range(6)] + ["planted"], Counter()
+    for _ in range(runs):
+        noise = torch.randn(7, len(bins), generator=generator, dtype=torch.float64)
+        # Heavy tails, and bins that scatter up to four times as much as others.
+        noise = noise / torch.randn(2, 7, len(bins), generator=generator).norm(dim=0) * (1 + bins / 2)
+        noise[-1] += 30.0 * (bins == 2)
+        probes = {"pose": Probes(torch.arange(len(bins)), bins)}
+        estimates = [
+            StratifiedEstimator(each).estimate(losses, params, {"w": s}, batch, probes) for s in noise
+        ]
+        found = dataclasses.replace(
+            result(),
+            psi_gradients={name: part.value for name, part in zip(names, estimates, strict=True)},
+            p_values={name: part.p_values for name, part in zip(names, estimates, strict=True)},
+        )
+        certificate = certify(found, names, ("pose",), None, Trust(level=level), "shrink")
+        assert certificate.doubts == []
+        kept.update(name for name in names if certificate.actions[name]["pose"] == "kept")
+    wrongly = sum(kept[name] for name in names[:-1])
+    assert wrongly <= scipy.stats.binom.ppf(1 - 1e-4, 6 * runs, level)
+    assert kept["planted"] == runs
 
 
 def test_what_does_not_exist_is_not_doubted():
@@ -85,7 +172,8 @@ def test_a_gradient_that_is_not_finite_is_never_followed():
     actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
     for on_untrusted, action in actions.items():
         certificate = judge(result(gradient=(math.nan, 0.0)), on_untrusted=on_untrusted)
-        assert certificate.action == action and "not finite" in certificate.doubts
+        assert actions(certificate) == [action] * 2 and "not finite" in certificate.doubts
+        assert certificate.void
 
 
 def test_a_step_is_told_in_one_line():
@@ -95,20 +183,26 @@ def test_a_step_is_told_in_one_line():
         "psi 3/14",
         "CONVERGED 7 steps",
         "cond 6",
-        "snr 3.0/0.5",
+        "p pose 0.01/0.04",
         "cos 0.80",
-        "shrunk (stationarity)",
+        "shrunk 2 (stationarity)",
     ):
         assert part in text
+    assert line(judge(result(p_values=(0.3, 0.01))), 1, 2, 0.1).endswith("; shrunk 1, kept 1")
     assert "cos" not in line(judge(result()), 1, 2, 0.1)
 
 
 def test_steps_that_were_not_trusted_are_counted():
-    certificates = [judge(result(), 0.9), judge(result(stationarity=9.0), 0.1), judge(result(residual=0.5))]
+    certificates = [
+        judge(result(), 0.9),
+        judge(result(stationarity=9.0), 0.1),
+        judge(result(residual=0.5, p_values=(0.3, 0.01))),
+        judge(result(p_values=(0.3, 0.01)), on_untrusted="skip"),
+    ]
     records = [{"certificate": dataclasses.asdict(certificate)} for certificate in certificates]
     assert untrusted(records) == {
-        "steps": 3, "untrusted": 2, "actions": {"shrunk": 2},
-        "doubts": {"stationarity": 1, "cosine": 1, "residual": 1}, "cosines": [0.9, 0.1],
+        "steps": 8, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
+        "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1}, "cosines": [0.9, 0.1],
     }  # fmt: skip
     assert untrusted([])["untrusted"] == 0
 
@@ -119,6 +213,8 @@ def test_steps_that_were_not_trusted_are_counted():
         ({"max_residual": -1.0}, "outer.trust.max_residual"),
         ({"min_cosine": 2.0}, "outer.trust.min_cosine"),
         ({"shrink": 1.0}, "outer.trust.shrink"),
+        ({"level": 1.0}, "outer.trust.level"),
+        ({"level": 1e-6}, "outer.trust.level"),
     ],
 )
 def test_thresholds_that_make_no_sense_are_refused(changes, message):

@@ -140,9 +140,9 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
 )  # fmt: skip
 def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator):
     scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
-    generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"]).float()
+    generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
     detector = Detector(2, 32, **DETECTOR)
-    validation = join(scene.training_set(start, 3, generator, HARD))
+    validation = join(scene.training_set(start.float(), 3, generator, HARD))
     light_update = ProjectedGradient(shrink=False)
     settings = Outer(Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update)
     inner = InnerLoop(

@@ -9,6 +9,7 @@ import torch
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.inner import InnerLoop
@@ -35,7 +36,7 @@ TINY = {
 }  # fmt: skip
 MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48}
 PROXIMAL = 20.0  # past the negative curvature of an untrained detector
-NOTHING_WILL_DO = Trust(min_signal_to_noise=math.inf)
+NOTHING_WILL_DO = Trust(max_stationarity=0.0)
 
 
 def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
@@ -216,6 +217,10 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
     module.settings = dataclasses.replace(module.settings, update=Mirror(shrink=False))
     learned = learn_psi(module, progress=False)
     assert set(learned.records[0].probabilities) == {"pose", "zoom"}
+    certificate = learned.records[0].certificate
+    for name in ("a", "b"):
+        assert set(certificate.p_values[name]) == set(certificate.actions[name]) == {"pose", "zoom"}
+        assert all(0.0 < p <= 1.0 for p in certificate.p_values[name].values())
     assert all((part.abs().amax(-1) > 0.0).all() for part in joint.split(learned.last).values())
 
 
@@ -237,17 +242,47 @@ def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, act
     learned = learn_psi(
         _module(scene, estimator, 2, detector=MICRO, trust=NOTHING_WILL_DO, on_untrusted=action), False
     )
-    assert all("signal" in record.certificate.doubts for record in learned.records)
+    assert all(record.certificate.doubts == ["stationarity"] for record in learned.records)
     assert len(learned.records) == (1 if action == "stop" else 2)
     if action not in ("shrink", "keep"):
         assert not learned.last.any()
         return
     settings = {"trust": NOTHING_WILL_DO, "on_untrusted": action}
     one = learn_psi(_module(scene, estimator, 1, detector=MICRO, **settings), False).last
-    free = learn_psi(
-        _module(scene, estimator, 1, detector=MICRO, trust=Trust(None, None, None, None)), False
-    ).last
+    free = learn_psi(_module(scene, estimator, 1, detector=MICRO, trust=Trust(level=None)), False).last
     torch.testing.assert_close(one, (0.25 if action == "shrink" else 1.0) * free)
+
+
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """A derivative with p-values made up: object a has a signal in the poses, b in the zooms of the first iteration."""
+
+    draws = HARD
+    probes_per_bin = 0
+
+    def estimate(self, losses, params, vector, images, probes):
+        value = torch.tensor([1.0, -1.0, 0.0, 0.5, -0.5])
+        first = int(images.index[0]) == 0
+        return MixedDerivative(
+            value, 0.1 * value.abs(), {"pose": 0.01 if first else 0.5, "zoom": 0.5 if first else 0.01}
+        )
+
+
+@pytest.mark.parametrize(("on_untrusted", "part"), [("shrink", 0.25), ("skip", 0.0), ("stop", 0.0)])
+def test_a_step_without_signal_is_cut_for_its_object_and_factor_alone(scene, on_untrusted, part):
+    scene = dataclasses.replace(scene, distribution=SceneDistribution.of([Pose(bins=3), Zoom(bins=2)]))
+    psi = torch.zeros(2, 5)
+    free, cut = (
+        learn_psi(_module(scene, Told(), 2, detector=MICRO, psi=psi, **settings), False)
+        for settings in ({"trust": Trust(level=None)}, {"on_untrusted": on_untrusted})
+    )
+    assert [record.certificate.doubts for record in cut.records] == [[], []]
+    # The first step is free's, or a part of it; in the second psi, and with it the mirror's step, differ.
+    parts = torch.tensor([[1.0] * 3 + [part] * 2, [part] * 3 + [1.0] * 2], dtype=torch.float64)
+    assert bool((free.trajectory[1].abs().amax(0)[[0, 1, 3, 4]] > 0.0).all())
+    torch.testing.assert_close(cut.trajectory[1], parts * free.trajectory[1])
+    again = cut.trajectory[2] - cut.trajectory[1]
+    assert bool(again.abs()[parts == 1.0].amax() > 0.0) and (part > 0.0 or not again[parts == 0.0].any())
 
 
 @pytest.mark.parametrize(

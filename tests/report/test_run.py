@@ -23,8 +23,9 @@ def results():
         "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
-            "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "action": "shrunk",
-            "doubts": ["signal"], "signal_to_noise": [[0.1, 0.2, 0.3, float("inf")]] * 2,
+            "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "doubts": [],
+            "p_values": {"a": {"pose": 0.3}, "b": {"pose": 0.01}},
+            "actions": {"a": {"pose": "shrunk"}, "b": {"pose": "kept"}},
         },
     }  # fmt: skip
     scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"a": 0.6, "b": float("nan")}, "per_class_ap50": {}}
@@ -49,7 +50,7 @@ def test_results_are_json_by_the_standard(results, tmp_path):
 
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
-    trust = "untrusted psi steps: 2 of 2; shrunk 2; signal 2; cosine with retrained differences 0.90, 0.90"
+    trust = "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; cosine with retrained differences 0.90, 0.90"
     images = ("validation images, learned: 25.0", "without a box: 6")
     for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", *images, trust):
         assert word in text
@@ -85,6 +86,9 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
     assert "evaluate/ns/ap_b" not in run.data.metrics
     steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/pose/bin_1")
     assert [point.step for point in steps] == [0, 1]
+    for key, value in (("a/pose/trusted", 0.0), ("b/pose/trusted", 1.0), ("a/pose/p_value", 0.3)):
+        history = MlflowClient(uri).get_metric_history(run.info.run_id, f"psi/{key}")
+        assert [point.value for point in history] == [value] * 2
     assert [item.path for item in MlflowClient(uri).list_artifacts(run.info.run_id)] == ["results.json"]
 
 

@@ -6,7 +6,7 @@ No estimator knows of the implicit function theorem's minus sign; it is written 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -104,28 +104,27 @@ class MixedDerivative:
     """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
     ``standard_error`` is that of ``value`` over draws of the images (v held fixed); inf where it cannot be
-    told.
+    told. ``p_values``, by factor of psi, are those of the null that all components of that factor are zero, over the
+    same draws; none where nothing was tested.
     """
 
     value: Float[Tensor, "K"]
     standard_error: Float[Tensor, "K"]
-
-    @property
-    def signal_to_noise(self) -> Float[Tensor, "K"]:
-        """``|value| / standard_error`` per component; 0 where both vanish."""
-        ratio = self.value.abs() / self.standard_error
-        return torch.where(self.value == 0.0, torch.zeros_like(ratio), ratio)
+    p_values: Mapping[str, float] = field(default_factory=dict)
 
 
-def from_contributions(contributions: Float[Tensor, "n K"], group: int = 1) -> MixedDerivative:
-    """The sum of per-image contributions, and the standard error of that sum.
+def group_sums(contributions: Float[Tensor, "n K"], group: int) -> Float[Tensor, "groups K"]:
+    """Contributions of every ``group`` of consecutive images together.
 
-    Every ``group`` of consecutive images may depend on each other, groups may not. Raises ``ValueError`` for a
-    number of images that does not divide into groups.
+    Raises ``ValueError`` for a number of images that does not divide into groups.
     """
     if len(contributions) % group:
         raise ValueError(f"contributions: want a multiple of the group of {group}, got {len(contributions)}")
-    sums = contributions.unflatten(0, (-1, group)).sum(1)
+    return contributions.unflatten(0, (-1, group)).sum(1)
+
+
+def from_contributions(sums: Float[Tensor, "n K"]) -> MixedDerivative:
+    """The sum of independent contributions, those of an image or a group of images, and its standard error."""
     value, count = sums.sum(0), len(sums)
     if count < 2:
         return MixedDerivative(value, torch.full_like(value, torch.inf))

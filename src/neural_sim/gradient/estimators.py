@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, get_args
 
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
+from neural_sim.gradient.significance import no_association, zero_mean
 from neural_sim.gradient.stratified import by_strata
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.product import Factor, SceneDistribution
 from neural_sim.synthesis.scene import HardDraws
+from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -46,20 +52,26 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+
+        The null of its significance is that a factor's bins, or lights, have one mean score: the derivative is zero.
+        """
         distribution = images.distribution
         if losses.probes is None or set(probes) != set(distribution.names):
             raise ValueError(
                 f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
             )
-        share, psi, parts = float(images.weights.sum()), distribution.split(images.psi), {}
+        share, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
         for factor in distribution.factors:
             held = probes[factor.name]
             along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            parts[factor.name] = by_strata(along.to(images.psi), held.bins, factor, psi[factor.name], share)
+            along = along.to(images.psi)
+            parts[factor.name] = by_strata(along, held.bins, factor, psi[factor.name], share)
+            p_values[factor.name] = _told_apart(along, held.bins, factor)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
+            p_values,
         )
 
 
@@ -79,14 +91,38 @@ class ReinforceEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
-        along = scores(losses.cached, params, vector, images.index, self.chunk_size)
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+
+        The null of its significance is that scores do not depend on the bins, or lights, that a factor drew.
+        """
+        along = scores(losses.cached, params, vector, images.index, self.chunk_size).to(images.psi)
         share = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:
             return images.distribution.log_prob(psi, images.draw)
 
-        return reinforce(along.to(images.psi), log_prob, images.psi, share)
+        drawn = _drawn(images.distribution, images.draw)
+        p_values = {name: no_association(along, values) for name, values in drawn.items()}
+        return replace(reinforce(along, log_prob, images.psi, share), p_values=p_values)
+
+
+def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
+    """p-value of the null that all bins have one mean score; of lights, under which the same scenes are seen one light
+    after the other, that a scene's scores differ by nothing but chance."""
+    if isinstance(factor, BinnedFactor):
+        return no_association(scores, one_hot(strata, factor.size))
+    scenes = scores.view(factor.size, -1).T
+    return zero_mean(scenes - scenes.mean(-1, keepdim=True))
+
+
+def _drawn(distribution: SceneDistribution, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
+    """What each factor drew, as the sufficient statistics of its psi: the bin as a row of zeros and a one, or the light
+    as it was before its projection, apart from what the constraint takes back."""
+    found = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(distribution.binned)}
+    light, explored = distribution.light, draw.explored
+    if light is not None and explored is not None:
+        found[light.name] = explored - explored.mean(-1, keepdim=True)
+    return found
 
 
 Estimator = PathwiseEstimator | StratifiedEstimator | ReinforceEstimator

@@ -102,12 +102,13 @@ class Hypergradient:
     ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
     ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
     unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
-    ``seconds`` by phase: validation, solve, mixed. ``raises`` counts how often lambda had to be raised.
+    ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve, mixed.
+    ``raises`` counts how often lambda had to be raised.
     """
 
     psi_gradients: dict[str, Float[Tensor, "k"]]
     standard_errors: dict[str, Float[Tensor, "k"]]
-    signal_to_noise: dict[str, Float[Tensor, "k"]]
+    p_values: dict[str, Mapping[str, float]]
     solution: Solution
     damping: Damped
     sensitivity: float
@@ -157,7 +158,7 @@ def hypergradient(
         # The one minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
         psi_gradients={name: -part.value for name, part in mixed.items()},
         standard_errors={name: part.standard_error for name, part in mixed.items()},
-        signal_to_noise={name: part.signal_to_noise for name, part in mixed.items()},
+        p_values={name: part.p_values for name, part in mixed.items()},
         solution=adjoint.solution,
         damping=adjoint.damping,
         sensitivity=sensitivity,

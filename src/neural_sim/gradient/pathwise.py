@@ -10,7 +10,7 @@ are contracted with them. Either way the chain from psi to the draw is walked on
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
 import torch
@@ -27,8 +27,10 @@ from neural_sim.gradient.base import (
     Probes,
     RenderedPath,
     from_contributions,
+    group_sums,
 )
 from neural_sim.gradient.mixed import ThetaMode, input_cotangents
+from neural_sim.gradient.significance import zero_mean
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.product import COORDINATES
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
@@ -100,7 +102,8 @@ class PathwiseEstimator:
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
-        Tangents that came with the images are used whatever the mode. Raises ``ValueError`` for images without a path.
+        Tangents that came with the images are used whatever the mode. The significance is that of
+        :func:`significance.zero_mean` for the groups' contributions. Raises ``ValueError`` for images without a path.
         """
         path = images.path
         if path is None:
@@ -119,7 +122,11 @@ class PathwiseEstimator:
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         # From here on a few numbers an image, on the CPU as psi and the draws are.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
-        return from_contributions(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
+        sums = group_sums(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
+        # What is common to a factor's components moves no distribution, and no weights of lights.
+        parts = images.distribution.split(sums).items()
+        p_values = {name: zero_mean(part - part.mean(-1, keepdim=True)) for name, part in parts}
+        return replace(from_contributions(sums), p_values=p_values)
 
 
 def map_cotangents(

@@ -1,4 +1,8 @@
-"""How far each psi step may be trusted: what its hypergradient was worth, what speaks against it, what was done."""
+"""How far each psi step may be trusted: what its hypergradient was worth, what speaks against it, what was done.
+
+An iteration makes one step for each object and each factor of psi. Doubts about the solve, or about the hypergradient
+as a whole, are about all of them; whether a derivative can be told from zero is asked of each.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +23,22 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 }  # fmt: skip
 
 
+Actions = dict[str, dict[str, Action]]
+"""What became of the steps, by object and factor."""
+
+
 @dataclass(frozen=True)
 class Certificate:
-    """What is known of one step's hypergradient.
+    """What is known of one iteration's hypergradient.
 
     ``stationarity`` is ``|dL_train/dtheta|`` and ``validation_norm`` ``|dL_val/dtheta|``. ``curvature_min`` and
     ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` that of the damped one (nan
     where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the hypergradient's
-    relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``signal_to_noise`` has one number
-    for each psi component, object by object. ``cosine`` is with a retrained finite difference, nan where none was
-    made. ``doubts`` names what failed; none means trusted.
+    relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with a retrained finite
+    difference, nan where none was made. ``doubts`` names what speaks against all steps. ``p_values``, by object and
+    factor, are those of the null that this iteration's derivative is zero; the step follows its average with those of
+    earlier iterations. ``actions`` has the objects whose psi moves; a step without doubt and with a significant
+    derivative is kept.
     """
 
     stationarity: float
@@ -42,21 +52,45 @@ class Certificate:
     curvature_max: float
     condition: float
     sensitivity: float
-    signal_to_noise: list[list[float]]
     cosine: float
     doubts: list[str]
-    action: Action
+    p_values: dict[str, dict[str, float]]
+    actions: Actions
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the loop ends here."""
+        return any(action == "stopped" for held in self.actions.values() for action in held.values())
+
+    @property
+    def void(self) -> bool:
+        """Whether nothing of this iteration is followed, not even later through the momentum."""
+        done = {action for held in self.actions.values() for action in held.values()}
+        return self.stopped or (bool(self.doubts) and "shrunk" not in done)
 
 
 def certify(
-    result: Hypergradient, names: Sequence[str], check: Check | None, trust: Trust, on_untrusted: OnUntrusted
+    result: Hypergradient,
+    names: Sequence[str],
+    factors: Sequence[str],
+    check: Check | None,
+    trust: Trust,
+    on_untrusted: OnUntrusted,
 ) -> Certificate:
-    """Judge a step's hypergradient; ``names`` orders the objects. No step follows a gradient that is not finite."""
+    """Judge an iteration's hypergradient; ``names`` are the objects whose psi moves, ``factors`` those of psi.
+
+    No step follows a gradient that is not finite. A step is without signal where its p-value is above ``trust.level``;
+    where nothing was tested, nothing speaks against it.
+    """
     finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())
     found = _doubts(result, check, trust) + ([] if finite else ["not finite"])
-    action: Action = "kept" if not found else _ACTIONS[on_untrusted]
-    if not finite and action in ("shrunk", "kept"):
-        action = "skipped"
+    if found:
+        action = _ACTIONS[on_untrusted]
+        if not finite and action in ("shrunk", "kept"):
+            action = "skipped"
+        actions: Actions = {name: dict.fromkeys(factors, action) for name in names}
+    else:
+        actions = _by_signal(result.p_values, names, factors, trust.level, on_untrusted)
     spectrum, solution = result.damping.spectrum, result.solution
     return Certificate(
         stationarity=result.stationarity,
@@ -70,26 +104,44 @@ def certify(
         curvature_max=spectrum.largest if spectrum else math.nan,
         condition=result.damping.condition,
         sensitivity=result.sensitivity,
-        signal_to_noise=[result.signal_to_noise[name].tolist() for name in names],
         cosine=check.cosine if check else math.nan,
         doubts=found,
-        action=action,
+        p_values={name: dict(found) for name, found in result.p_values.items()},
+        actions=actions,
     )
 
 
+def _by_signal(
+    p_values: Mapping[str, Mapping[str, float]],
+    names: Sequence[str],
+    factors: Sequence[str],
+    level: float | None,
+    on_untrusted: OnUntrusted,
+) -> Actions:
+    """Steps kept where there is signal. An object at its optimum has none, and is no reason to stop the others:
+    ``stop`` skips its step, and ends the loop where no step is left."""
+    otherwise: Action = "shrunk" if on_untrusted == "shrink" else "skipped"
+    limit = math.inf if level is None else level
+    actions: Actions = {
+        name: {f: "kept" if p_values.get(name, {}).get(f, 0.0) <= limit else otherwise for f in factors}
+        for name in names
+    }
+    if on_untrusted == "stop" and not any("kept" in held.values() for held in actions.values()):
+        return {name: dict.fromkeys(factors, "stopped") for name in names}
+    return actions
+
+
 def _doubts(result: Hypergradient, check: Check | None, trust: Trust) -> list[str]:
-    """Names of the demands that the hypergradient fails; a number that does not exist fails none."""
+    """Names of the demands on all steps that the hypergradient fails; a number that does not exist fails none."""
     solution = result.solution
     # An approximation that was never iterated (solver=identity) was asked for knowing its residual.
     residual = 0.0 if solution.status is Status.APPROXIMATE else solution.residual
-    signal = max((float(snr.max()) for snr in result.signal_to_noise.values()), default=math.inf)
     cosine = check.cosine if check else math.nan
     failed = {
         "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE, Status.DIVERGED),
         "residual": _above(residual, trust.max_residual),
         "stationarity": _above(result.stationarity, trust.max_stationarity),
         "sensitivity": _above(result.sensitivity, trust.max_sensitivity),
-        "signal": _above(-signal, None if trust.min_signal_to_noise is None else -trust.min_signal_to_noise),
         "cosine": _above(-cosine, None if trust.min_cosine is None else -trust.min_cosine),
     }
     return [name for name, holds in failed.items() if holds]
@@ -100,30 +152,39 @@ def _above(value: float, limit: float | None) -> bool:
 
 
 def line(certificate: Certificate, iteration: int, iterations: int, validation_loss: float) -> str:
-    """One line for the log. Signal-to-noise: the best component of each object."""
+    """One line for the log, p-values by factor, object by object."""
     c = certificate
-    best = "/".join(f"{max(row):.1f}" for row in c.signal_to_noise)
+    tested = {factor: [p[factor] for p in c.p_values.values()] for p in c.p_values.values() for factor in p}
+    done = Counter(action for held in c.actions.values() for action in held.values())
     parts = [
         f"psi {iteration}/{iterations} val {validation_loss:.4f}",
         f"|dtrain| {c.stationarity:.2g} |dval| {c.validation_norm:.2g}",
         f"{c.solver_status} {c.solver_steps} steps res {c.solver_residual:.1g}",
         f"H [{c.curvature_min:.2g}, {c.curvature_max:.3g}] lambda {c.damping:.2g} cond {c.condition:.3g}",
         *([] if math.isnan(c.sensitivity) else [f"2 lambda {c.sensitivity:.0%}"]),
-        f"snr {best}",
+        *(f"p {factor} {'/'.join(f'{p:.2g}' for p in found)}" for factor, found in tested.items()),
         *([] if math.isnan(c.cosine) else [f"cos {c.cosine:.2f}"]),
-        c.action if not c.doubts else f"{c.action} ({', '.join(c.doubts)})",
+        ", ".join(f"{action} {count}" for action, count in done.items())
+        + (f" ({', '.join(c.doubts)})" if c.doubts else ""),
     ]
     return "; ".join(parts)
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How many of the recorded steps were not trusted, why, what was done, and every cosine that was measured."""
+    """How many of the recorded steps, one for each object and factor of an iteration, were not trusted, what was done,
+    and why: doubts about all, or no signal. And every cosine that was measured."""
     held = [record["certificate"] for record in records if record["certificate"]]
-    doubted = [certificate for certificate in held if certificate["doubts"]]
+    actions = [
+        (action, certificate["doubts"] or ["signal"])
+        for certificate in held
+        for by_factor in certificate["actions"].values()
+        for action in by_factor.values()
+    ]
+    doubted = [(action, doubts) for action, doubts in actions if action != "kept"]
     return {
-        "steps": len(held),
+        "steps": len(actions),
         "untrusted": len(doubted),
-        "actions": dict(Counter(certificate["action"] for certificate in doubted)),
-        "doubts": dict(Counter(doubt for certificate in doubted for doubt in certificate["doubts"])),
+        "actions": dict(Counter(action for action, _ in doubted)),
+        "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),
         "cosines": [c["cosine"] for c in held if not math.isnan(c["cosine"])],
     }

@@ -67,9 +67,9 @@ class SimulatorModule(OuterLoop):
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
         with timed(seconds, "certify", self.inner.device):
             check = self._check(result)
-        certificate = certify(
-            result, self.scene.names, check, self.settings.trust, self.settings.on_untrusted
-        )
+        moving = [self.scene.names[label] for label in self._learned]
+        factors = self.scene.distribution.names
+        certificate = certify(result, moving, factors, check, self.settings.trust, self.settings.on_untrusted)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
         self.record(self.psi, images, training_loss, seconds, certificate, norms, _products(result))
         self._move(result, certificate)
@@ -79,9 +79,12 @@ class SimulatorModule(OuterLoop):
         return -1 if self._stopped else None
 
     def _move(self, result: Hypergradient, certificate: Certificate) -> None:
-        """psi's step, or what its certificate leaves of it."""
-        self._stopped = certificate.action == "stopped"
-        if certificate.action in ("skipped", "stopped"):
+        """psi's step, or what its certificate leaves of it.
+
+        A derivative without signal joins the momentum nevertheless: the average of several may tell what each does not.
+        """
+        self._stopped = certificate.stopped
+        if certificate.void:
             return
         names = [self.scene.names[i] for i in self._learned]
         gradient, error = (
@@ -90,14 +93,14 @@ class SimulatorModule(OuterLoop):
         )
         distribution, before = self.scene.distribution, self.psi[self._learned]
         psi, slope, noise = (distribution.split(values) for values in (before, gradient, error))
-        moved = {}
+        moved, parts = {}, {"kept": 1.0, "shrunk": self.settings.trust.shrink, "skipped": 0.0}
         for factor in distribution.factors:
             held = psi[factor.name], slope[factor.name], noise[factor.name], self._update_states[factor.name]
-            moved[factor.name], self._update_states[factor.name] = self._step(factor, *held)
+            after, self._update_states[factor.name] = self._step(factor, *held)
+            left = [parts[certificate.actions[name][factor.name]] for name in names]
+            moved[factor.name] = held[0] + after.new_tensor(left)[:, None] * (after - held[0])
         done = (len(self.records) - 1) / max(1, self.settings.iterations - 1)
         part = 1.0 + done * (self.settings.final_step - 1.0)
-        if certificate.action == "shrunk":
-            part *= self.settings.trust.shrink
         self.psi.data[self._learned] = before + part * (distribution.join(moved) - before)
 
     def _step(
@@ -150,7 +153,6 @@ class SimulatorModule(OuterLoop):
             result,
             psi_gradients={**zeros, **result.psi_gradients},
             standard_errors={**zeros, **result.standard_errors},
-            signal_to_noise={**zeros, **result.signal_to_noise},
         )
 
     def _bind(self, losses: Losses, held: ObjectImages, probes: dict[str, Probes]) -> Callable:

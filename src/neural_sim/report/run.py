@@ -151,8 +151,8 @@ def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _trust_line(held: Mapping[str, Any]) -> str:
-    """How many psi steps were not trusted, why, and what became of them."""
-    text = f"untrusted psi steps: {held['untrusted']} of {held['steps']}"
+    """How many psi steps of objects and factors were not trusted, why, and what became of them."""
+    text = f"untrusted psi steps of objects: {held['untrusted']} of {held['steps']}"
     for part in ("actions", "doubts"):
         if held[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in held[part].items())

@@ -59,8 +59,10 @@ def _series(results: RunResults) -> dict[str, list[float]]:
                 series.setdefault(f"psi/{name}/{factor}/entropy", []).append(record["entropies"][factor][i])
             if record["certificate"]:
                 series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
-                for b, ratio in enumerate(record["certificate"]["signal_to_noise"][i]):
-                    series.setdefault(f"psi/{name}/signal_to_noise_{b + 1}", []).append(ratio)
+                for factor, p_value in record["certificate"]["p_values"].get(name, {}).items():
+                    series.setdefault(f"psi/{name}/{factor}/p_value", []).append(p_value)
+                for factor, action in record["certificate"]["actions"].get(name, {}).items():
+                    series.setdefault(f"psi/{name}/{factor}/trusted", []).append(float(action == "kept"))
         for key in ("validation_loss", "training_loss", "images", "detector_steps", "products"):
             series.setdefault(f"psi/{key}", []).append(record[key])
         for key in _CERTIFIED if record["certificate"] else ():

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neural_sim.gradient.reinforce import reinforce
+from neural_sim.gradient.significance import no_association, zero_mean
 from neural_sim.gradient.stratified import allocate, importance_weights, stratified
 from neural_sim.parameter import bins as binned
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
@@ -75,6 +76,35 @@ def score_scales(scope: Scope) -> Checks:
         found = stratified(scores + offset, bins, psi, _floored)
         bound = 2 * len(bins) * eps(DOUBLE) * offset * float(p.max())
         yield Check(f"offset of {offset:g}", float((found.value - plain.value).abs().max()), bound)
+
+
+@case
+def significance(scope: Scope) -> Checks:
+    """p-values in another unit, by powers of two: no digit changes. Scores that are all equal, one image, one row other
+    than zero, numbers that are not finite: 1, nothing is told. Bins of one image each: every permutation has the same
+    statistic, and the p-value is 1.
+    """
+    bins = torch.eye(BINS, dtype=DOUBLE).repeat_interleave(EACH, 0)
+    scores = torch.randn(len(bins), generator=scope.generator(), dtype=DOUBLE)
+    rows = torch.randn(len(bins), BINS, generator=scope.generator(), dtype=DOUBLE)
+    told, tilted = no_association(scores + bins[:, 0], bins), zero_mean(rows + 0.3)
+    for power in (-1000, -400, 400, 1000):
+        change = abs(no_association((scores + bins[:, 0]) * 2.0**power, bins) - told)
+        yield Check(f"association in units of 2^{power}", change, 0.0)
+        yield Check(f"mean in units of 2^{power}", abs(zero_mean((rows + 0.3) * 2.0**power) - tilted), 0.0)
+    lone = torch.eye(BINS, dtype=DOUBLE)[:, :1] * rows[:1]
+    nothing = {
+        "equal scores": no_association(torch.full_like(scores, 0.1), bins),
+        "one bin drawn": no_association(scores, torch.ones_like(bins)),
+        "one image": no_association(scores[:1], bins[:1]),
+        "an image a bin": no_association(scores[:BINS], bins[::EACH]),
+        "a score of NaN": no_association(scores.clone().index_fill_(0, torch.tensor(0), math.nan), bins),
+        "no rows but zeros": zero_mean(torch.zeros_like(rows)),
+        "one row beside zeros": zero_mean(lone),
+        "a row of inf": zero_mean(rows.clone().index_fill_(0, torch.tensor(0), math.inf)),
+    }
+    for name, p_value in nothing.items():
+        yield Check(f"p-value below 1: {name}", 1.0 - p_value, 0.0)
 
 
 @case

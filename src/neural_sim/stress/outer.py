@@ -204,7 +204,7 @@ def loop(scope: Scope) -> Checks:
         learned = learn_psi(_module(Constant(value), choice, iterations, scope), progress=False)
         moved = float(learned.last.abs().max())
         certificate = learned.records[0].certificate
-        status = certificate.action if certificate else ""
+        status = certificate.actions["x"]["pose"] if certificate else ""
         wanted = (actions[choice],) if not math.isfinite(value) else ()
         bound = iterations * MAX_STEP * (1 + 4 * eps(DOUBLE)) if value == 1e30 else 0.0
         yield Check(f"psi moved: estimate {value:g}, {choice}", moved, bound, status, wanted)

@@ -1,0 +1,97 @@
+"""Whether a derivative can be told from zero: p-values for all components of one factor of psi together.
+
+The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2`` of per-image contributions c to the derivative. Every
+component is divided by a variance of its own, so that bins whose scores scatter more, and rare bins, weigh no more than
+others; an image alone in its bin adds about 1 to Q whatever its score. Q's distribution under the null is not looked up
+but made from the data, by changing them at random in ways that the null allows. The p-value is the part of the changed
+data, and the data themselves, whose Q is at least the data's. The level is exact, whatever the scores' law, where the
+changes leave that law as it is (Phipson and Smyth 2010). The random changes are the same in every call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+DRAWS = 999
+"""Random changes of the data; with the data themselves the p-values are multiples of ``SMALLEST``."""
+SMALLEST = 1.0 / (DRAWS + 1)
+_BLOCK = 250
+# Changed data that are the data again, or their mirror image, have the same Q up to rounding and must count.
+_TIE = 1.0 - 1e-9
+
+
+def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
+    """p-value of the null that independent ``rows`` have mean zero, by random changes of their signs.
+
+    Exact for rows symmetric about zero, whatever their tails, their variances and the dependence between their
+    components. Rows of zeros tell nothing: with m others the p-value is at least about 2^(1 - m). 1 for rows that are
+    not finite.
+    """
+    rows = _scaled(rows.double())
+    if not bool(rows.any()):
+        return 1.0
+    squares = rows.square().sum(0)
+
+    def changed(count: int, generator: torch.Generator) -> Tensor:
+        signs = torch.randint(2, (count, len(rows)), generator=generator).double() * 2.0 - 1.0
+        return _statistic(signs @ rows, squares)
+
+    return _p_value(_statistic(rows.sum(0), squares), changed, draws)
+
+
+def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
+    """p-value of the null that the images' ``scores`` have the same mean whatever was ``drawn`` for them (the bin as a
+    row of zeros and a one, or numbers), by random changes of the contributions ``(s_i - mean s)(d_i - mean d)``.
+
+    The larger of two p-values, so that the level holds where either does. Scores permuted over the images: exact where
+    scores do not depend on what was drawn, for any law of the scores, any skewness and any number of images. Signs
+    changed (:func:`zero_mean`): bins whose scores scatter differently, for scores that scatter symmetrically.
+    Asymptotically each holds without its condition (Chung and Romano 2013, for permutations of such a statistic). 1
+    for numbers that are not finite.
+    """
+    residuals, drawn = _centred(scores.double()), _centred(drawn.double())
+    flipped = zero_mean(residuals[:, None] * drawn, draws)
+    if flipped == 1.0:
+        return 1.0
+    squared = drawn.square()
+
+    def changed(count: int, generator: torch.Generator) -> Tensor:
+        order = torch.rand(count, len(residuals), generator=generator, dtype=torch.float64).argsort(1)
+        permuted = residuals[order]
+        return _statistic(permuted @ drawn, permuted.square() @ squared)
+
+    own = _statistic(residuals @ drawn, residuals.square() @ squared)
+    return max(flipped, _p_value(own, changed, draws))
+
+
+def _p_value(own: Tensor, changed: Callable[[int, torch.Generator], Tensor], draws: int) -> float:
+    generator, beyond = torch.Generator().manual_seed(0), 1
+    for first in range(0, draws, _BLOCK):
+        beyond += int((changed(min(_BLOCK, draws - first), generator) >= own * _TIE).sum())
+    return beyond / (draws + 1)
+
+
+def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "*d k"]) -> Float[Tensor, "*d"]:
+    """Q; a component to which nothing contributes adds 0."""
+    ratio = sums.square() / torch.where(squares > 0.0, squares, 1.0)
+    return torch.where(squares > 0.0, ratio, 0.0).sum(-1)
+
+
+def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
+    """Values without their mean, in a unit of their own. What all share is taken out first: equal values give exactly
+    0, not the rounding of a sum."""
+    apart = values - values[:1]
+    return _scaled(apart - apart.mean(0))
+
+
+def _scaled(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
+    """Each component over its largest absolute value, so that no square over- or underflows; zeros where a value is not
+    finite."""
+    if not bool(values.isfinite().all()):
+        return torch.zeros_like(values)
+    largest = values.abs().amax(0, keepdim=True)
+    return values / torch.where(largest > 0.0, largest, 1.0)
