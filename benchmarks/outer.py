@@ -31,7 +31,7 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.synthesis.scene import Scene, join
 
 SMALL_FIELDS = [
-    "scale=quick", "progress=false", "views.count=56", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",
+    "scale=quick", "progress=false", "views.count=40", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",
     "budget.grid.prune_steps=[60]",
 ]  # fmt: skip
 PHASES = ("render", "probes", "features", "train", "validation", "solve", "mixed", "rest")

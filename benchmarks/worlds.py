@@ -15,7 +15,7 @@ from neural_sim.outer.still import StillLoop, centred
 from neural_sim.synthesis.scene import join
 
 SMALL = [
-    "scale=quick", "progress=false", "training.image_size=64", "views.count=84",
+    "scale=quick", "progress=false", "training.image_size=64", "views.count=68",
     "budget.grid.steps=160", "budget.grid.refine_steps=[50]", "budget.grid.prune_steps=[110]",
     "target.val_per_object=50", "target.test_per_object=1", "target.test_per_biased_object=1",
 ]  # fmt: skip

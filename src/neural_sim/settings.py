@@ -31,10 +31,10 @@ def _at_least(where: str, smallest: float, **values: float) -> None:
 
 @dataclass(frozen=True)
 class Views:
-    """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Sec. 4).
+    """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Secs. 4 and B.2).
 
-    ``image_size`` in pixels, ``distance_range`` in object radii; the last ``held_out`` views are never trained on.
-    ``lights`` vary over the views; None: one fixed light.
+    ``count`` views are trained on; ``held_out`` more, the last, only score the field. ``image_size`` in pixels,
+    ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
     """
 
     count: int = 100
@@ -57,9 +57,7 @@ class Views:
                 f"views.distance_range must be ordered and above 1 radius, got {self.distance_range}"
             )
         if self.lights is not None:
-            self.lights.weights(
-                self.count - self.held_out, torch.Generator()
-            )  # each anchor lights a trained view
+            self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
 
     def camera(self, image_size: int) -> PinholeCamera:
         """The square camera of this field of view."""
@@ -71,14 +69,14 @@ class Views:
         return self.lights.rig if self.lights is not None else None
 
     def render(self, renderer: MeshRenderer, item: ObjectMesh) -> PosedViews:
-        """All views of one object; equal seeds give equal poses and lights whatever the object."""
-        generator = torch.Generator().manual_seed(self.seed)
-        uniform = torch.rand((3, self.count), generator=generator)
+        """All views of one object, those held out last; equal seeds give equal poses and lights whatever the object."""
+        generator, total = torch.Generator().manual_seed(self.seed), self.count + self.held_out
+        uniform = torch.rand((3, total), generator=generator)
         near, far = self.distance_range
         poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], near + (far - near) * uniform[2])
         rig = weights = None
         if self.lights is not None:
-            rig, weights = self.lights.rig, self.lights.weights(self.count, generator)
+            rig, weights = self.lights.rig, self.lights.weights(total, generator)
         return render_views(renderer, item, self.camera(self.image_size), poses, rig, weights)
 
 

@@ -4,10 +4,20 @@ import pytest
 import torch
 from torch.func import grad, jvp, vjp
 
+COARSER = {
+    "strides": (8, 16, 32, 64),
+    "anchor_sizes": ((8, 12), (16, 24), (32, 40), (64, 80)),
+    "normalisation": "none",
+}
 
-@pytest.fixture
-def problem(tools, generator, images):
-    detector = tools.detector()
+
+@pytest.fixture(params=[{}, COARSER], ids=["two levels", "coarser levels"])
+def problem(request, tools, generator, images):
+    return make_problem(tools, generator, images, **request.param)
+
+
+def make_problem(tools, generator, images, **changes):
+    detector = tools.detector(**changes)
     params = tools.noisy(detector.init(generator), generator)
     backbone, trainable = detector.split(params)
     targets = detector.assign(images.boxes, images.labels)
@@ -49,6 +59,14 @@ def test_forward_and_reverse_mode_agree(problem):
 
 
 def test_hessian_is_symmetric_and_the_same_in_both_modes(problem):
+    check_modes(problem)
+
+
+def test_both_modes_pass_relu_and_l1(tools, generator, images):
+    check_modes(make_problem(tools, generator, images, **COARSER, activation="relu", box_loss="l1"))
+
+
+def check_modes(problem):
     detector, _, trainable, features, targets = problem
     gradient = grad(lambda p: detector.loss(p, features, targets))
     u, v = direction(trainable, 2), direction(trainable, 3)

@@ -125,6 +125,11 @@ def test_weights_from_a_file_reach_the_features(tools, generator, tmp_path):
         tools.detector(architecture="resnet18", weights=str(tmp_path / "wrong.pth"))
 
 
+def test_anchors_without_a_reference_are_pixels(tools):
+    small, large = tools.detector(), tools.detector(image_size=64, anchor_reference=None)
+    assert torch.equal(small.anchors[:2], large.anchors[:2])
+
+
 def test_init_depends_on_the_seed_alone(tools):
     detector = tools.detector()
     first = detector.init(torch.Generator().manual_seed(1))
@@ -157,6 +162,12 @@ def test_default_tiny_is_small(generator):
         ({"activation": "tanh"}, "detector.activation"),
         ({"box_loss": "huber"}, "detector.box_loss"),
         ({"strides": (8, 32)}, "detector.strides"),
+        ({"strides": (16, 8)}, "detector.strides"),
+        ({"strides": (8, 16, 64), "anchor_sizes": ((8,),) * 3}, "detector.strides"),
+        ({"strides": (32, 64), "architecture": "tiny"}, "detector.strides"),
+        ({"freeze_backbone": True}, "detector.freeze_backbone"),
+        ({"normalisation": "batch"}, "detector.normalisation"),
+        ({"anchor_reference": 0}, "detector.anchor_reference"),
         ({"anchor_sizes": ((8,),)}, "detector.anchor_sizes"),
         ({"anchor_sizes": ((8,), (16, 24))}, "detector.anchor_sizes"),
         ({"weights": "DEFAULT"}, "detector.weights"),

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torchvision.models import resnet18
 
 from neural_sim.detector.cached import CachedSet, cached_features
 from neural_sim.detector.module import DetectorModule
@@ -133,3 +134,20 @@ def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
     assert distance(100.0) < 0.1 * distance(1.0) < 0.1 * distance(0.0)
     with pytest.raises(ValueError, match="anchor"):
         train(detector, start, images, proximal=1.0)
+
+
+def test_a_detector_may_keep_its_weights_in_every_training(tools, generator, images, tmp_path):
+    torch.manual_seed(0)
+    torch.save(resnet18().state_dict(), tmp_path / "resnet18.pth")
+    settings = {"architecture": "resnet18", "weights": str(tmp_path / "resnet18.pth")}
+    detector = tools.detector(**settings, freeze_backbone=True)
+    start = detector.init(generator)
+    backbone, trainable = detector.split(start)
+    assert set(detector.learnable(start)) == set(trainable)
+    trained, history = train(detector, start, images)
+    assert all(torch.equal(trained[name], value) for name, value in backbone.items())
+    assert not any(torch.equal(trained[name], value) for name, value in trainable.items())
+    on_features, same = train(detector, start, CachedSet.of(detector, backbone, images))
+    assert history == same and all(torch.equal(trained[name], on_features[name]) for name in start)
+    free = tools.detector(**settings)
+    assert any("backbone" in name for name in free.learnable(start))

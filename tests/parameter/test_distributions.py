@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neural_sim.parameter.distributions import distribution, total_variation
+from neural_sim.parameter.distributions import distribution, merged, total_variation
 
 
 def test_dominant_is_the_papers():
@@ -32,6 +32,14 @@ def test_every_count_of_bins_gives_a_distribution(bins):
 def test_bad_specifications_are_refused_with_their_place(bad):
     with pytest.raises(ValueError, match="here"):
         distribution(bad, 8, "here")
+
+
+def test_bins_that_are_one_count_together():
+    p = torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.25, 0.25, 0.25, 0.25]])
+    torch.testing.assert_close(
+        merged(p, [[1, 4], [2], [3]]), torch.tensor([[0.5, 0.2, 0.3], [0.5, 0.25, 0.25]])
+    )
+    assert torch.equal(merged(p, [[1], [2], [3], [4]]), p)
 
 
 def test_total_variation():

@@ -23,7 +23,7 @@ def test_nerf_w_brings_varied_light_and_fields_with_codes():
     fitting = made.field.fitting(made.field.field())
     assert isinstance(fitting, AppearanceFitting) and isinstance(fitting.field, AppearanceField)
     assert fitting.grid.resolution == 64  # the scale's
-    weights = made.views.lights.weights(made.views.count - made.views.held_out, torch.Generator())
+    weights = made.views.lights.weights(made.views.count, torch.Generator())
     assert ((weights == 1.0).sum(0) >= 2).all()
 
 

@@ -8,6 +8,7 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.report import tracking
+from neural_sim.report.figures import psi_figure
 from neural_sim.report.run import RunResults, write_figures, write_results
 from neural_sim.report.run_tracking import track
 from neural_sim.types import LabelledImages
@@ -46,6 +47,21 @@ def test_results_are_json_by_the_standard(results, tmp_path):
     assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
     assert held["images_without_box"] == 6
     assert held["psi"]["a"]["pose"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
+
+
+def test_bins_that_look_the_same_are_scored_as_one(results):
+    one = dataclasses.replace(results, symmetric_bins={"a": {"pose": [[1, 3], [2], [4]]}})
+    # p is 0.25 in each bin, the target 0.85, 0.05, 0.05, 0.05: over the groups 0.5, 0.25, 0.25 to 0.9, 0.05, 0.05.
+    assert one.total_variations()["a"]["pose"]["initial"] == pytest.approx(0.4)
+    assert one.total_variations()["b"] == results.total_variations()["b"]
+
+
+def test_bins_that_look_the_same_are_drawn_as_one():
+    history, target = {"a": [[0.25] * 4, [0.4, 0.1, 0.4, 0.1]]}, {"a": [0.4, 0.1, 0.4, 0.1]}
+    axes = psi_figure(history, target, "title", "pose", {"a": [[1, 3], [2], [4]]}).axes[0]
+    assert axes.get_title() == "a (1=3)" and [text.get_text() for text in axes.texts] == ["1=3"]
+    heights = [bar.get_height() for bar in axes.patches]
+    assert heights == pytest.approx([0.8, 0.1, 0.1]) and len(axes.collections) == 3
 
 
 def test_summary_names_every_method_and_object(results):

@@ -6,7 +6,7 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torchvision.models.detection.retinanet import RetinaNetClassificationHead
+from torchvision.models.detection.retinanet import RetinaNetClassificationHead, RetinaNetHead
 
 
 def initialise(
@@ -14,16 +14,20 @@ def initialise(
 ) -> dict[str, Tensor]:
     """A state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
 
-    The output layers of a RetinaNet head (without normalisation, the only convolutions with a bias) start at
-    standard deviation 0.01; the class layer's bias makes it predict ``prior_probability`` (Lin et al., Sec. 4.1).
+    Convolutions without normalisation have a bias. Those of a RetinaNet head start at standard deviation 0.01, and the
+    class layer's bias makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1); others keep the variance of
+    their input, as torchvision's do.
     """
+    in_head = {
+        id(part) for head in module.modules() if isinstance(head, RetinaNetHead) for part in head.modules()
+    }
     state = {name: value.detach().clone() for name, value in module.state_dict().items()}
     for name, part in module.named_modules():
         prefix = f"{name}." if name else ""
         if isinstance(part, nn.Conv2d):
             std = math.sqrt(2.0 / (part.in_channels * math.prod(part.kernel_size)))
             if part.bias is not None:
-                std = 0.01
+                std = 0.01 if id(part) in in_head else std / math.sqrt(2.0)
                 state[f"{prefix}bias"].zero_()
             state[f"{prefix}weight"].normal_(0.0, std, generator=generator)
         elif isinstance(part, nn.GroupNorm):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -11,8 +12,12 @@ from torch import Tensor, nn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.retinanet import RetinaNetHead
 from torchvision.ops import FeaturePyramidNetwork
+from torchvision.ops.feature_pyramid_network import ExtraFPNBlock
 
-from neural_sim.detector.backbones import IMAGENET_MEAN, IMAGENET_STD, group_norm, set_activation
+from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, group_norm, set_activation
+
+Normalisation = Literal["group", "none"]
+"""Of the pyramid and the head, see :func:`backbones.group_norm`."""
 
 
 class NormalisedBackbone(nn.Module):
@@ -31,6 +36,27 @@ class NormalisedBackbone(nn.Module):
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
     """A number for each channel, made where ``like`` is instead of copied there."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
+
+
+class CoarserLevels(ExtraFPNBlock):
+    """Levels past the backbone's last map C5: P6 a convolution of stride 2 on C5, P7 one on the activated P6, and so on
+    (Lin et al. 2017, Sec. 4). A level is never smaller than one pixel."""
+
+    def __init__(self, in_channels: int, channels: int, count: int, activation: str) -> None:
+        super().__init__()
+        widths = [in_channels] + [channels] * (count - 1)
+        self.convs = nn.ModuleList(nn.Conv2d(width, channels, 3, stride=2, padding=1) for width in widths)
+        self.activation = ACTIVATIONS[activation]()
+
+    def forward(
+        self, results: list[Tensor], x: list[Tensor], names: list[str]
+    ) -> tuple[list[Tensor], list[str]]:
+        level = x[-1]
+        for number, conv in enumerate(self.convs):
+            level = conv(self.activation(level) if number else level)
+            results.append(level)
+            names.append(f"coarser{number}")
+        return results, names
 
 
 class Predictor(nn.Module):
@@ -53,16 +79,21 @@ def build_predictor(
     num_classes: int,
     head_convs: int,
     activation: str,
+    normalisation: Normalisation = "group",
 ) -> Predictor:
-    """The pyramid and head, group-normalised; ``anchors`` are the anchors per location of each level.
+    """The pyramid and head; ``anchors`` are the anchors per location of each level, those of levels past the last of
+    ``in_channels`` included.
 
     Raises:
         ValueError: where levels differ in anchors per location: they share one head.
     """
     if len(set(anchors)) != 1:
         raise ValueError(f"detector.anchor_sizes: want equally many sizes on every level, got {anchors}")
-    fpn = FeaturePyramidNetwork(in_channels, channels, norm_layer=group_norm)
-    head = RetinaNetHead(channels, anchors[0], num_classes, norm_layer=group_norm)
+    norm = group_norm if normalisation == "group" else None
+    coarser = len(anchors) - len(in_channels)
+    extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
+    fpn = FeaturePyramidNetwork(in_channels, channels, extra, norm)
+    head = RetinaNetHead(channels, anchors[0], num_classes, norm_layer=norm)
     for branch in (head.classification_head, head.regression_head):
         branch.conv = branch.conv[:head_convs]
     predictor = Predictor(fpn, head)
@@ -74,7 +105,7 @@ def fixed_anchors(
     generator: AnchorGenerator, image_size: tuple[int, int], strides: tuple[int, ...]
 ) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
     """Anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
-    # A strided convolution of padding 1 leaves ceil(size / 2) pixels.
+    # A strided convolution of padding 1 leaves ceil(size / 2) pixels, so at least one.
     grids = [[-(-side // stride) for side in image_size] for stride in strides]
     steps = [[torch.tensor(stride), torch.tensor(stride)] for stride in strides]
     levels = generator.grid_anchors(grids, steps)

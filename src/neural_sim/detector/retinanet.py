@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -20,7 +21,7 @@ from torchvision.ops import batched_nms, clip_boxes_to_image
 from neural_sim.detector.backbones import ACTIVATIONS, build_backbone
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.losses import BOX_LOSSES, box_loss, focal_loss
-from neural_sim.detector.network import NormalisedBackbone, build_predictor, fixed_anchors
+from neural_sim.detector.network import Normalisation, NormalisedBackbone, build_predictor, fixed_anchors
 from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
 
 Parameters = dict[str, Tensor]
@@ -31,6 +32,7 @@ ARCHITECTURES = {
     "resnet18": (4, 8, 16, 32),
     "resnet50": (4, 8, 16, 32),
 }
+"""Strides of the backbones' maps."""
 
 
 class Detector:
@@ -42,16 +44,19 @@ class Detector:
         architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
         weights: of the ResNets' backbone: None, a file with a torchvision state dictionary, or torchvision's
             name of the weights.
+        freeze_backbone: the backbone keeps ``weights`` in every training. It is always frozen in the psi loop.
         activation: ``silu`` or ``relu`` (torchvision's own).
         box_loss: ``pseudo_huber`` or ``l1`` (torchvision's own).
         box_loss_delta: scale of the pseudo-Huber loss, in encoded units.
-        strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16).
+        strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last for each
+            of any coarser levels, see :class:`network.CoarserLevels`.
         anchor_sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side
             is ``anchor_reference``; they scale with the image's.
-        anchor_reference: that side in pixels.
+        anchor_reference: that side in pixels; None: sizes are pixels of any image, as in torchvision.
         aspect_ratios: of every anchor, height / width.
         channels: of the pyramid and the head, a multiple of 8.
         head_convs: convolutions in each branch of the head, 1 to 4.
+        normalisation: of the pyramid and the head, ``group`` or ``none`` (torchvision's own).
         focal_alpha, focal_gamma: of the focal loss.
         prior_probability: foreground probability that the untrained head predicts.
         foreground_iou, background_iou: overlaps from which an anchor is foreground, below which background.
@@ -68,15 +73,17 @@ class Detector:
         image_size: int | tuple[int, int] = 96,
         architecture: str = "tiny",
         weights: str | None = None,
+        freeze_backbone: bool = False,
         activation: str = "silu",
         box_loss: str = "pseudo_huber",
         box_loss_delta: float = 0.1,
         strides: Sequence[int] = (8, 16),
         anchor_sizes: Sequence[Sequence[float]] = ((22, 28, 36), (46, 58, 74)),
-        anchor_reference: float = 96,
+        anchor_reference: float | None = 96,
         aspect_ratios: Sequence[float] = (1.0,),
         channels: int = 48,
         head_convs: int = 2,
+        normalisation: Normalisation = "group",
         focal_alpha: float = 0.25,
         focal_gamma: float = 2.0,
         prior_probability: float = 0.01,
@@ -98,16 +105,34 @@ class Detector:
             channels=(channels, channels >= 8 and channels % 8 == 0, "a positive multiple of 8"),
             head_convs=(head_convs, 1 <= head_convs <= 4, "1 to 4"),
             prior_probability=(prior_probability, 0 < prior_probability < 1, "inside (0, 1)"),
-            anchor_reference=(anchor_reference, anchor_reference > 0, "above 0"),
+            normalisation=(
+                normalisation,
+                normalisation in get_args(Normalisation),
+                f"one of {get_args(Normalisation)}",
+            ),
+            anchor_reference=(
+                anchor_reference,
+                anchor_reference is None or anchor_reference > 0,
+                "above 0, or null",
+            ),
+            freeze_backbone=(
+                freeze_backbone,
+                not freeze_backbone or weights is not None,
+                "detector.weights too, since a frozen backbone without them is random",
+            ),
             proximal=(proximal, 0 <= proximal < math.inf, "finite and at least 0"),
             anchor_sizes=(anchor_sizes, len(anchor_sizes) == len(strides), "one list for each stride"),
             foreground_iou=(foreground_iou, background_iou <= foreground_iou <= 1, "background_iou up to 1"),
         )
+        own = tuple(stride for stride in strides if stride in ARCHITECTURES[architecture])
         _check(
             strides=(
                 strides,
-                set(strides) <= set(ARCHITECTURES[architecture]) and strides == tuple(sorted(strides)),
-                f"an ascending choice of {ARCHITECTURES[architecture]} for {architecture}",
+                len(own) > 0
+                and own == tuple(sorted(set(own)))
+                and strides[len(own) :] == _coarser(own, strides, architecture),
+                f"an ascending choice of {ARCHITECTURES[architecture]} for {architecture}, and from its last on "
+                "coarser ones, each twice the one before",
             )
         )
         self.num_classes = num_classes
@@ -120,18 +145,20 @@ class Detector:
         self.proximal = proximal
         self.score_threshold, self.nms_iou = score_threshold, nms_iou
         self.max_detections, self.max_candidates = max_detections, max_candidates
-        backbone = build_backbone(architecture, strides, activation, weights)
-        scale = min(self.image_size) / anchor_reference
+        self.freeze_backbone = freeze_backbone
+        backbone = build_backbone(architecture, own, activation, weights)
+        scale = 1.0 if anchor_reference is None else min(self.image_size) / anchor_reference
         sizes = tuple(tuple(scale * size for size in level) for level in anchor_sizes)
         generator = AnchorGenerator(sizes, (tuple(aspect_ratios),) * len(sizes))
         self._backbone = NormalisedBackbone(backbone)
         self._predictor = build_predictor(
-            [backbone.channels[stride] for stride in strides],
+            [backbone.channels[stride] for stride in own],
             channels,
             generator.num_anchors_per_location(),
             num_classes,
             head_convs,
             activation,
+            normalisation,
         )
         self._pretrained = weights is not None
         self.anchors, self.anchors_per_level = fixed_anchors(generator, self.image_size, strides)
@@ -153,8 +180,9 @@ class Detector:
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Names of everything that a full training changes: all but frozen statistics."""
-        names = {n for module in (self._backbone, self._predictor) for n, _ in module.named_parameters()}
+        """Names of everything that a full training changes: all but frozen statistics or a frozen backbone."""
+        learned = (self._predictor,) if self.freeze_backbone else (self._backbone, self._predictor)
+        names = {n for module in learned for n, _ in module.named_parameters()}
         return [name for name in params if name in names]
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
@@ -250,6 +278,12 @@ class Detector:
     @property
     def _first_anchors(self) -> list[int]:
         return [sum(self.anchors_per_level[:level]) for level in range(len(self.anchors_per_level))]
+
+
+def _coarser(own: tuple[int, ...], strides: tuple[int, ...], architecture: str) -> tuple[int, ...]:
+    """Strides of the levels past the backbone's last, where as many as there are may follow it."""
+    last, count = ARCHITECTURES[architecture][-1], len(strides) - len(own)
+    return tuple(last * 2**n for n in range(1, count + 1)) if last in own else ()
 
 
 def _check(**conditions: tuple[object, bool, str]) -> None:

@@ -60,8 +60,8 @@ def train_detector(
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
     Args:
-        images: on the device of ``params``; where they come as features, the backbone stays frozen: the pyramid and
-            the head are trained.
+        images: on the device of ``params``; where they come as features, or the detector freezes its backbone, the
+            pyramid and the head alone are trained.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
         proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
 
@@ -78,6 +78,8 @@ def train_detector(
         )
     if proximal > 0.0 and anchor is None:
         raise ValueError(f"train_detector: proximal {proximal} wants its anchor theta_0, got None")
+    if detector.freeze_backbone and not isinstance(images, CachedSet):
+        images = CachedSet.of(detector, detector.split(params)[0], images)
     if isinstance(images, CachedSet):
         fixed, learned = detector.split(params)
         inputs, targets = images.features, images.targets

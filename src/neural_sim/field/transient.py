@@ -12,13 +12,13 @@ from neural_sim.field.quadrature import composite, render_weights, sum_rays
 from neural_sim.field.samples import PackedSamples
 
 FREQUENCIES = 5
-SMALLEST_BETA = 0.03  # as in the paper
+SMALLEST_BETA = 0.03  # as in NeRF in the Wild
 
 
 class TransientHead(nn.Module):
     """Density, colour and uncertainty of what only one view shows, from a position and that view's transient code.
 
-    Used while fitting and dropped afterwards; ``codes`` are 16 numbers a view, as in the paper.
+    Used while fitting and dropped afterwards; ``codes`` are 16 numbers a view, as in NeRF in the Wild.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ def composite_both(
 ) -> tuple[Rendering, Float[Tensor, "rays"]]:
     """The image of object and transients together, and each ray's beta, seen through both.
 
-    Densities add and colours mix by density, which is emission and absorption of two media in one place. (The paper
-    adds the alphas of the two, which exceed 1 together where both are opaque.)
+    Densities add and colours mix by density, which is emission and absorption of two media in one place. (NeRF in
+    the Wild adds the alphas of the two, which exceed 1 together where both are opaque.)
     """
     sigma = static[0] + transient[0]
     share = (transient[0] / sigma.clamp_min(torch.finfo(sigma.dtype).tiny))[:, None]
@@ -76,7 +76,7 @@ def uncertain_error(
     depths: Float[Tensor, "samples"],
     penalty: float,
 ) -> Float[Tensor, ""]:
-    """The paper's Eq. 13: |C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, and ``penalty`` times the mean
-    optical depth of the transients' samples. The square error is expected over backgrounds."""
+    """|C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, and ``penalty`` times the mean optical depth of the
+    transients' samples (NeRF in the Wild, Sec. 4.2). The square error is expected over backgrounds."""
     errors = expected_errors(rendering, pixels).sum(-1)
     return (0.5 * errors / beta.square() + beta.log()).mean() + penalty * depths.mean()

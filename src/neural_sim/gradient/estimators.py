@@ -52,9 +52,9 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign; for lights :func:`across_lights`.
 
-        The null of its significance is that a factor's bins, or lights, have one mean score: the derivative is zero.
+        The null of its significance is that a factor's bins, or lights, have one mean score: then the value is zero.
         """
         distribution = images.distribution
         if losses.probes is None or set(probes) != set(distribution.names):

@@ -2,7 +2,7 @@
 Tool 2).
 
 Contracting with v first leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one
-image-sized array, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 9 is never formed.
+image-sized array, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def image_cotangent(
     chunk_size: int = 16,
     mode: ThetaMode = "forward",
 ) -> Float[Tensor, "n 3 h w"]:
-    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``, the cotangent of every image (left factor of Eq. 9 times v).
+    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``, the cotangent of every image (left factor of Eq. 3 times v).
 
     ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the images, is always
     reverse.

@@ -1,4 +1,4 @@
-"""The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eq. 9).
+"""The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eqs. 3 to 6).
 
 Reverse mode is the paper's. First forward: images without derivatives (the scene's). Then v and the images' cotangents.
 Second forward: rays of one patch at a time, replayed from the same draw, each backward at once into the draw's few

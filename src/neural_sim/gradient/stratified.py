@@ -1,7 +1,8 @@
-"""The exact derivative over hard bins: with ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is
-``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits without a floor ``p_i (s_i - sum_j p_j s_j)``.
+"""The derivative over hard bins: with ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is
+``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits without a floor ``p_i (s_i - sum_j p_j s_j)``. And a difference of mean
+scores that stands for the derivative by lights, :func:`across_lights`.
 
-Only the bins' means are estimated, so every bin is drawn on purpose instead of waiting for p to draw it, and
+Only mean scores are estimated, so every bin is drawn on purpose instead of waiting for p to draw it, and
 the renderer is never differentiated.
 """
 
@@ -94,20 +95,23 @@ def by_strata(
     psi: Float[Tensor, "k"],
     share: float = 1.0,
 ) -> MixedDerivative:
-    """The derivative by one factor's psi, from the scores of its probes: bins by :func:`stratified`, lights by
-    :func:`across_lights`."""
+    """The derivative by one factor's psi from the scores of its probes, by :func:`stratified`; for lights what stands
+    for it, :func:`across_lights`."""
     if isinstance(factor, BinnedFactor):
         return stratified(scores, strata, psi, factor.log_probabilities, share)
     return across_lights(scores, factor.size, share)
 
 
 def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -> MixedDerivative:
-    """``share * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: the derivative by the weights of lights
-    read as the shares of the images under each, up to what is common to all, which the constraint takes back.
+    """``share * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights. What is
+    common to all is left out, since the constraint takes it back.
 
-    ``scores`` are those of the same scenes under one light after the other. Where one light is bent all the way into
-    another, the derivative by the blend of light in every image (``gradient=pathwise``) says little: a detector that
-    never saw the other light gains nothing from a trace of it (docs/numerics.md, Lights: both beside the truth).
+    They are no derivative of the training loss by psi, whose weights blend the lights in every image
+    (``gradient=pathwise`` takes that one). They are the derivative of another training set's loss: one of images under
+    single lights, a part w_i of them under light i. It is taken in its place because, where one light is bent all the
+    way into another, the derivative by the blend says little: a detector that never saw the other light gains nothing
+    from a trace of it (docs/numerics.md, Lights: both beside the truth). ``scores`` are those of the same scenes under
+    one light after the other.
     """
     if lights < 1 or scores.ndim != 1 or scores.numel() == 0 or scores.numel() % lights:
         raise ValueError(

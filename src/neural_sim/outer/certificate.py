@@ -120,7 +120,7 @@ def _by_signal(
 ) -> Actions:
     """Steps kept where there is signal. An object at its optimum has none, and is no reason to stop the others:
     ``stop`` skips its step, and ends the loop where no step is left."""
-    otherwise: Action = "shrunk" if on_untrusted == "shrink" else "skipped"
+    otherwise: Action = "skipped" if on_untrusted == "stop" else _ACTIONS[on_untrusted]
     limit = math.inf if level is None else level
     actions: Actions = {
         name: {f: "kept" if p_values.get(name, {}).get(f, 0.0) <= limit else otherwise for f in factors}

@@ -10,7 +10,10 @@ from torch import Tensor
 
 Specification = str | Mapping[str, object] | Sequence[float]
 
-DOMINANT_REST = 0.02  # the paper's biased sets: all but one bin share 0.02 each, for k = 8 leaving 0.86
+DOMINANT_REST = 0.02
+"""Probability of a bin that is no mode. The paper (Sec. 4.2) says only which bins dominate; this is the number in its
+authors' code, which leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of three
+(github.com/gyhandy/Neural-Sim-NeRF, optimization/neural_sim_main.py)."""
 
 
 def distribution(specification: Specification, bins: int, where: str = "distribution") -> Float[Tensor, "k"]:
@@ -60,6 +63,11 @@ def _numbers(values: Sequence[float], bins: int, where: str) -> Tensor:
     if abs(probabilities.sum().item() - 1.0) > 1e-6:
         raise ValueError(f"{where}: probabilities must add up to 1, got {probabilities.sum().item():.6g}")
     return probabilities
+
+
+def merged(p: Float[Tensor, "*n k"], groups: Sequence[Sequence[int]]) -> Float[Tensor, "*n g"]:
+    """Probabilities of groups of bins, numbered from 1."""
+    return torch.stack([p[..., [b - 1 for b in group]].sum(-1) for group in groups], -1)
 
 
 def total_variation(p: Float[Tensor, "*n k"], q: Float[Tensor, "*n k"]) -> Float[Tensor, "*n"]:

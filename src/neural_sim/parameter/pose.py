@@ -11,13 +11,8 @@ from neural_sim.parameter.distributions import Specification
 from neural_sim.parameter.factor import Beliefs, BinnedFactor, Gap
 
 Axis = Literal["polar", "azimuth", "both"]
-OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {
-    "polar": (-45.0, 45.0),
-    "azimuth": (45.0, 135.0),
-    "both": (-45.0, 45.0),
-}
-"""Of the angle beside the full circle. Over a full circle of both, (phi, rho) and (360 - phi, rho + 180) are one
-camera, so that bins i and k + 1 - i would coincide."""
+OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
+"""Of the angle beside the full circle, where ``unlearned`` does not say it."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +24,10 @@ class Pose:
         axis: ``polar`` bins phi, the great circle through the poles, with rho uniform in ``other_range_deg``;
             ``azimuth`` bins rho, the turn about the vertical, with phi uniform in ``other_range_deg``; ``both`` bins
             phi's full circle and rho's ``other_range_deg`` (``other_bins`` of them, which do not wrap), as two factors
-            ``pose`` and ``turn``.
-        other_range_deg: null: [-45, 45] of rho, [45, 135] of phi.
+            ``pose`` and ``turn``. Where both angles go round the full circle (the paper's rho), (phi, rho) and
+            (360 - phi, rho + 180) are one place and direction, with the camera upside down in one of them: bins i and
+            k + 1 - i show an object from the same sides, upright and on its head.
+        other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
         temperature, bin_mean, floor: see :class:`BinnedFactor`; ``bin_mean`` is that of the full circle.
         initial, target, biased, gap: see :class:`Beliefs`; with ``both``, {phi: ..., rho: ...} where a distribution
             stands for itself gives each angle its own, and one distribution is phi's, rho being uniform.
@@ -54,7 +51,7 @@ class Pose:
     def __post_init__(self) -> None:
         if self.axis not in get_args(Axis):
             raise ValueError(f"parameter.pose.axis must be one of {get_args(Axis)}, got {self.axis!r}")
-        low, high = self._other_range_deg
+        low, high = self._other_range_deg or (0.0, 0.0)
         if not low <= high or high - low > 360.0:
             raise ValueError(
                 f"parameter.pose.other_range_deg must be ordered and at most a circle, got {[low, high]}"
@@ -62,8 +59,8 @@ class Pose:
         _ = self.factors
 
     @property
-    def _other_range_deg(self) -> tuple[float, float]:
-        return OTHER_RANGE_DEG[self.axis] if self.other_range_deg is None else self.other_range_deg
+    def _other_range_deg(self) -> tuple[float, float] | None:
+        return OTHER_RANGE_DEG.get(self.axis) if self.other_range_deg is None else self.other_range_deg
 
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:
@@ -74,7 +71,7 @@ class Pose:
             temperature=self.temperature, bin_mean=self.bin_mean, floor=self.floor,
             beliefs=_angle(beliefs, "phi") if self.axis == "both" else beliefs,
         )  # fmt: skip
-        if self.axis != "both":
+        if self.axis != "both" or self._other_range_deg is None:
             return (circle,)
         low, high = (math.radians(degrees) for degrees in self._other_range_deg)
         turn = replace(
@@ -86,7 +83,7 @@ class Pose:
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Uniform ranges of what is drawn but not learned, in radians."""
-        if self.axis == "both":
+        if self.axis == "both" or self._other_range_deg is None:
             return {}
         low, high = (math.radians(degrees) for degrees in self._other_range_deg)
         return {"phi" if self.axis == "azimuth" else "rho": (low, high)}

@@ -12,6 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from neural_sim.parameter.distributions import merged
 from neural_sim.types import LabelledImages
 
 matplotlib.use("Agg")
@@ -42,11 +43,13 @@ def psi_figure(
     target: Mapping[str, Sequence[float]],
     title: str,
     factor: str,
+    groups: Mapping[str, Sequence[Sequence[int]]] | None = None,
 ) -> Figure:
     """p over the bins at every iteration, stacked, with the target distribution as a bar beside it.
 
     ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them.
-    ``factor`` names what the bins are of; only a pose's colours close the circle.
+    ``factor`` names what the bins are of; only a pose's colours close the circle. ``groups`` are an object's bins (from
+    1) that look the same: stacked as one, in the colour of the first.
     """
     names = list(history)
     columns = min(3, len(names))
@@ -59,18 +62,20 @@ def psi_figure(
     figure.suptitle(title, color=INK, fontsize=11)
     for place, name in enumerate(names, 1):
         axes = figure.add_subplot(rows, columns, place)
-        p = np.asarray(history[name])
+        joined = groups[name] if groups is not None else [[b] for b in range(1, bins + 1)]
+        p, wanted = (merged(torch.tensor(each), joined).numpy() for each in (history[name], target[name]))
+        shades = [colours[group[0] - 1] for group in joined]
         steps = np.arange(len(p))
         width = max(1.0, 0.12 * len(p))
-        axes.stackplot(steps, p.T, colors=colours, linewidth=0)
+        axes.stackplot(steps, p.T, colors=shades, linewidth=0)
         bottom = 0.0
-        for b, share in enumerate(target[name]):
-            axes.bar(len(p) - 1 + 1.1 * width, share, width, bottom=bottom, color=colours[b], linewidth=0)
+        for group, share, shade in zip(joined, wanted, shades, strict=True):
+            axes.bar(len(p) - 1 + 1.1 * width, share, width, bottom=bottom, color=shade, linewidth=0)
             if share > 0.25:
-                axes.text(len(p) - 1 + 1.1 * width, bottom + share / 2, str(b + 1), ha="center", va="center",
-                          color="white", fontsize=8)  # fmt: skip
+                axes.text(len(p) - 1 + 1.1 * width, bottom + share / 2, "=".join(map(str, group)), ha="center",
+                          va="center", color="white", fontsize=8)  # fmt: skip
             bottom += share
-        axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=name)
+        axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=_titled(name, joined))
         axes.title.set_fontsize(9)
         ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
         axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
@@ -81,6 +86,12 @@ def psi_figure(
         title=f"{factor} bin (x: outer iteration, y: probability)", fontsize=8, title_fontsize=8, frameon=False,
     )  # fmt: skip
     return figure
+
+
+def _titled(name: str, groups: Sequence[Sequence[int]]) -> str:
+    """The object's name, and which of its bins are one."""
+    same = ["=".join(map(str, group)) for group in groups if len(group) > 1]
+    return f"{name} ({', '.join(same)})" if same else name
 
 
 def ap_figure(ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str]) -> Figure:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neural_sim.cameras import orbit
 from neural_sim.outer.certificate import untrusted
-from neural_sim.parameter.distributions import total_variation
+from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report import figures
 from neural_sim.synthesis.export import write_coco
 from neural_sim.synthesis.scene import RenderedObject, join
@@ -33,8 +33,8 @@ class RunResults:
     (``ap``) at every iteration that was scored.
 
     ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
-    (from 1), by object and angle, whose views an object's symmetry makes the same. ``identity`` says which runs
-    this one can be compared with, see :func:`identity.identity`.
+    (from 1), by object and angle, whose views an object's symmetry makes the same; they are scored and drawn as one.
+    ``identity`` says which runs this one can be compared with, see :func:`identity.identity`.
     """
 
     experiment: str
@@ -97,15 +97,21 @@ class RunResults:
         """Names of what is learned, in order."""
         return tuple(self.probabilities["target"])
 
+    def groups(self, name: str, factor: str) -> Sequence[Sequence[int]]:
+        """Groups of a factor's bins (from 1) that look the same for an object; a bin each where nothing is known."""
+        bins = self.probabilities["target"][factor].shape[-1]
+        return self.symmetric_bins.get(name, {}).get(factor) or [[b] for b in range(1, bins + 1)]
+
     def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Distance of the initial and the learned distribution from the target, by object and factor."""
+        """Distance of the initial and the learned distribution from the target, by object and factor, over groups."""
         found: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
-        for factor in self.factors:
-            target = self.probabilities["target"][factor]
-            for which in ("initial", "learned"):
-                distances = total_variation(self.probabilities[which][factor], target).tolist()
-                for name, distance in zip(self.names, distances, strict=True):
-                    found[name].setdefault(factor, {})[which] = distance
+        for label, name in enumerate(self.names):
+            for factor in self.factors:
+                groups = self.groups(name, factor)
+                p = {which: merged(held[factor][label], groups) for which, held in self.probabilities.items()}
+                found[name][factor] = {
+                    which: float(total_variation(p[which], p["target"])) for which in ("initial", "learned")
+                }
         return found
 
     def summary(self) -> str:
@@ -184,7 +190,8 @@ def write_figures(
         steps.append(results.probabilities["learned"][factor].tolist())
         history = {name: [p[i] for p in steps] for i, name in enumerate(names)}
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
-        drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor)
+        groups = {name: results.groups(name, factor) for name in names}
+        drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor, groups)
         made.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
     if results.ap:
         made.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))

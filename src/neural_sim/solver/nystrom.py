@@ -24,7 +24,7 @@ class Nystrom(LinearSolver):
 
     Args:
         rank: products spent on the sketch (no more than half of max_steps where refinement is on).
-        sketch: ``columns`` of H at random (the paper), or products with ``gaussian`` vectors (Frangella et al. 2023).
+        sketch: ``columns`` of H at random (as there), or products with ``gaussian`` vectors (Frangella et al. 2023).
         refine: use what is left of max_steps for ``x += P (b - A x)`` while the residual falls.
         shift: the multiple of the identity in A; None reads it off a ``Shifted`` operator.
         seed: of the sketch's generator, so that the same system gives the same answer.

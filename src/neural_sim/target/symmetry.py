@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,9 +15,6 @@ from neural_sim.parameter.factor import BinNoise
 from neural_sim.parameter.product import COORDINATES, SceneDistribution, SceneNoise
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.types import PinholeCamera, SceneDraw
-
-# Per offset within the bin and second angle: as they are, or mirrored about their middle.
-ALIGNMENTS = ((False, False), (True, False), (False, True), (True, True))
 
 
 def equivalent_bins(
@@ -28,9 +28,11 @@ def equivalent_bins(
 ) -> list[list[int]]:
     """Groups of a factor's bins (from 0) whose views agree, as lists that cover all bins.
 
-    Two bins belong together when, under one of four alignments of the angles within them, the mean absolute difference
-    of their premultiplied views over the pixels that either covers is below ``tolerance``. Views of every bin use the
-    same ``samples`` offsets and second angles; what the factor does not draw is at the middle of its range.
+    Two bins belong together when, under one of four alignments of the angles within them (the offset in the bin and the
+    second angle, each as it is or mirrored about the middle of its range), the mean absolute difference of their
+    premultiplied views over the pixels that either covers is below ``tolerance``. A second angle that goes round the
+    full circle is tried half a turn on, too. Views of every bin use the same ``samples`` offsets and second angles;
+    what the factor does not draw is at the middle of its range.
     """
     count = next(f.bins for f in distribution.binned if f.name == factor)
     views = [_views(item, renderer, distribution, factor, camera, b, samples) for b in range(count)]
@@ -56,18 +58,22 @@ def _views(
     """Views of one bin under every alignment."""
     offsets = (torch.arange(samples) + 0.5) / samples
     other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
+    turns = (0.0, 0.5) if _second_goes_round(distribution, factor) else (0.0,)
     made = []
-    for mirror_offset, mirror_other in ALIGNMENTS:
-        draw = _at(
-            distribution,
-            factor,
-            bin_index,
-            1.0 - offsets if mirror_offset else offsets,
-            1.0 - other if mirror_other else other,
-        )
+    for within, second, turn in itertools.product((offsets, 1.0 - offsets), (other, 1.0 - other), turns):
+        draw = _at(distribution, factor, bin_index, within, (second + turn) % 1.0)
         rgba = renderer.render(item.mesh, camera, orbit(draw.phi, draw.rho, draw.distance))
         made.append(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1))
     return made
+
+
+def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:
+    """Whether the angle beside the factor's own covers the full circle."""
+    own = next(f.coordinate for f in distribution.binned if f.name == factor)
+    second = "phi" if own == "rho" else "rho"
+    low, high = next(((f.low, f.high) for f in distribution.binned if f.coordinate == second),
+                     distribution.ranges[second])  # fmt: skip
+    return math.isclose(high - low, 2.0 * math.pi)
 
 
 def _at(
