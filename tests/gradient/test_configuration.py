@@ -28,8 +28,8 @@ def test_each_choice_is_one_override(override, expected):
     assert experiment("gradient=pathwise", override).gradient.draws == expected
 
 
-def test_the_papers_variant_is_its_plain_form():
-    paper = experiment("+variant=paper")
+def test_the_papers_method_is_its_plain_form():
+    paper = experiment("baseline=neural_sim_paper")
     assert paper.gradient == PathwiseEstimator(mode="reverse")
     assert paper.gradient.draws == RelaxedDraws()
     assert paper.distribution.factors[0].bin_mean == "linear" and paper.synthesis.label_gradient == "ignored"
