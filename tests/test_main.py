@@ -1,6 +1,7 @@
 """The command line as a user meets it: one whole run, and what is refused before any stage."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,7 +30,11 @@ def _run(folder, *arguments):
 def test_one_run_from_objects_to_a_report(tmp_path):
     done = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false")
     assert done.returncode == 0, done.stderr[-3000:]
-    assert "mlflow ui --backend-store-uri sqlite:///" in done.stdout
+    command, address = done.stdout.splitlines()[-2:]
+    assert command.startswith("mlflow ui --backend-store-uri sqlite:///")
+    assert re.fullmatch(
+        r"http://127\.0\.0\.1:5000/#/experiments/1/runs/\w{32}\?workflowType=machine_learning", address
+    )
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert {"experiment", "method", "seed", "psi", "ap", "seconds", "peak_memory_mb", "left_out"} <= set(
         results

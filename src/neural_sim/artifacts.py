@@ -23,7 +23,7 @@ from neural_sim.field.training import field_from_state, field_state
 from neural_sim.methods import outer_loop
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.outer.loop import learn_psi
-from neural_sim.outer.records import Cost
+from neural_sim.outer.records import Cost, IterationRecord
 from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.store import Store, code_version, digest, tensor_digest
 from neural_sim.synthesis.scene import RenderedObject, Scene
@@ -32,10 +32,16 @@ from neural_sim.types import LabelledImages
 
 
 class Artifacts:
-    """Results of the stages. A result whose stage was not asked for must be in the store."""
+    """Results of the stages. A result whose stage was not asked for must be in the store.
 
-    def __init__(self, experiment: Experiment) -> None:
-        self.x = experiment
+    ``on_record`` is called with the record of each iteration of the psi loop when it has ended; never where the loop's
+    result is in the store.
+    """
+
+    def __init__(
+        self, experiment: Experiment, on_record: Callable[[IterationRecord], object] | None = None
+    ) -> None:
+        self.x, self._on_record = experiment, on_record
         self.store = Store(experiment.store)
         self.account = Account()
         self._held: dict[str, Any] = {}  # by kind and key, so that a result is read once
@@ -227,7 +233,7 @@ class Artifacts:
                 self.x, self.scene, self.detector, self.warm_start(), self.psi("initial"), self.targets["val"],
                 self._generator(2),
             )  # fmt: skip
-            found = learn_psi(loop, self.x.progress)
+            found = learn_psi(loop, self.x.progress, self._on_record)
             records = [dataclasses.asdict(record) for record in found.records]
             return {
                 "trajectory": found.trajectory, "records": records, "before": self._warm_start()["cost"]

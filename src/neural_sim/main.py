@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import time
 import types
 import typing
 import warnings
@@ -114,7 +115,8 @@ def stress(config: DictConfig, folder: Path) -> int:
     suite = _instantiate(plain["stress"], "stress")
     from neural_sim.report.stress import report
 
-    return report(suite.run(plain["seed"], plain["progress"]), plain, folder)
+    begun = time.time()
+    return report(suite.run(plain["seed"], plain["progress"]), plain, folder, begun)
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from neural_sim import versions
 from neural_sim.artifacts import Artifacts
 from neural_sim.devices import peak_memory_mb
 from neural_sim.experiment import Experiment
-from neural_sim.outer.records import Cost
+from neural_sim.outer.records import Cost, IterationRecord
 from neural_sim.plan import plan
 from neural_sim.report.identity import identity
 from neural_sim.report.run import (
@@ -26,7 +26,7 @@ from neural_sim.report.run import (
     write_results,
     write_training_set,
 )
-from neural_sim.report.run_tracking import track
+from neural_sim.report.run_tracking import LiveRun, live_run
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.store import code_version
 from neural_sim.synthesis.scene import join
@@ -37,29 +37,52 @@ STAGES = ("views", "field", "warm_start", "psi", "evaluate", "report")
 
 
 class Pipeline:
-    """Walks the stages and reports."""
+    """Walks the stages and reports, to MLflow while they go on where a :class:`LiveRun` listens."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.x = experiment
-        self.made = Artifacts(experiment)
+        self.live: LiveRun | None = None
+        self.made = Artifacts(experiment, self._iteration)
+
+    def _iteration(self, record: IterationRecord) -> None:
+        if self.live:
+            self.live.iteration(dataclasses.asdict(record))
+
+    @contextmanager
+    def tracked(self) -> Iterator[None]:
+        """An MLflow run for what is inside, if the report is asked for."""
+        x = self.x
+        if "report" not in x.stages:
+            yield
+            return
+        names, biased, uri = self.made.names, x.distribution.biased, tracking_uri(x.mlflow)
+        with live_run(uri, x.name, x.baseline.name, x.seed, names, biased, x.config) as self.live:
+            _log.info("to watch this run:\n%s", self.live.where)
+            yield
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count a stage's seconds if it is asked for."""
         begin = time.perf_counter()
         yield
-        self.made.account.seconds[name] = time.perf_counter() - begin
-        _log.info("%-10s %8.1f s", name, self.made.account.seconds[name])
+        spent = self.made.account.seconds[name] = time.perf_counter() - begin
+        _log.info("%-10s %8.1f s", name, spent)
+        if self.live:
+            self.live.stage(name, spent)
 
     def run_stage(self, name: str) -> None:
         """Make or find a stage's results."""
         if name in ("views", "field"):
             for item in tqdm(self.made.names, desc=name, disable=not self.x.progress, leave=False):
-                getattr(self.made, name)(item)
+                found = getattr(self.made, name)(item)
+                if name == "field" and self.live:
+                    self.live.fields({item: found["history"]})
         elif name == "warm_start":
             self.made.warm_start()
         elif name == "psi":
-            self.made.learned()
+            records = self.made.learned()["records"]
+            if self.live:
+                self.live.iterations(records)
         elif name == "evaluate":
             scored = {**self.made.compared(), **self.made.on_the_way()}
             for what, psi in tqdm(scored.items(), desc=name, disable=not self.x.progress, leave=False):
@@ -119,6 +142,8 @@ class Pipeline:
 
     def report(self, folder: Path) -> None:
         """Figures, the final training set, results.json, MLflow."""
+        if self.live is None:
+            raise RuntimeError("report: want an open MLflow run, see Pipeline.tracked")
         results = self.results()
         drawn = self.made.training_images(self.made.learned_psi)
         test = self.made.targets["test"]
@@ -129,10 +154,9 @@ class Pipeline:
             scored = {which: self.made.scores(psi, which) for which, psi in self.made.compared().items()}
             write_detections(test, {which: held["detections"] for which, held in scored.items()}, folder)
         write_results(results, folder)
-        uri = tracking_uri(self.x.mlflow)
-        track(results, uri, folder)
+        self.live.finish(results, folder)
         print(results.summary())
-        print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
+        print(f"results: {folder}\n{self.live.where}")
 
 
 def run(experiment: Experiment, folder: Path) -> float | None:
@@ -146,13 +170,12 @@ def run(experiment: Experiment, folder: Path) -> float | None:
     for omission in pipeline.made.account.left_out:
         share = "" if omission.share in (None, 1.0) else f" ({omission.share:.0%})"
         _log.info("left out: %s%s: %s", omission.what, share, omission.why)
-    for name in STAGES[:-1]:
-        if name in experiment.stages:
-            with pipeline.stage(name):
-                pipeline.run_stage(name)
-    if "report" in experiment.stages:
-        with pipeline.stage("report"):
-            pipeline.report(folder)
-    if "evaluate" not in experiment.stages:
-        return None
-    return pipeline.made.validation_ap()
+    with pipeline.tracked():
+        for name in STAGES[:-1]:
+            if name in experiment.stages:
+                with pipeline.stage(name):
+                    pipeline.run_stage(name)
+        if "report" in experiment.stages:
+            with pipeline.stage("report"):
+                pipeline.report(folder)
+    return pipeline.made.validation_ap() if "evaluate" in experiment.stages else None

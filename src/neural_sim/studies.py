@@ -43,7 +43,7 @@ def vary_temperature(experiment: Experiment, temperatures: Temperatures, folder:
     warm-started detector, to ``folder`` and MLflow."""
     if not isinstance(experiment.gradient, PathwiseEstimator):
         raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
-    begun, made, images = time.perf_counter(), Artifacts(experiment), experiment.outer.images_per_object
+    begun, made, images = time.time(), Artifacts(experiment), experiment.outer.images_per_object
     psi, generator = made.psi("initial"), torch.Generator().manual_seed(experiment.seed)
     drawn = join(made.scene.training_set(psi, images, generator))
     theta, validation = made.warm_start(), made.targets["val"]
@@ -52,9 +52,9 @@ def vary_temperature(experiment: Experiment, temperatures: Temperatures, folder:
     )
     rows, truths = temperatures.measure(loop, experiment.gradient, images, experiment.seed)
     uri = tracking_uri(experiment.mlflow)
-    report_temperatures(rows, truths, experiment.name, experiment.seed, experiment.config, uri, folder)
-    spent = time.perf_counter() - begun
-    print(f"v {loop.solve}; {spent:.0f} s\nresults: {folder}\nmlflow ui --backend-store-uri {uri}")
+    named = experiment.name, experiment.seed, experiment.config
+    run = report_temperatures(rows, truths, *named, uri, folder, begun)
+    print(f"v {loop.solve}; {time.time() - begun:.0f} s\nresults: {folder}\n{run.where}")
 
 
 STUDIES: dict[str, Callable[[Experiment, Any, Path], None]] = {

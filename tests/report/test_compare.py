@@ -1,10 +1,11 @@
 """A whole comparison of small made-up runs, from MLflow to compare.md and compare.json."""
 
 import json
+import shutil
 
 import pytest
 
-from neural_sim.report import tracking
+from neural_sim.report import logged, tracking
 from neural_sim.report.compare import Compare
 
 CONFIG = {
@@ -44,10 +45,10 @@ def results(method, seed, ap, scoring="s", config=(), **changes):
 
 
 @pytest.fixture(scope="module")
-def database(tmp_path_factory):
+def database(empty_store, tmp_path_factory):
     """Two methods on two seeds, a later smoke run of one of them, a run of an older version, and one not evaluated."""
     folder = tmp_path_factory.mktemp("compare")
-    uri = tracking.tracking_uri(str(folder / "mlflow.db"))
+    uri = tracking.tracking_uri(str(shutil.copy(empty_store, folder / "mlflow.db")))
     old = results("lts", 0, 0.5)
     for key in ("scoring", "configuration", "test_set", "config", "files", "code"):
         del old[key]
@@ -86,8 +87,13 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
     }
     text = (tmp_path / "compare.md").read_text()
     assert text.startswith("## gap\n") and "views.size is 0, not 1" in text.split("## Left out")[1]
-    assert "Seconds are not comparable" not in text and text.strip() in capsys.readouterr().out
-    assert (tmp_path / "figures" / "gap.png").stat().st_size > 5000
+    assert (
+        "Seconds are not comparable" not in text and (tmp_path / "figures" / "gap.png").stat().st_size > 5000
+    )
+    printed = capsys.readouterr().out
+    assert text.strip() in printed and printed.strip().endswith(logged.where_runs(database, "gap"))
+    (own,) = logged.runs(database, "compare")
+    assert own.status == "FINISHED" and {"compare.md", "compare.json", "figures"} <= own.files
 
 
 def test_two_ways_of_scoring_are_two_tables_whose_headings_say_how_they_differ(database, tmp_path):
@@ -110,8 +116,7 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
         Compare(("other",), draws=5).run(database, 0, {}, tmp_path)
 
 
-def test_seconds_of_several_kinds_of_device_are_called_so(tmp_path):
-    uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
+def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):
     for method, kind in (("neural_sim", "gpu"), ("lts", "cpu")):
         run = tmp_path / method
         run.mkdir()

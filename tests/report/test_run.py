@@ -7,10 +7,10 @@ import pytest
 import torch
 from mlflow import MlflowClient
 
-from neural_sim.report import tracking
+from neural_sim.report import logged
 from neural_sim.report.figures import psi_figure
 from neural_sim.report.run import RunResults, write_figures, write_results
-from neural_sim.report.run_tracking import track
+from neural_sim.report.run_tracking import live_run
 from neural_sim.types import LabelledImages
 
 
@@ -21,7 +21,7 @@ def results():
     record = {
         "probabilities": {"pose": uniform.tolist()}, "entropies": {"pose": [1.0, 1.0]}, "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
-        "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9,
+        "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9, "cpu_seconds": 0.4,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
             "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "doubts": [],
@@ -90,37 +90,65 @@ def test_figures_are_written(results, tmp_path):
     assert all(path.read_bytes()[:4] == b"\x89PNG" and path.stat().st_size > 5000 for path in made)
 
 
-def test_a_run_lands_in_mlflow_with_metrics_by_step(results, tmp_path):
-    uri = tracking.tracking_uri(str(tmp_path / "deep" / "mlflow.db"))
-    (tmp_path / "run").mkdir()
+def live(uri, results):
+    return live_run(uri, "pose_gap", "neural_sim", 3, results.names, results.biased, results.config)
+
+
+def steps(uri, run_id, key):
+    return {point.step: point.value for point in MlflowClient(uri).get_metric_history(run_id, key)}
+
+
+def test_a_run_lands_in_mlflow_with_metrics_by_step(results, uri, tmp_path):
     write_results(results, tmp_path / "run")
-    client = MlflowClient(uri)
-    run = client.get_run(track(results, uri, tmp_path / "run"))
-    assert run.info.status == "FINISHED" and run.data.tags["method"] == "neural_sim"
-    assert run.data.params["parameter.pose.bins"] == "4"
-    assert run.data.metrics["evaluate/learned/ap"] == 0.5 and run.data.metrics["validation_ap"] == 0.25
-    assert "evaluate/ns/ap_b" not in run.data.metrics
-    steps = MlflowClient(uri).get_metric_history(run.info.run_id, "psi/a/pose/bin_1")
-    assert [point.step for point in steps] == [0, 1]
-    for key, value in (("a/pose/trusted", 0.0), ("b/pose/trusted", 1.0), ("a/pose/p_value", 0.3)):
-        history = MlflowClient(uri).get_metric_history(run.info.run_id, f"psi/{key}")
-        assert [point.value for point in history] == [value] * 2
-    assert [item.path for item in MlflowClient(uri).list_artifacts(run.info.run_id)] == ["results.json"]
+    with live(uri, results) as run:
+        run.finish(results, tmp_path / "run")
+    (found,) = logged.runs(uri, "pose_gap")
+    held = MlflowClient(uri).get_run(found.run_id)
+    assert held.info.status == "FINISHED" and held.data.tags["method"] == "neural_sim"
+    assert held.data.params["parameter.pose.bins"] == "4" and held.info.run_name == "neural_sim seed 3"
+    assert held.data.metrics["evaluate/learned/ap"] == 0.5 and held.data.metrics["validation_ap"] == 0.25
+    assert "evaluate/ns/ap_b" not in held.data.metrics
+    assert steps(uri, found.run_id, "psi/a/pose/bin_1") == {0: 0.25, 1: 0.25}
+    assert steps(uri, found.run_id, "psi/a/pose/p_value") == {0: 0.3, 1: 0.3}
+    for name, trusted in (("a", 0.0), ("b", 1.0)):
+        assert steps(uri, found.run_id, f"psi/{name}/pose/trusted") == {0: trusted, 1: trusted}
+    assert steps(uri, found.run_id, "field/a/psnr") == {0: 30.0}
+    assert found.files == {"results.json"}
 
 
-def test_what_was_reached_charts_by_what_was_spent(results, tmp_path):
+def test_iterations_and_stages_are_there_when_they_end_and_are_written_once(results, uri, tmp_path):
+    first, second = ({**results.records[0], "validation_loss": loss} for loss in (0.5, 0.25))
+    write_results(results, tmp_path / "run")
+    with live(uri, results) as run:
+        (found,) = logged.runs(uri, "pose_gap")
+        assert found.status == "RUNNING"
+        run.fields({"a": [{"psnr": 29.0}, {"psnr": 30.0}]})
+        run.stage("field", 7.5)
+        run.iteration(first)
+        assert steps(uri, found.run_id, "psi/validation_loss") == {0: 0.5}
+        assert steps(uri, found.run_id, "psi/seconds_render") == {0: 0.5}
+        assert steps(uri, found.run_id, "seconds/field") == {0: 7.5}
+        run.iterations([first, second])
+        assert steps(uri, found.run_id, "psi/validation_loss") == {0: 0.5, 1: 0.25}
+        run.finish(dataclasses.replace(results, records=[first, second]), tmp_path / "run")
+    history = MlflowClient(uri).get_metric_history(found.run_id, "psi/validation_loss")
+    assert [point.value for point in history] == [0.5, 0.25]
+    assert steps(uri, found.run_id, "field/a/psnr") == {0: 29.0, 1: 30.0}
+
+
+def test_what_was_reached_charts_by_what_was_spent(results, uri, tmp_path):
     scores = {"ap": 0.5, "per_class": {"a": 0.6, "b": 0.4}}
     points = [
         {"iteration": i, "images": 300 * i, "seconds": 2.6 * i, "ap": scores | {"ap": 0.1 * i}}
         for i in (0, 4)
     ]
-    uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
     (tmp_path / "run").mkdir()
-    run = track(dataclasses.replace(results, curve=points), uri, tmp_path / "run")
+    with live(uri, results) as run:
+        run.finish(dataclasses.replace(results, curve=points), tmp_path / "run")
+    (found,) = logged.runs(uri, "pose_gap")
     for name, expected in (
         ("ap_by_iteration", {0: 0.0, 4: 0.4}),
         ("ap_by_images", {0: 0.0, 1200: 0.4}),
         ("biased_ap_by_seconds", {0: 0.6, 10: 0.6}),
     ):
-        history = MlflowClient(uri).get_metric_history(run, f"curve/{name}")
-        assert {metric.step: pytest.approx(metric.value) for metric in history} == expected
+        assert steps(uri, found.run_id, f"curve/{name}") == pytest.approx(expected)

@@ -148,7 +148,9 @@ def test_a_run_is_logged(tmp_path):
     write(RESULTS, tmp_path / "run")
     uri = f"sqlite:///{tmp_path}/mlflow.db"
     config = {"name": "stress", "seed": 3, "stress": {"families": ["linear"], "full": True}}
-    run = MlflowClient(uri).get_run(track(RESULTS, config, uri, tmp_path / "run"))
+    written = track(RESULTS, config, uri, tmp_path / "run", begun=5.0)
+    run = MlflowClient(uri).get_run(written.run_id)
+    assert run.info.start_time == 5000 < run.info.end_time
     assert run.data.metrics["checks"] == 3 and run.data.metrics["a/one/failed"] == 1
     assert run.data.params["stress.full"] == "True"
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import time
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -34,6 +36,7 @@ class OuterLoop(pl.LightningModule):
         self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
         self.records: list[IterationRecord] = []
         self.trajectory = [self.psi.detach().clone()]
+        self.on_record: Callable[[IterationRecord], object] = lambda record: None
         self._counted, self._cpu = (0, 0), inner.cpu_begun
 
     def configure_optimizers(self) -> None:
@@ -41,6 +44,12 @@ class OuterLoop(pl.LightningModule):
 
     def train_dataloader(self) -> range:
         return range(self.rounds)
+
+    def on_train_batch_end(self, *step: Any) -> None:
+        """Show an observer the iteration that has ended; its processor time is not the method's."""
+        begun = time.process_time()
+        self.on_record(self.records[-1])
+        self._cpu += time.process_time() - begun
 
     def record(
         self,
@@ -84,8 +93,13 @@ class OuterLoop(pl.LightningModule):
         return last
 
 
-def learn_psi(module: OuterLoop, progress: bool) -> LearnedPsi:
-    """Run the loop to its budget through a Lightning Trainer that writes nothing."""
+def learn_psi(
+    module: OuterLoop, progress: bool, on_record: Callable[[IterationRecord], object] | None = None
+) -> LearnedPsi:
+    """Run the loop to its budget through a Lightning Trainer that writes nothing. ``on_record`` is called with each
+    iteration's record when it has ended."""
+    if on_record is not None:
+        module.on_record = on_record
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         # psi and its account are a few numbers: they stay on the CPU wherever images and detector are.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from neural_sim.report import figures, tracking
+from neural_sim.report import figures, logged, tracking
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
 from neural_sim.report.selection import Group, LeftOut, Selection
@@ -56,6 +56,22 @@ class Compare:
                 f"compare.experiments: no evaluated run of compare.reference={self.reference!r} on biased objects in "
                 f"{', '.join(self.experiments)}" + (f" ({why})" if why else "")
             )
+        labels = [group.label for group in chosen.groups]
+        tags = {"compared": ",".join(labels)}
+        with tracking.opened(uri, "compare", ", ".join(labels), tags, tracking.flatten(config)) as tracked:
+            found, text = self._compared(chosen, seed, folder)
+            tracked.log(
+                {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in found for method in c.methods}
+            )
+            tracked.log_files(folder)
+        print(text)
+        tables = [logged.where_runs(uri, name) for name in dict.fromkeys(self.experiments)]
+        lines = dict.fromkeys(line for table in tables for line in table.splitlines())  # one command for all
+        print(f"results: {folder}", *lines, sep="\n")
+        return found
+
+    def _compared(self, chosen: Selection, seed: int, folder: Path) -> tuple[list[Comparison], str]:
+        """Every group's comparison, with the files in ``folder``; and the text of compare.md."""
         found, parts, documents = [], [], []
         for group in chosen.groups:
             runs = [read_run(run) for run in group.runs]
@@ -71,15 +87,7 @@ class Compare:
             json.dumps({"comparisons": documents, "left_out": left}, indent=1)
         )
         (folder / "compare.md").write_text(text + "\n")
-        metrics = {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in found for method in c.methods}
-        labels = [comparison.setting for comparison in found]
-        tracking.log_run(
-            uri, "compare", ", ".join(labels), {"compared": ",".join(labels)}, tracking.flatten(config), metrics,
-            {}, folder,
-        )  # fmt: skip
-        print(text)
-        print(f"results: {folder}\nmlflow ui --backend-store-uri {uri}")
-        return found
+        return found, text
 
 
 def _slug(comparison: Comparison) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neural_sim.report import tracking
+from neural_sim.report import logged
 from neural_sim.report.bootstrap import Matches, match
 from neural_sim.types import LabelledImages
 
@@ -84,10 +84,10 @@ def candidates(uri: str, experiments: Sequence[str]) -> list[Candidate]:
     Raises:
         ValueError: no such experiment.
     """
-    return [_candidate(run, name) for name in dict.fromkeys(experiments) for run in tracking.runs(uri, name)]
+    return [_candidate(run, name) for name in dict.fromkeys(experiments) for run in logged.runs(uri, name)]
 
 
-def _candidate(run: tracking.LoggedRun, experiment: str) -> Candidate:
+def _candidate(run: logged.LoggedRun, experiment: str) -> Candidate:
     missing = [name for name in FILES if name not in run.files]
     if run.status != "FINISHED":
         return Candidate(run.name, run.run_id, experiment, unusable=f"its status in MLflow is {run.status}")

@@ -1,23 +1,92 @@
-"""A run in MLflow: its final numbers as metrics, its iterations as series, its folder as artifacts."""
+"""A run in MLflow: its iterations as series while they end, its final numbers, its folder as artifacts."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from neural_sim.report import tracking
 from neural_sim.report.run import RunResults
 
+_COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "products", "cpu_seconds")
 _CERTIFIED = (
     "stationarity", "solver_steps", "solver_residual", "damping", "curvature_min", "curvature_max", "condition",
     "sensitivity", "cosine",
 )  # fmt: skip
 
 
-def track(results: RunResults, uri: str, folder: Path) -> str:
-    """The run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
-    metrics = {f"seconds/{stage}": spent for stage, spent in results.seconds.items()}
-    metrics |= results.memory
+class LiveRun:
+    """A run in MLflow while its stages go on. Iterations and fields that are told again are written once."""
+
+    def __init__(self, run: tracking.Run, names: Sequence[str]) -> None:
+        self._run, self._names = run, names
+        self._iterations, self._fields = 0, set[str]()
+
+    @property
+    def where(self) -> str:
+        """How to look at it, see :func:`tracking.where`."""
+        return self._run.where
+
+    def iteration(self, record: Mapping[str, Any]) -> None:
+        """Write an iteration of the psi loop that has just ended."""
+        self._run.log(_of_iteration(record, self._names), self._iterations)
+        self._iterations += 1
+
+    def iterations(self, records: Sequence[Mapping[str, Any]]) -> None:
+        """Write those that were not written when they ended: the loop's result was in the store."""
+        for record in records[self._iterations :]:
+            self.iteration(record)
+
+    def fields(self, histories: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
+        """Write the scores of fields while they were fitted, by object."""
+        for name in histories.keys() - self._fields:
+            rows = histories[name]
+            scores = {key: [row[key] for row in rows if key in row] for key in ("psnr", "ssim")}
+            self._run.log_series({f"field/{name}/{key}": values for key, values in scores.items()})
+            self._fields.add(name)
+
+    def stage(self, name: str, seconds: float) -> None:
+        """Write what a stage that has just ended took."""
+        self._run.log({f"seconds/{name}": seconds})
+
+    def finish(self, results: RunResults, folder: Path) -> None:
+        """Write what is left: iterations and fields from the store, final numbers, and ``folder`` as artifacts."""
+        self.iterations(results.records)
+        self.fields(results.fields)
+        self._run.log(_final(results))
+        self._run.log_series(_curve(results))
+        self._run.log_files(folder)
+
+
+@contextmanager
+def live_run(
+    uri: str,
+    experiment: str,
+    method: str,
+    seed: int,
+    names: Sequence[str],
+    biased: Sequence[str],
+    config: Mapping[str, Any],
+) -> Iterator[LiveRun]:
+    """A run with the configuration as its parameters, RUNNING inside, see :func:`tracking.opened`."""
+    gap = config.get("gap", "disjoint")
+    name = f"{method} seed {seed}" + ("" if gap == "disjoint" else f" gap {gap}")
+    tags = {
+        "method": method,
+        "seed": str(seed),
+        "parameter": ",".join(config["parameter"]),
+        "biased": ",".join(biased),
+        "gap": gap,
+    }
+    with tracking.opened(uri, experiment, name, tags, tracking.flatten(config)) as run:
+        yield LiveRun(run, names)
+
+
+def _final(results: RunResults) -> dict[str, float]:
+    metrics = dict(results.memory)
     if results.validation_ap is not None:
         metrics["validation_ap"] = results.validation_ap
     for which, scores in results.ap.items():
@@ -26,53 +95,25 @@ def track(results: RunResults, uri: str, folder: Path) -> str:
     for name, factors in results.total_variations().items():
         for factor, distances in factors.items():
             metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
-    return tracking.log_run(
-        uri,
-        results.experiment,
-        _name(results),
-        {
-            "method": results.method,
-            "seed": str(results.seed),
-            "parameter": ",".join(results.config["parameter"]),
-            "biased": ",".join(results.biased),
-            "gap": results.config.get("gap", "disjoint"),
-        },
-        tracking.flatten(results.config),
-        metrics,
-        _series(results) | _curve(results),
-        folder,
-    )
+    return metrics
 
 
-def _name(results: RunResults) -> str:
-    gap = results.config.get("gap", "disjoint")
-    return f"{results.method} seed {results.seed}" + ("" if gap == "disjoint" else f" gap {gap}")
-
-
-def _series(results: RunResults) -> dict[str, list[float]]:
-    series: dict[str, list[float]] = {}
-    for record in results.records:
-        for i, name in enumerate(results.names):
-            for factor, probabilities in record["probabilities"].items():
-                for b, p in enumerate(probabilities[i]):
-                    series.setdefault(f"psi/{name}/{factor}/bin_{b + 1}", []).append(p)
-                series.setdefault(f"psi/{name}/{factor}/entropy", []).append(record["entropies"][factor][i])
-            if record["certificate"]:
-                series.setdefault(f"psi/{name}/gradient_norm", []).append(record["gradient_norms"][i])
-                for factor, p_value in record["certificate"]["p_values"].get(name, {}).items():
-                    series.setdefault(f"psi/{name}/{factor}/p_value", []).append(p_value)
-                for factor, action in record["certificate"]["actions"].get(name, {}).items():
-                    series.setdefault(f"psi/{name}/{factor}/trusted", []).append(float(action == "kept"))
-        for key in ("validation_loss", "training_loss", "images", "detector_steps", "products"):
-            series.setdefault(f"psi/{key}", []).append(record[key])
-        for key in _CERTIFIED if record["certificate"] else ():
-            series.setdefault(f"psi/{key}", []).append(record["certificate"][key])
-        for phase, spent in record["seconds"].items():
-            series.setdefault(f"psi/seconds_{phase}", []).append(spent)
-    for name, history in results.fields.items():
-        for key in ("psnr", "ssim"):
-            series[f"field/{name}/{key}"] = [row[key] for row in history if key in row]
-    return series
+def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    certificate = record["certificate"]
+    for i, name in enumerate(names):
+        for factor, probabilities in record["probabilities"].items():
+            own = f"psi/{name}/{factor}"
+            found |= {f"{own}/bin_{b}": p for b, p in enumerate(probabilities[i], 1)}
+            found[f"{own}/entropy"] = record["entropies"][factor][i]
+        if certificate:
+            p_values, actions = (certificate[key].get(name, {}) for key in ("p_values", "actions"))
+            found |= {f"psi/{name}/{factor}/p_value": value for factor, value in p_values.items()}
+            found |= {f"psi/{name}/{factor}/trusted": float(a == "kept") for factor, a in actions.items()}
+            found[f"psi/{name}/gradient_norm"] = record["gradient_norms"][i]
+    found |= {f"psi/{key}": record[key] for key in _COUNTED}
+    found |= {f"psi/{key}": certificate[key] for key in (_CERTIFIED if certificate else ())}
+    return found | {f"psi/seconds_{phase}": spent for phase, spent in record["seconds"].items()}
 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:

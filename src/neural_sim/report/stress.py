@@ -66,8 +66,10 @@ def write(results: Sequence[Result], folder: Path) -> Path:
     return path
 
 
-def track(results: Sequence[Result], config: Mapping[str, Any], uri: str, folder: Path) -> str:
-    """The suite as a run in MLflow, with ``folder`` as its artifacts; returns the run's id."""
+def track(
+    results: Sequence[Result], config: Mapping[str, Any], uri: str, folder: Path, begun: float | None = None
+) -> tracking.Run:
+    """The suite as a run in MLflow that began at ``begun`` (seconds since 1970), with ``folder`` as its artifacts."""
     metrics = {"checks": float(len(results)), "failed": float(len(failures(results)))}
     for name, held in by_case(results).items():
         metrics |= {
@@ -78,14 +80,14 @@ def track(results: Sequence[Result], config: Mapping[str, Any], uri: str, folder
     name = f"seed {config['seed']}"
     parameters = tracking.flatten({"stress": config["stress"], "seed": config["seed"]})
     tags = {"seed": str(config["seed"])}
-    return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder)
+    return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder, begun)
 
 
-def report(results: Sequence[Result], config: Mapping[str, Any], folder: Path) -> int:
-    """Write, log and print; returns the number of checks that failed."""
+def report(results: Sequence[Result], config: Mapping[str, Any], folder: Path, begun: float) -> int:
+    """Write, log and print; returns the number of checks that failed. ``begun``: when, in seconds since 1970."""
     path = write(results, folder)
     uri = tracking.tracking_uri(config["paths"]["mlflow"])
-    track(results, config, uri, folder)
+    run = track(results, config, uri, folder, begun)
     print(table(results))
-    print(f"results: {path}\nmlflow ui --backend-store-uri {uri}")
+    print(f"results: {path}\n{run.where}")
     return len(failures(results))

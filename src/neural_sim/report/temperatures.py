@@ -28,8 +28,10 @@ def report_temperatures(
     config: Mapping[str, Any],
     uri: str,
     folder: Path,
-) -> None:
-    """Figure, temperatures.md and temperatures.json in ``folder``, and a run in MLflow."""
+    begun: float,
+) -> tracking.Run:
+    """Figure, temperatures.md and temperatures.json in ``folder``, and a run in MLflow that began at ``begun`` (seconds
+    since 1970)."""
     folder.mkdir(parents=True, exist_ok=True)
     document = {
         key: [dataclasses.asdict(x) for x in held] for key, held in (("rows", rows), ("truths", truths))
@@ -44,8 +46,9 @@ def report_temperatures(
         for key in ("bias", "spread", "cosine")
     }
     tags = {"method": "pathwise", "seed": str(seed)}
-    tracking.log_run(uri, experiment, f"seed {seed}", tags, tracking.flatten(config), {}, series, folder)
     print(text)
+    parameters = tracking.flatten(config)
+    return tracking.log_run(uri, experiment, f"seed {seed}", tags, parameters, {}, series, folder, begun)
 
 
 def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:

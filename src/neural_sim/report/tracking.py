@@ -1,17 +1,27 @@
-"""A run in MLflow: one per method and seed, its stages as metric prefixes, figures and files as artifacts."""
+"""Runs in MLflow: opened when work begins, and written to while it goes on."""
 
 from __future__ import annotations
 
 import logging
 import math
 import os
+import re
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 _log = logging.getLogger(__name__)
+
+KIND = ("mlflow.experimentKind", "custom_model_development")
+"""The tag by which versions of MLflow that go by tags show an experiment as model training."""
+TRAINING = "workflowType=machine_learning"
+"""What an address says for versions whose pages go by a switch, which stands at GenAI in a new browser: without it they
+show an empty page of traces."""
+BATCH = 100
+"""Rows of one kind in a request; MLflow takes no more parameters at once."""
 
 
 def tracking_uri(location: str) -> str:
@@ -27,6 +37,132 @@ def tracking_uri(location: str) -> str:
     return f"sqlite:///{Path(location).resolve()}"
 
 
+def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
+    """How to look at a run, or at an experiment's table of runs: an address, after the command that serves it."""
+    path = f"/#/experiments/{experiment_id}/runs" + (f"/{run_id}" if run_id else "") + f"?{TRAINING}"
+    if uri.startswith(("http://", "https://")):
+        return uri.rstrip("/") + path
+    if uri.startswith("databricks"):
+        return f"{uri}: experiment {experiment_id}" + (f", run {run_id}" if run_id else "")
+    return f"mlflow ui --backend-store-uri {uri}\nhttp://127.0.0.1:5000{path}"
+
+
+class Run:
+    """A run that is open in MLflow. Values that are not finite are left out, since MLflow's charts break on them.
+
+    What the store refuses for now (a server that is away, a locked database) does not stop the work: it is logged as a
+    warning, kept, and sent with what comes next, at the latest when the run is closed. ``clock`` gives the rows'
+    time in seconds since 1970.
+    """
+
+    def __init__(self, client: Any, uri: str, info: Any, clock: Callable[[], float] = time.time) -> None:
+        self.uri, self.run_id, self.experiment_id = uri, info.run_id, info.experiment_id
+        self._client, self._clock, self._waiting = client, clock, []
+
+    @property
+    def where(self) -> str:
+        """How to look at it, see :func:`where`."""
+        return where(self.uri, self.experiment_id, self.run_id)
+
+    def log(self, metrics: Mapping[str, float], step: int = 0) -> None:
+        """Write numbers of now."""
+        self.log_series({key: {step: value} for key, value in metrics.items()})
+
+    def log_series(self, series: Mapping[str, Sequence[float] | Mapping[int, float]]) -> None:
+        """Write values by step, or one a step from 0, with the time of now."""
+        from mlflow.entities import Metric
+
+        now = int(1000 * self._clock())
+        for key, values in series.items():
+            steps = values.items() if isinstance(values, Mapping) else enumerate(values)
+            name = _allowed(key)
+            self._waiting += [Metric(name, float(v), now, step) for step, v in steps if math.isfinite(v)]
+        self._try("metrics wait for the next writing", self._send)
+
+    def log_files(self, folder: Path) -> None:
+        """Copy a folder to the run's artifacts."""
+        self._client.log_artifacts(self.run_id, str(folder))
+
+    def close(self, status: str, error: BaseException | None = None) -> None:
+        """Send what waits and end the run. ``error``, its cause, becomes a tag; then what the store refuses is a
+        warning."""
+        if error is None:
+            self._send()
+            self._end(status)
+            return
+        text = f"{type(error).__name__}: {error}".splitlines()[0][:500]
+        self._try("the last metrics are lost", self._send)
+        self._try("its cause is not noted", lambda: self._client.set_tag(self.run_id, "error", text))
+        self._try(f"the run stays open, want {status}", lambda: self._end(status))
+
+    def parameters(self, parameters: Mapping[str, Any]) -> None:
+        """Write the configuration."""
+        from mlflow.entities import Param
+
+        pairs = [Param(_allowed(key), str(value)[:6000]) for key, value in parameters.items()]
+        for start in range(0, len(pairs), BATCH):
+            with _guard(self.uri):
+                self._client.log_batch(self.run_id, params=pairs[start : start + BATCH])
+
+    def _send(self) -> None:
+        while self._waiting:
+            with _guard(self.uri):
+                self._client.log_batch(self.run_id, metrics=self._waiting[:BATCH])
+            del self._waiting[:BATCH]
+
+    def _end(self, status: str) -> None:
+        with _guard(self.uri):
+            self._client.set_terminated(self.run_id, status, int(1000 * self._clock()))
+
+    def _try(self, otherwise: str, act: Callable[[], object]) -> None:
+        from mlflow.exceptions import MlflowException
+
+        try:
+            act()
+        except MlflowException as error:
+            _log.warning("mlflow: run %s: %s (%s)", self.run_id, otherwise, str(error).splitlines()[0])
+
+
+@contextmanager
+def opened(
+    uri: str,
+    experiment: str,
+    name: str,
+    tags: Mapping[str, str],
+    parameters: Mapping[str, Any],
+    begun: float | None = None,
+    clock: Callable[[], float] = time.time,
+) -> Iterator[Run]:
+    """A run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after Ctrl-C.
+
+    ``begun`` is when the work began if that was before now, in seconds since 1970. A new SQLite store is created, and
+    every store written to, under a lock, so that the workers of a sweep can share it.
+
+    Raises:
+        ValueError: a store that cannot be written to.
+    """
+    with quiet():
+        from mlflow.exceptions import MlflowException
+
+        start = int(1000 * (clock() if begun is None else begun))
+        try:
+            client = connect(uri)
+            with _guard(uri):
+                experiment_id = _experiment_id(client, uri, experiment)
+                tags = {**tags, "source": "neural-sim"}
+                made = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
+        except MlflowException as error:
+            raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error
+    run = Run(client, uri, made.info, clock)
+    try:
+        run.parameters(parameters)
+        yield run
+    except BaseException as error:
+        run.close("KILLED" if _interrupted(error) else "FAILED", error)
+        raise
+    run.close("FINISHED")
+
+
 def log_run(
     uri: str,
     experiment: str,
@@ -36,84 +172,18 @@ def log_run(
     metrics: Mapping[str, float],
     series: Mapping[str, Sequence[float] | Mapping[int, float]],
     artifacts: Path,
-) -> str:
-    """Write one finished run and return its id.
+    begun: float | None = None,
+) -> Run:
+    """Write a run that is over, ``begun`` as in :func:`opened`.
 
     ``series`` holds a value a step (``psi/pitcher/bin_3``), or values by their steps, ``metrics`` final numbers
-    (``evaluate/learned/ap``). Non-finite values are left out, since MLflow's charts break on them. A new SQLite store
-    is created once, under a lock, so that sweep workers that start together do not race for its tables.
+    (``evaluate/learned/ap``).
     """
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from mlflow import MlflowClient
-        from mlflow.entities import Metric, Param, RunTag
-
-        for noisy in ("mlflow", "alembic", "sqlalchemy"):
-            logging.getLogger(noisy).setLevel(logging.WARNING)
-        client = _client(MlflowClient, uri)
-        experiment_id = _experiment_id(client, uri, experiment)
-        run = client.create_run(experiment_id, run_name=name, tags=dict(tags))
-        run_id = run.info.run_id
-        now = run.info.start_time
-        rows = [Metric(k, float(v), now, 0) for k, v in metrics.items() if math.isfinite(v)]
-        for key, values in series.items():
-            steps = values.items() if isinstance(values, Mapping) else enumerate(values)
-            rows += [Metric(key, float(v), now, step) for step, v in steps if math.isfinite(v)]
-        pairs = [Param(k, str(v)[:6000]) for k, v in parameters.items()]
-        for start in range(0, max(len(rows), len(pairs), 1), 100):
-            window = slice(start, start + 100)
-            client.log_batch(
-                run_id, metrics=rows[window], params=pairs[window], tags=[RunTag("source", "neural-sim")]
-            )
-        client.log_artifacts(run_id, str(artifacts))
-        client.set_terminated(run_id)
-    return run_id
-
-
-@dataclass(frozen=True)
-class LoggedRun:
-    """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one."""
-
-    run_id: str
-    name: str
-    status: str
-    files: frozenset[str]
-    fetch: Callable[[str], Path]
-
-
-def runs(uri: str, experiment: str) -> list[LoggedRun]:
-    """All runs of an experiment that are not deleted, the latest first.
-
-    Raises:
-        ValueError: no experiment of that name.
-    """
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from mlflow import MlflowClient
-
-        client = _client(MlflowClient, uri)
-        found = client.get_experiment_by_name(experiment)
-        if found is None:
-            known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
-            raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
-        order, logged, token = ["attributes.start_time DESC"], [], None
-        while token != "":
-            page = client.search_runs([found.experiment_id], order_by=order, page_token=token)
-            logged += [_logged(client, run.info) for run in page]
-            token = page.token or ""
-    return logged
-
-
-def _logged(client: Any, info: Any) -> LoggedRun:
-    files = frozenset(item.path for item in client.list_artifacts(info.run_id))
-
-    def fetch(name: str) -> Path:
-        return Path(client.download_artifacts(info.run_id, name))
-
-    return LoggedRun(info.run_id, info.run_name, info.status, files, fetch)
+    with opened(uri, experiment, name, tags, parameters, begun) as run:
+        run.log(metrics)
+        run.log_series(series)
+        run.log_files(artifacts)
+    return run
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -128,33 +198,66 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _client(make: Any, uri: str) -> Any:
-    if not uri.startswith("sqlite:///"):
-        return make(tracking_uri=uri)
-    import fcntl
+def _allowed(name: str) -> str:
+    """A name of MLflow's characters: those of an object need not be."""
+    return re.sub(r"[^/\w.\- :]", "_", name)
 
-    database = Path(uri.removeprefix("sqlite:///"))
-    database.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{database}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        client = make(tracking_uri=uri)
-        client.search_experiments(max_results=1)
+
+def _interrupted(error: BaseException) -> bool:
+    """Ctrl-C, or the SystemExit that Lightning makes of it."""
+    return any(isinstance(e, KeyboardInterrupt) for e in (error, error.__context__, error.__cause__))
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the noise that MLflow and its database make when they are imported and when a store is created."""
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for noisy in ("mlflow", "alembic", "sqlalchemy"):
+            logging.getLogger(noisy).setLevel(logging.WARNING)
+        yield
+
+
+def _database(uri: str) -> Path | None:
+    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
+
+
+def _guard(uri: str) -> AbstractContextManager[Any]:
+    """One writer at a time for a SQLite file, among this program's processes."""
+    from filelock import FileLock
+
+    database = _database(uri)
+    return nullcontext() if database is None else FileLock(f"{database}.lock")
+
+
+def connect(uri: str) -> Any:
+    """A client of a store, which is created if it is a SQLite file that is not there yet."""
+    from mlflow import MlflowClient
+
+    if (database := _database(uri)) is not None:
+        database.parent.mkdir(parents=True, exist_ok=True)
+    with _guard(uri):
+        client = MlflowClient(tracking_uri=uri)
+        client.search_experiments(max_results=1)  # creates the tables of a new database
     return client
 
 
 def _experiment_id(client: Any, uri: str, name: str) -> str:
+    """The experiment, made where there is none, with the tag of model training unless it has one of its kind."""
     from mlflow.exceptions import MlflowException
 
     found = client.get_experiment_by_name(name)
     if found is None:
-        location = None
-        if uri.startswith("sqlite:///"):
-            location = (Path(uri.removeprefix("sqlite:///")).parent / "mlartifacts" / name).as_uri()
+        database = _database(uri)
+        location = None if database is None else (database.parent / "mlartifacts" / name).as_uri()
         try:
-            return client.create_experiment(name, artifact_location=location)
-        except MlflowException as error:  # another worker was first
+            return client.create_experiment(name, artifact_location=location, tags=dict([KIND]))
+        except MlflowException as error:  # another machine was first at a server
             _log.info("mlflow: %s", error)
             found = client.get_experiment_by_name(name)
             if found is None:
                 raise
+    if KIND[0] not in found.tags:
+        client.set_experiment_tag(found.experiment_id, *KIND)
     return found.experiment_id

@@ -1,0 +1,67 @@
+"""Runs read back from MLflow."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neural_sim.report.tracking import connect, quiet, where
+
+
+@dataclass(frozen=True)
+class LoggedRun:
+    """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one."""
+
+    run_id: str
+    name: str
+    status: str
+    files: frozenset[str]
+    fetch: Callable[[str], Path]
+
+
+def runs(uri: str, experiment: str) -> list[LoggedRun]:
+    """All runs of an experiment that are not deleted, the latest first.
+
+    Raises:
+        ValueError: no experiment of that name.
+    """
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    with quiet():
+        client = connect(uri)
+        order, logged, token = ["attributes.start_time DESC"], [], None
+        experiment_id = _experiment_id(client, uri, experiment)
+        while token != "":
+            page = client.search_runs([experiment_id], order_by=order, page_token=token)
+            logged += [_logged(client, run.info) for run in page]
+            token = page.token or ""
+    return logged
+
+
+def where_runs(uri: str, experiment: str) -> str:
+    """How to look at an experiment's table of runs, see :func:`tracking.where`.
+
+    Raises:
+        ValueError: no experiment of that name.
+    """
+    with quiet():
+        return where(uri, _experiment_id(connect(uri), uri, experiment))
+
+
+def _logged(client: Any, info: Any) -> LoggedRun:
+    files = frozenset(item.path for item in client.list_artifacts(info.run_id))
+
+    def fetch(name: str) -> Path:
+        return Path(client.download_artifacts(info.run_id, name))
+
+    return LoggedRun(info.run_id, info.run_name, info.status, files, fetch)
+
+
+def _experiment_id(client: Any, uri: str, experiment: str) -> str:
+    found = client.get_experiment_by_name(experiment)
+    if found is None:
+        known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
+        raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
+    return found.experiment_id
