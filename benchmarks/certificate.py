@@ -221,9 +221,9 @@ images of each bin).
 {laws}
 
 Each p-value, but of relaxed draws, is the larger of two. One is exact where scores do not depend on what was drawn,
-the other where they scatter symmetrically. Skewed scores pass too often where bins scatter differently too. No test of means holds its level for every law of the scores (Bahadur and Savage
-1956), so the detector's own were asked: {images} of every bin at the warm start of `pose_gap`, their bins' means taken
-out, drawn from again.
+the other where they scatter symmetrically. Skewed scores pass too often where bins scatter differently too. No test of
+means holds its level for every law of the scores (Bahadur and Savage 1956), so the detector's own were asked: {images}
+of every bin at the warm start of `pose_gap`, their bins' means taken out, drawn from again.
 
 {own}
 """
