@@ -14,7 +14,7 @@ from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Para
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.significance import no_association, zero_mean
+from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import Factor, SceneDistribution
@@ -107,12 +107,11 @@ class ReinforceEstimator:
 
 
 def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
-    """p-value of the null that all bins have one mean score; of lights, under which the same scenes are seen one light
-    after the other, that a scene's scores differ by nothing but chance."""
+    """p-value of the null that all bins, or all lights, have one mean score; the same scenes are seen under one light
+    after the other."""
     if isinstance(factor, BinnedFactor):
         return no_association(scores, one_hot(strata, factor.size))
-    scenes = scores.view(factor.size, -1).T
-    return zero_mean(scenes - scenes.mean(-1, keepdim=True))
+    return no_difference(scores.view(factor.size, -1).T)
 
 
 def _drawn(distribution: SceneDistribution, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:

@@ -68,6 +68,28 @@ def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draw
     return max(flipped, _p_value(own, changed, draws))
 
 
+def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) -> float:
+    """p-value of the null that the same scenes have the same mean score under every light, by random changes of each
+    scene's scores apart from their mean.
+
+    The larger of two p-values, as in :func:`no_association`: each scene's scores permuted among the lights, exact where
+    a scene's scores differ by chance alone, for any law; signs changed, for lights under which scores scatter
+    differently.
+    """
+    apart = scores.double() - scores.double()[:, :1]
+    rows = _scaled((apart - apart.mean(-1, keepdim=True)).flatten()).view_as(apart)
+    flipped = zero_mean(rows, draws)
+    if flipped == 1.0:
+        return 1.0
+
+    def changed(count: int, generator: torch.Generator) -> Tensor:
+        order = torch.rand(count, *rows.shape, generator=generator, dtype=torch.float64).argsort(-1)
+        permuted = rows.expand(count, -1, -1).gather(-1, order)
+        return _statistic(permuted.sum(1), permuted.square().sum(1))
+
+    return max(flipped, _p_value(_statistic(rows.sum(0), rows.square().sum(0)), changed, draws))
+
+
 def _p_value(own: Tensor, changed: Callable[[int, torch.Generator], Tensor], draws: int) -> float:
     generator, beyond = torch.Generator().manual_seed(0), 1
     for first in range(0, draws, _BLOCK):

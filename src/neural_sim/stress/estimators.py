@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.significance import no_association, zero_mean
+from neural_sim.gradient.significance import no_association, no_difference, zero_mean
 from neural_sim.gradient.stratified import allocate, importance_weights, stratified
 from neural_sim.parameter import bins as binned
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
@@ -99,6 +99,8 @@ def significance(scope: Scope) -> Checks:
         "one image": no_association(scores[:1], bins[:1]),
         "an image a bin": no_association(scores[:BINS], bins[::EACH]),
         "a score of NaN": no_association(scores.clone().index_fill_(0, torch.tensor(0), math.nan), bins),
+        "one scene": no_difference(scores[None]),
+        "a scene's scores equal under every light": no_difference(scores[:, None].expand(-1, 3)),
         "no rows but zeros": zero_mean(torch.zeros_like(rows)),
         "one row beside zeros": zero_mean(lone),
         "a row of inf": zero_mean(rows.clone().index_fill_(0, torch.tensor(0), math.inf)),
