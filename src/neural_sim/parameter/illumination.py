@@ -1,6 +1,6 @@
 """The illumination parameter: psi are affine weights over anchor lights, deterministic and kept on their constraint.
 
-A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.3), so an object's images share one light, and
+A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), so an object's images share one light, and
 psi steps by projected gradient descent. Estimators that need a density draw a Gaussian around psi instead and score the
 draw as it was before its projection: the projected one has no density.
 """
@@ -165,7 +165,7 @@ class ProjectedGradient:
 
 @dataclass(frozen=True)
 class PlainProjectedGradient:
-    """Projected gradient descent as it stands in books, with momentum: the paper's step of lights (Sec. 3.3).
+    """Projected gradient descent as it stands in books, with momentum: the paper's step of lights (Sec. 3.2).
 
     ``v <- momentum v + gradient``, ``psi <- project(psi - learning_rate v)``: no gradient's size is taken out, nothing
     is shrunk or bounded. ``learning_rate`` is in weights per unit of the gradient.

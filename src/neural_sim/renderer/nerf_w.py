@@ -19,7 +19,7 @@ from neural_sim.types import Maps, PinholeCamera, Rays
 class NerfWRenderer(NerfRenderer):
     """``NerfRenderer`` whose views have weights over the field's anchors, normally adding up to 1.
 
-    A view's code is ``weights @ field.anchors`` (paper, Sec. 3.3). Views of equal weights are rendered as one batch
+    A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views of equal weights are rendered as one batch
     under one code. Opacity depends on no weight. Without weights the anchors count equally.
     """
 
