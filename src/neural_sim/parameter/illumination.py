@@ -170,7 +170,7 @@ class ProjectedGradient:
 
 @dataclass(frozen=True)
 class PlainProjectedGradient:
-    """Projected gradient descent as it stands in books, with momentum: the paper's step of lights (Sec. 3.3).
+    """Projected gradient descent as it stands in books, with momentum: the paper's step of lights (Sec. 3.2).
 
     ``v <- momentum v + gradient``, ``psi <- project(psi - learning_rate v)``: no gradient's size is taken out, nothing
     is shrunk or bounded. ``learning_rate`` is in weights per unit of the gradient.
