@@ -1,6 +1,6 @@
 """Every documented run as it is written, through the command line, at smoke scale, on data made here and on one store:
-it ends well and leaves what the documentation promises. Sweeps are cut to their first seed. Comparisons come last,
-after the runs that they compare."""
+it ends well and leaves what the documentation promises. Sweeps are cut to their first seed, and scales that take hours
+to smoke. Comparisons come last, after the runs that they compare."""
 
 import itertools
 import json
@@ -37,17 +37,16 @@ class Runs:
         self.numbers = itertools.count()
 
     def words(self, command):
-        """The command's overrides, with the first of its seeds and made data for its paths."""
-        return [
-            self.data.localise(word) for word in (command.cut(1) if command.multirun else command.overrides)
-        ]
+        """The overrides at smoke scale, with the first of the seeds and made data for paths."""
+        written = command.cut(1) if command.multirun else command.overrides
+        kept = [self.data.localise(word) for word in written if not word.startswith("scale=")]
+        return [*kept, "scale=smoke"]
 
     def folder(self, command):
         """Where the command left its files, which it must have done without an error."""
         if command not in self.folders:
             folder = self.root / "runs" / str(next(self.numbers))
-            added = [] if any(word.startswith("scale=") for word in command.overrides) else ["scale=smoke"]
-            added += [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
+            added = [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
             added.append(f"hydra.{'sweep' if command.multirun else 'run'}.dir={folder}")
             run = [sys.executable, "-m", "src.main", *sorted(command.flags), *self.words(command), *added]
             done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=3000)
