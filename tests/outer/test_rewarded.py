@@ -1,5 +1,7 @@
 """The loop of reward methods: rounds, what is counted, and that psi is the method's."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -47,3 +49,17 @@ def test_the_best_psi_is_that_of_the_lowest_validation_loss(inner):
     p = learned.records[losses.index(min(losses))].probabilities["pose"]
     factor = SceneDistribution.of([Pose(bins=4)]).factors[0]
     torch.testing.assert_close(factor.log_probabilities(learned.last).exp(), torch.tensor(p).double())
+
+
+def test_an_observer_sees_each_iteration_when_it_has_ended_at_no_cost_of_the_method(inner, monkeypatch):
+    clock, seen = [0.0], []
+    loop = RewardLoop(inner(), torch.zeros(2, 4), RandomSearch(rounds=2))
+
+    def observe(record):
+        seen.append((record, len(loop.records), len(loop.trajectory)))
+        clock[0] += 100.0
+
+    monkeypatch.setattr("neural_sim.outer.loop.time", SimpleNamespace(process_time=lambda: clock[0]))
+    learned = learn_psi(loop, progress=False, on_record=observe)
+    assert seen == [(record, i + 1, i + 2) for i, record in enumerate(learned.records)] and len(seen) == 4
+    assert [record.cpu_seconds for record in learned.records[1:]] == [0.0] * 3

@@ -80,7 +80,7 @@ def test_a_methods_runs_share_the_settings_of_the_newest():
         ("lts", 1, "4"),
     ]
     assert reasons(selection)["2"].startswith(
-        "other settings than the newest run of lts, lts seed 1 (00000004): baseline.learning_rate is 2, not absent"
+        "not run as the newest of lts, lts seed 1 (00000004): baseline.learning_rate is 2, not absent"
     )
 
 

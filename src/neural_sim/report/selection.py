@@ -101,11 +101,7 @@ class Selection:
         for run in runs:
             if run not in kept:
                 differs = differences(all_values(run.results), all_values(newest.results))
-                self._leave(
-                    [run],
-                    f"other settings than the newest run of {run.method}, {_named(newest)}: {differs}. A baseline.name "
-                    "of its own would make it a method of its own",
-                )
+                self._leave([run], f"not run as the newest of {run.method}, {_named(newest)}: {differs}")
         return kept
 
     def _newest(self, runs: Sequence[Candidate]) -> dict[int, Candidate]:
