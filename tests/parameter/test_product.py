@@ -64,9 +64,13 @@ def test_what_nothing_learns_is_uniform_in_its_range(generator):
     assert draw.phi.min() < 0.05 and draw.phi.max() > 2 * math.pi - 0.05
     assert math.radians(10) <= draw.rho.min() and draw.rho.max() <= math.radians(20)
     assert draw.magnification is None
-    pose = SceneDistribution.of([Pose()], unlearned)  # a pose draws both angles
+    pose = SceneDistribution.of([Pose()], unlearned)
     draw = pose.hard(torch.zeros(8), pose.draw_noise(2_000, generator))
-    assert draw.rho.min() < -0.7 and draw.distance.min() >= 3.0 and draw.distance.max() <= 5.0
+    assert draw.distance.min() >= 3.0 and draw.distance.max() <= 5.0
+    assert math.radians(10) <= draw.rho.min() and draw.rho.max() <= math.radians(20)
+    own = SceneDistribution.of([Pose(other_range_deg=(-45.0, 45.0))], unlearned)  # a pose may say it itself
+    draw = own.hard(torch.zeros(8), own.draw_noise(2_000, generator))
+    assert draw.rho.min() < -0.7 and draw.rho.max() > 0.7
 
 
 def test_both_angles_are_two_factors(generator):
