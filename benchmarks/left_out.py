@@ -25,15 +25,14 @@ from render import variants
 from tolerance import State, shortened, state
 from torch import Tensor
 
-from neural_sim import codec
-from neural_sim.artifacts import Artifacts
 from neural_sim.field.pool import build_pool
-from neural_sim.field.training import field_from_state
 from neural_sim.gradient.mixed import scores
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator
+from neural_sim.stages.context import Context
+from neural_sim.stages.field import FieldStage
 from neural_sim.synthesis.pool import ImagePool
 
 Row = dict[str, Any]
@@ -49,10 +48,15 @@ def clocked(work: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
     return statistics.median(spent), found
 
 
-def fields(made: Artifacts, name: str) -> list[Row]:
+def field_of(context: Context, name: str) -> FieldStage:
+    """The stage of one object's field."""
+    return next(stage for stage in context.graph.fields if stage.views.object == name)
+
+
+def fields(context: Context, name: str) -> list[Row]:
     """A field of one object as configured, with rays from every pixel, and with a colour head that sees directions."""
-    views = codec.unpack_views(made.views(name))
-    recipe, held_out, device = made.x.field, made.x.views.held_out, torch.device("cpu")
+    stage, device = field_of(context, name), torch.device("cpu")
+    views, recipe, held_out = context.results(stage.views), stage.recipe, stage.views.settings.held_out
 
     def fit(changed: Any) -> dict[str, float]:
         return changed.fit(views, held_out, device)[1][-1]
@@ -73,21 +77,26 @@ def fields(made: Artifacts, name: str) -> list[Row]:
     ]  # fmt: skip
 
 
-def renders(made: Artifacts, name: str) -> list[Row]:
+def renders(context: Context, name: str) -> list[Row]:
     """The final quality with each omission undone, and the lower qualities."""
-    field, views = field_from_state(made.field(name)["field"]), codec.unpack_views(made.views(name))
+    stage = field_of(context, name)
+    field, views = context.results(stage).field, context.results(stage.views)
     rows = []
     for label, renderer in variants(["final", "normal", "draft"], True).items():
-        found = measure_render(field, renderer, views, made.x.training.image_size, 3)
+        found = measure_render(field, renderer, views, context.experiment.training.image_size, 3)
         error = f"opacity {found['opacity_error']:.1e}, colour {found['colour_psnr']:.1f} dB"
         rows.append({"omission": label, "seconds": found["milliseconds"] / 1e3, "error": error})
     return rows
 
 
-def loops(made: Artifacts) -> list[Row]:
+def loops(context: Context) -> list[Row]:
     """One hypergradient with each omission of the loop put in, against one without any."""
-    at, outer, random = state(made, "initial", 0), made.x.outer, torch.Generator().manual_seed(1)
-    damping = made.x.solver.damping
+    at, outer, random = (
+        state(context, "initial", 0),
+        context.experiment.loop.outer,
+        torch.Generator().manual_seed(1),
+    )
+    damping = context.experiment.loop.solver.damping
     count = len(at.inner.weights)
 
     def solve(subset: Tensor | None, residual: float) -> tuple[float, Tensor]:
@@ -104,20 +113,20 @@ def loops(made: Artifacts) -> list[Row]:
     truth, error = at.derivative(v)
     few = torch.randperm(count, generator=random)[: outer.curvature_images]
     part, v_few = solve(few, 1e-3)
-    early, v_early = solve(None, made.x.solver.rtol)
+    early, v_early = solve(None, context.experiment.loop.solver.rtol)
     rows = [
         {"omission": "nothing", "seconds": whole, "error": "0"},
         {"omission": f"{count - len(few)} of {count} curvature images", "seconds": part,
          "error": beside(at.derivative(v_few)[0], truth, error)},
-        {"omission": f"products beyond a residual of {made.x.solver.rtol:g}", "seconds": early,
+        {"omission": f"products beyond a residual of {context.experiment.loop.solver.rtol:g}", "seconds": early,
          "error": beside(at.derivative(v_early)[0], truth, error)},
     ]  # fmt: skip
-    return rows + probes(made, at, v, truth, error)
+    return rows + probes(context, at, v, truth, error)
 
 
-def probes(made: Artifacts, at: State, v: Tensor, truth: Tensor, error: Tensor) -> list[Row]:
+def probes(context: Context, at: State, v: Tensor, truth: Tensor, error: Tensor) -> list[Row]:
     """Scores by central differences, and probes from a pool of rendered bins in place of fresh renders."""
-    per_bin, vector = made.x.gradient.probes_per_bin, unflatten(v, at.inner.params)
+    per_bin, vector = context.experiment.loop.gradient.probes_per_bin, unflatten(v, at.inner.params)
     index = torch.cat([probe.index for held in at.probed.probes for probe in held.values()])
     rows = []
     for mode in ("forward", "central_difference"):
@@ -127,14 +136,19 @@ def probes(made: Artifacts, at: State, v: Tensor, truth: Tensor, error: Tensor) 
         rows.append((spent, found))
     relative = float((rows[1][1] - rows[0][1]).norm() / rows[0][1].norm())
     pool_seconds, pool = clocked(
-        lambda: ImagePool.render(made.scene, made.x.outer.pool_per_bin, torch.Generator().manual_seed(2)), 1
+        lambda: ImagePool.render(
+            context.results(context.graph.scene),
+            context.experiment.loop.outer.pool_per_bin,
+            torch.Generator().manual_seed(2),
+        ),
+        1,
     )
     loop = at.loop
     fresh, _ = clocked(lambda: loop.probes(per_bin, torch.Generator().manual_seed(3)), 1)
     pooled, held = clocked(
         lambda: ProbeSet.draw(
-            pool, made.scene, loop.detector, loop.backbone, per_bin, loop.psi,
-            torch.Generator().manual_seed(3), range(len(made.names)),
+            pool, context.results(context.graph.scene), loop.detector, loop.backbone, per_bin, loop.psi,
+            torch.Generator().manual_seed(3), range(len(context.graph.names)),
         ), 1,
     )  # fmt: skip
     changed = dataclasses.replace(at, probed=held)
@@ -172,11 +186,11 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         overrides = ["+experiment=pose_gap", "scale=quick", "progress=false", *arguments.overrides]
-        made = Artifacts(build(compose("config", overrides)))
+        context = Context.of(build(compose("config", overrides)))
     parts = {
-        "one field": fields(made, arguments.name),
-        "an image": renders(made, arguments.name),
-        "one hypergradient": loops(made),
+        "one field": fields(context, arguments.name),
+        "an image": renders(context, arguments.name),
+        "one hypergradient": loops(context),
     }
     for title, rows in parts.items():
         print(table(title, rows), flush=True)

@@ -18,33 +18,42 @@ from hydra import compose, initialize_config_dir
 from machine import machine
 from section import replace_section
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.still import StillLoop
+from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import join
 
 WAY = (0.0, 0.2, 0.4, 0.7, 1.0)
 
 
-def at(made: Artifacts, part: float, seeds: int, per_light: int) -> dict[str, Any]:
+def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, Any]:
     """Validation loss at a point of the way, and its slopes along the way as both derivatives foretell them."""
-    start, target = made.psi("initial"), made.psi("target")
+    start, target = context.graph.psi("initial"), context.graph.psi("target")
     psi, way = torch.lerp(start, target, part), target - start
-    x, rows = made.x, []
+    x, graph, results, rows = context.experiment, context.graph, context.results, []
+    scene, detector = results(graph.scene), graph.warm_start.build()
+    warm_start, validation = results(graph.warm_start).params, results(graph.targets).val
     for seed in range(seeds):
         generator = torch.Generator().manual_seed(seed)
         inner = InnerLoop(
-            made.scene, made.detector, made.warm_start(), made.targets["val"], x.outer, x.training.batch_size,
-            x.training.weight_decay, generator,
+            scene, detector, warm_start, validation, x.loop.outer, x.training.batch_size, x.training.weight_decay,
+            generator,
         )  # fmt: skip
         images = join(inner.draw(psi))
-        inner.train(CachedSet.of(made.detector, inner.backbone, images))
+        inner.train(CachedSet.of(detector, inner.backbone, images))
         loop = StillLoop.at(
-            made.scene, made.detector, inner.theta, psi, images, made.targets["val"], x.solver, generator
+            scene,
+            detector,
+            inner.theta,
+            psi,
+            images,
+            validation,
+            x.loop.solver,
+            generator,
         )
         blends = loop.pathwise(PathwiseEstimator(), x.outer.images_per_object, generator)
         shares = loop.truth(per_light, generator)
@@ -95,8 +104,8 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         overrides = ["+experiment=illumination_gap", "scale=quick", "progress=false", *arguments.overrides]
-        made = Artifacts(build(compose("config", overrides)))
-    rows = [at(made, part, arguments.seeds, arguments.per_light) for part in WAY]
+        context = Context.of(build(compose("config", overrides)))
+    rows = [at(context, part, arguments.seeds, arguments.per_light) for part in WAY]
     found = {"machine": machine(), "seeds": arguments.seeds, "rows": rows}
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps(found, indent=1))

@@ -23,11 +23,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from machine import add_device, forget_peak, gpu, machine
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.devices import placed, synchronise
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import Scene, join
 
 SMALL_FIELDS = [
@@ -44,20 +44,25 @@ def repeated(scene: Scene, count: int) -> Scene:
     return dataclasses.replace(scene, names=names, fields=tuple(scene.fields[i] for i in index))
 
 
-def loop(made: Artifacts, count: int, images: int) -> SimulatorModule:
+def loop(context: Context, count: int, images: int) -> SimulatorModule:
     """The psi loop on ``count`` objects with ``images`` training images of each, from uniform poses."""
     generator = torch.Generator().manual_seed(0)
-    scene = repeated(made.scene, count)
-    detector = made.x.detector(num_classes=count, image_size=made.x.training.image_size)
-    psi = torch.zeros(count, made.psi("initial").shape[1])
-    parts = scene.training_set(psi, made.x.target.val_per_object, generator)
+    scene = repeated(context.results(context.graph.scene), count)
+    detector = context.experiment.detector(
+        num_classes=count, image_size=context.experiment.training.image_size
+    )
+    psi = torch.zeros(count, context.graph.psi("initial").shape[1])
+    parts = scene.training_set(psi, context.experiment.imaging.target.val_per_object, generator)
     validation = join([dataclasses.replace(part, images=part.images.to("cpu")) for part in parts])
-    settings, training = dataclasses.replace(made.x.outer, images_per_object=images), made.x.training
+    settings, training = (
+        dataclasses.replace(context.experiment.loop.outer, images_per_object=images),
+        context.experiment.training,
+    )
     inner = InnerLoop(
-        scene, detector, placed(detector.init(generator), made.device), validation, settings, training.batch_size,
-        training.weight_decay, generator, made.x.gradient.draws,
+        scene, detector, placed(detector.init(generator), context.graph.device), validation, settings,
+        training.batch_size, training.weight_decay, generator, context.experiment.loop.gradient.draws,
     )  # fmt: skip
-    return SimulatorModule(inner, psi, made.x.gradient, made.x.solver)
+    return SimulatorModule(inner, psi, context.experiment.loop.gradient, context.experiment.loop.solver)
 
 
 def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:
@@ -105,7 +110,7 @@ def main() -> None:
     trainer = "trainer=" + ("cpu" if arguments.device.type == "cpu" else "gpu")
     overrides = [*SMALL_FIELDS, trainer, f"paths.store={arguments.store}", *arguments.overrides]
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        made = Artifacts(build(compose("config", overrides)))
+        context = Context.of(build(compose("config", overrides)))
     grid = dict.fromkeys([(count, 50) for count in arguments.objects] + [(6, n) for n in arguments.images])
     print(
         f"{'objects':>7}{'images':>7}"
@@ -114,11 +119,11 @@ def main() -> None:
     )
     rows = []
     for count, images in grid:
-        forget_peak(made.device)
-        module = loop(made, count, images)
+        forget_peak(context.graph.device)
+        module = loop(context, count, images)
         row = {"objects": count, "images": images, **measure(module, arguments.repeats)}
         row["steps"] = module.records[-1].certificate.solver_steps
-        row |= gpu(made.device)
+        row |= gpu(context.graph.device)
         rows.append(row)
         shown = "".join(f"{row[phase]:11.2f}" for phase in PHASES)
         print(f"{count:7}{images:7}{shown}{row['seconds']:8.2f}{row['steps']:7}", flush=True)
@@ -130,7 +135,7 @@ def main() -> None:
             print(f"seconds grow with {size} to the power {slopes[size]['all']:.2f}, "
                   f"{slopes[size]['largest two']:.2f} between the largest two")  # fmt: skip
     result = {
-        "machine": machine(made.device),
+        "machine": machine(context.graph.device),
         "overrides": arguments.overrides,
         "exponents": slopes,
         "rows": rows,

@@ -20,7 +20,6 @@ from machine import machine
 from section import replace_section
 from torch import Tensor
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem
@@ -30,6 +29,7 @@ from neural_sim.outer.still import StillLoop
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos
+from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import join
 
 STEPS = (4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 30)
@@ -59,21 +59,30 @@ class State:
         return found
 
 
-def state(made: Artifacts, which: str, seed: int) -> State:
+def state(context: Context, which: str, seed: int) -> State:
     generator = torch.Generator().manual_seed(seed)
-    outer, training, detector, psi = made.x.outer, made.x.training, made.detector, made.psi(which)
-    backbone = detector.split(made.warm_start())[0]
+    outer, training, detector, psi = (
+        context.experiment.loop.outer,
+        context.experiment.training,
+        context.graph.warm_start.build(),
+        context.graph.psi(which),
+    )
+    backbone = detector.split(context.results(context.graph.warm_start).params)[0]
     cached = CachedSet.of(
-        detector, backbone, join(made.scene.training_set(psi, outer.images_per_object, generator))
+        detector,
+        backbone,
+        join(context.results(context.graph.scene).training_set(psi, outer.images_per_object, generator)),
     )
     theta, _ = train_detector(
         detector, {**detector.init(generator), **backbone}, cached, generator, epochs=outer.epochs,
         batch_size=training.batch_size, learning_rate=outer.learning_rate, weight_decay=training.weight_decay,
     )  # fmt: skip
     trainable = detector.split(theta)[1]
-    validation = CachedSet.of(detector, backbone, made.targets["val"])
-    loop = StillLoop(made.scene, detector, backbone, trainable, {}, psi, "not solved")
-    probed = loop.probes(made.x.gradient.probes_per_bin, generator)
+    validation = CachedSet.of(detector, backbone, context.results(context.graph.targets).val)
+    loop = StillLoop(
+        context.results(context.graph.scene), detector, backbone, trainable, {}, psi, "not solved"
+    )
+    probed = loop.probes(context.experiment.loop.gradient.probes_per_bin, generator)
     inner = InnerProblem(trainable, cached.losses, torch.full((len(cached),), 1.0 / len(cached)))
     return State(inner, gradient(validation.mean_terms(), trainable), loop, probed)
 
@@ -93,9 +102,9 @@ def compare(at: State, v: Tensor, truth: Tensor) -> dict[str, float]:
     }
 
 
-def measure(made: Artifacts, which: str, seeds: int) -> dict[str, Any]:
-    at = state(made, which, 0)
-    damping, random = made.x.solver.damping, torch.Generator().manual_seed(1)
+def measure(context: Context, which: str, seeds: int) -> dict[str, Any]:
+    at = state(context, which, 0)
+    damping, random = context.experiment.loop.solver.damping, torch.Generator().manual_seed(1)
     whole = at.krylov(None, 40)
 
     def damped(subset: Tensor | None) -> float:
@@ -174,8 +183,8 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         overrides = ["+experiment=pose_gap", "scale=quick", "progress=false", *arguments.overrides]
-        made = Artifacts(build(compose("config", overrides)))
-    states = [measure(made, which, arguments.seeds) for which in ("initial", "target")]
+        context = Context.of(build(compose("config", overrides)))
+    states = [measure(context, which, arguments.seeds) for which in ("initial", "target")]
     found = {"machine": machine(), "seeds": arguments.seeds, "states": states}
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps(found, indent=1))

@@ -9,10 +9,10 @@ from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.still import StillLoop, centred
-from neural_sim.synthesis.scene import join
+from neural_sim.stages.context import Context
+from neural_sim.stages.temperatures import still_loop
 
 SMALL = [
     "scale=quick", "progress=false", "training.image_size=64", "views.count=68",
@@ -28,11 +28,8 @@ WORLDS = {
 def make_world(overrides: list[str]) -> StillLoop:
     """Fields and detector from the store, or made now; v by the configured solver."""
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        made = Artifacts(build(compose("config", [*SMALL, *overrides])))
-    psi, generator = made.psi("initial"), torch.Generator().manual_seed(11)
-    images = join(made.scene.training_set(psi, made.x.outer.images_per_object, generator))
-    theta, validation = made.warm_start(), made.targets["val"]
-    return StillLoop.at(made.scene, made.detector, theta, psi, images, validation, made.x.solver, generator)
+        context = Context.of(build(compose("config", [*SMALL, *overrides])))
+    return still_loop(context, seed=11)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
 from neural_sim.outer.inner import pooled
-from neural_sim.parameter.illumination import PlainProjectedGradient
+from neural_sim.parameter.light_update import PlainProjectedGradient
 from neural_sim.parameter.update import SGD, Mirror
+from neural_sim.stages.graph import Graph
 from neural_sim.synthesis.scene import HardDraws
 
 CONF = conf_directory()
@@ -33,16 +34,16 @@ def experiment(*overrides):
 def test_every_baseline_takes_every_parameter(baseline, parameter):
     lights = ["renderer=nerf_w"] if "illumination" in parameter else []
     made = experiment(f"baseline={baseline}", f"parameter={parameter}", *lights)
-    assert made.baseline.name == ("neural_sim" if baseline == "none" else baseline)
-    assert ",".join(made.distribution.names) == parameter.strip("[]")
+    assert made.loop.method.name == ("neural_sim" if baseline == "none" else baseline)
+    assert ",".join(made.imaging.distribution.names) == parameter.strip("[]")
 
 
 @pytest.mark.parametrize(("name", "gap"), itertools.product(EXPERIMENTS, ("disjoint", "uniform", "same")))
 def test_every_experiment_has_biased_objects_at_every_gap(name, gap):
     made = experiment(f"+experiment={name}", f"gap={gap}")
-    assert made.name == name and made.distribution.biased
-    names = list(made.distribution.biased)
-    initial, target = (made.distribution.psi(which, names) for which in ("initial", "target"))
+    assert made.run.name == name and made.imaging.distribution.biased
+    names = list(made.imaging.distribution.biased)
+    initial, target = (made.imaging.distribution.psi(which, names) for which in ("initial", "target"))
     equal = [bool((a - b).abs().max() < 1e-9) for a, b in zip(initial, target, strict=True)]
     assert all(equal) if gap == "same" else not any(equal)
 
@@ -50,7 +51,7 @@ def test_every_experiment_has_biased_objects_at_every_gap(name, gap):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_the_papers_variant_takes_every_experiment(name):
     made = experiment(f"+experiment={name}", "+variant=paper")
-    assert made.baseline.name == "neural_sim_paper" and isinstance(made.gradient, PathwiseEstimator)
+    assert made.loop.method.name == "neural_sim_paper" and isinstance(made.loop.gradient, PathwiseEstimator)
     poses = [node for what, node in made.config["parameter"].items() if what == "pose"]
     assert all(node["bin_mean"] == "linear" for node in poses)
 
@@ -58,19 +59,19 @@ def test_the_papers_variant_takes_every_experiment(name):
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*_ycb.yaml")))
 def test_experiments_on_ycb_name_objects_that_exist(name, shared_data):
     made = experiment(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}")
-    assert set(made.distribution.biased) <= set(made.objects.names())
+    assert set(made.imaging.distribution.biased) <= set(made.imaging.objects.names())
 
 
 def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     plain, auto_sim = experiment(), experiment("baseline=auto_sim")
-    assert isinstance(auto_sim.baseline, HypergradientLoop)
-    assert isinstance(plain.gradient, StratifiedEstimator)
-    assert isinstance(auto_sim.gradient, ReinforceEstimator)
+    assert isinstance(auto_sim.loop.method, HypergradientLoop)
+    assert isinstance(plain.loop.gradient, StratifiedEstimator)
+    assert isinstance(auto_sim.loop.gradient, ReinforceEstimator)
     for group in ("solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
     steps = {"train_first": True, "update": Mirror(2.0, max_step=1.0)}
-    assert auto_sim.outer == dataclasses.replace(plain.outer, **steps)
-    assert experiment("baseline=auto_sim", "outer.update.max_step=2").outer.update == Mirror(
+    assert auto_sim.loop.outer == dataclasses.replace(plain.loop.outer, **steps)
+    assert experiment("baseline=auto_sim", "outer.update.max_step=2").loop.outer.update == Mirror(
         2.0, max_step=2.0
     )
 
@@ -101,10 +102,10 @@ def test_estimators_are_compared_in_one_loop(pair, scale):
     differ = _differences(one.config, other.config)
     assert {"baseline.name", "gradient._target_"} <= differ
     assert all(key == "baseline.name" or key.startswith("gradient.") for key in differ)
-    assert type(one.gradient) is not type(other.gradient)
+    assert type(one.loop.gradient) is not type(other.loop.gradient)
     for made, name in ((one, pair[0]), (other, pair[1])):
         wanted = {"paper": PathwiseEstimator, "pathwise": PathwiseEstimator, "reinforce": ReinforceEstimator}
-        assert isinstance(made.gradient, wanted.get(name.rsplit("_", 1)[1], StratifiedEstimator))
+        assert isinstance(made.loop.gradient, wanted.get(name.rsplit("_", 1)[1], StratifiedEstimator))
 
 
 def test_none_is_the_old_name_of_neural_sim():
@@ -118,11 +119,13 @@ def test_the_papers_method_is_what_the_paper_says_at_every_scale(scale):
     made = experiment(
         "baseline=neural_sim_paper", f"scale={scale}", "parameter=[pose,zoom,illumination]", "renderer=nerf_w"
     )
-    assert (made.gradient.mode, made.gradient.relaxation) == ("reverse", "gumbel_softmax")
-    assert all(factor.floor == 0.0 and factor.bin_mean == "linear" for factor in made.distribution.binned)
-    assert all(factor.temperature == 0.1 for factor in made.distribution.binned)
-    assert made.distribution.light.constraint == "affine"
-    outer = made.outer
+    assert (made.loop.gradient.mode, made.loop.gradient.relaxation) == ("reverse", "gumbel_softmax")
+    assert all(
+        factor.floor == 0.0 and factor.bin_mean == "linear" for factor in made.imaging.distribution.binned
+    )
+    assert all(factor.temperature == 0.1 for factor in made.imaging.distribution.binned)
+    assert made.imaging.distribution.light.constraint == "affine"
+    outer = made.loop.outer
     assert (outer.epochs, outer.start, outer.train_first, outer.final_step) == (2, "previous", True, 1.0)
     assert (outer.curvature_images, outer.pool_per_bin, outer.on_untrusted) == (0, 0, "keep")
     assert outer.images_per_object == (6 if scale == "smoke" else 50)
@@ -142,11 +145,11 @@ def test_lights_are_explored_where_a_method_scores_its_draws_alone():
     hard = {*explores, "neural_sim", "ns", "oracle", "random_search", "bayes_opt"}
     for name in hard:
         made = experiment(f"baseline={name}", *lights)
-        assert made.draws == HardDraws(explore=name in explores)
-        assert not pooled(made.outer, made.draws, made.distribution)
+        assert Graph(made).learned.draws == HardDraws(explore=name in explores)
+        assert not pooled(made.loop.outer, Graph(made).learned.draws, made.imaging.distribution)
     for name in ("lts", "random_search", "bayes_opt"):  # no light moves: images come from a pool
         made = experiment(f"baseline={name}")
-        assert pooled(made.outer, made.draws, made.distribution)
+        assert pooled(made.loop.outer, Graph(made).learned.draws, made.imaging.distribution)
 
 
 def test_lights_want_a_renderer_that_knows_them():
@@ -157,7 +160,7 @@ def test_lights_want_a_renderer_that_knows_them():
 
 
 def test_what_is_fixed_says_which_distribution():
-    kinds = {name: experiment(f"baseline={name}").baseline for name in ("ns", "oracle")}
+    kinds = {name: experiment(f"baseline={name}").loop.method for name in ("ns", "oracle")}
     assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}
 
 

@@ -7,8 +7,8 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim import devices
-from neural_sim.main import build, conf_directory
-from neural_sim.pipeline import run
+from neural_sim.main import conf_directory, context_of
+from neural_sim.stages.walk import walk
 
 RUNS = {
     "stratified": [],
@@ -27,9 +27,9 @@ def _results(folder, trainer, overrides):
         *paths,
     ]
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        experiment = build(compose("config", [*chosen, *overrides]))
+        context, others = context_of(compose("config", [*chosen, *overrides]), folder / "run")
     torch.manual_seed(0)  # layers of a field's colour head
-    run(experiment, folder / "run")
+    walk(context, others)
     return json.loads((folder / "run" / "results.json").read_text())
 
 

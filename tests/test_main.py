@@ -144,7 +144,7 @@ def test_every_scale_goes_with_labelled_photographs(scale, tmp_path):
         json.dumps({"images": [{"id": 1, "file_name": "a"}], "categories": [], "annotations": []})
     )
     made = build(_config("target=coco", f"target.annotations={annotations}", f"scale={scale}"))
-    assert made.target.annotations == str(annotations)
+    assert made.imaging.target.annotations == str(annotations)
     assert made.training.image_size == made.config["budget"]["training"]["image_size"]
 
 
@@ -157,9 +157,9 @@ def test_what_a_scale_sets_can_be_overridden_where_it_is_used(scale):
         "target.val_per_object": 10,
     }
     made = build(_config(f"scale={scale}", *(f"{key}={value}" for key, value in overrides.items())))
-    assert made.views.count == 30 and made.training.image_size == 72
-    assert made.outer.iterations == 3 and made.target.val_per_object == 10
-    assert made.views.image_size == made.config["budget"]["views"]["image_size"]
+    assert made.imaging.views.count == 30 and made.training.image_size == 72
+    assert made.loop.outer.iterations == 3 and made.imaging.target.val_per_object == 10
+    assert made.imaging.views.image_size == made.config["budget"]["views"]["image_size"]
 
 
 def _choices():

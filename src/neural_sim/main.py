@@ -9,11 +9,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import time
-import types
 import typing
 import warnings
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 if TYPE_CHECKING:
-    from neural_sim.experiment import Experiment
+    from neural_sim.stages.context import Context, Step
+    from neural_sim.stages.experiment import Experiment
 
 # Read when torch is imported. OpenMP threads that spin starve each other where processes share cores (sweeps, tests);
 # threads that sleep at once are woken for each of many short operations, which makes an outer iteration a third
@@ -36,9 +36,11 @@ os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 _log = logging.getLogger(__name__)
 
-# Groups whose mapping names a class or function (``_target_``); the rest are plain settings.
-_GROUPS = ("objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "baseline")
-_SETTINGS = ("gradient", "outer", "training")
+# Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
+_PARTS = (
+    "objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "baseline", "gradient",
+    "outer", "training", "unlearned",
+)  # fmt: skip
 
 
 class UserError(ValueError):
@@ -64,28 +66,62 @@ def build(config: DictConfig) -> Experiment:
     Raises:
         UserError: an unknown key, a value of the wrong type or out of range, with the key and what was got.
     """
-    plain = _plain(config)
-    from neural_sim.experiment import Experiment
+    return _build(_plain(config))
 
-    parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in (*_GROUPS, *_SETTINGS)}
+
+def _build(plain: dict[str, Any]) -> Experiment:
+    from neural_sim.stages.experiment import Experiment, Imaging, Loop, Run
+
+    parts: dict[str, Any] = {name: _instantiate(plain[name], name) for name in _PARTS}
     parameters = {name: _instantiate(node, f"parameter.{name}") for name, node in plain["parameter"].items()}
     if not parameters:
         raise UserError("parameter: want at least one of pose, zoom, illumination, got none")
-    return Experiment(
+    run = Run(
         name=plain["name"],
         seed=plain["seed"],
-        score_at=tuple(plain["score_at"]),
-        stages=tuple(plain["stages"]),
         store=Path(plain["paths"]["store"]),
         mlflow=plain["paths"]["mlflow"],
-        progress=plain["progress"],
         accelerator=plain["trainer"]["accelerator"],
-        distribution=_product(
-            parameters, parts | {"unlearned": _instantiate(plain["unlearned"], "unlearned")}
-        ),
-        config=plain,
-        **parts,
+        progress=plain["progress"],
+        score_at=tuple(plain["score_at"]),
     )
+    images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
+    imaging = Imaging(**images, distribution=_product(parameters, parts))
+    loop = Loop(parts["baseline"], parts["outer"], parts["gradient"], parts["solver"])
+    return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain)
+
+
+def context_of(config: DictConfig, folder: Path) -> tuple[Context, dict[str, Step]]:
+    """A run in ``folder``, and those of its stages that are none from objects to a report, by name.
+
+    The experiment is built at once if a stage needs it, so that bad settings are refused before any stage runs.
+
+    Raises:
+        UserError: as :func:`build`, and for an unknown stage.
+    """
+    plain = _plain(config)
+    from neural_sim.stages.context import Context
+    from neural_sim.stages.walk import STEPS
+
+    others: dict[str, Step] = {}
+    for name in plain["stages"]:
+        if name in STEPS:
+            continue
+        node = plain.get(name)
+        if not isinstance(node, Mapping) or "_target_" not in node:
+            known = [*STEPS, *(key for key, value in plain.items() if _is_step(value))]
+            raise UserError(f"stages: unknown stage {name!r}, want some of {', '.join(known)}")
+        others[name] = _instantiate(node, name)
+    context = Context(plain, folder, lambda: _build(plain), tuple(plain["stages"]))
+    if set(plain["stages"]) & set(STEPS):
+        _ = context.experiment
+    return context, others
+
+
+def _is_step(node: Any) -> bool:
+    return isinstance(node, Mapping) and "_target_" in node and callable(
+        getattr(hydra.utils.get_object(node["_target_"]), "run", None)
+    )  # fmt: skip
 
 
 def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
@@ -105,20 +141,6 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     return made
 
 
-def stress(config: DictConfig, folder: Path) -> int:
-    """Run the suite of ``conf/experiment/stress.yaml``, report in ``folder``; returns how many checks failed.
-
-    Raises:
-        UserError: an unknown key or family.
-    """
-    plain = _plain(config)
-    suite = _instantiate(plain["stress"], "stress")
-    from neural_sim.report.stress import report
-
-    begun = time.time()
-    return report(suite.run(plain["seed"], plain["progress"]), plain, folder, begun)
-
-
 def _plain(config: DictConfig) -> dict[str, Any]:
     """The configuration as plain values, its top level checked."""
     try:
@@ -135,13 +157,8 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 def _check_top(plain: Mapping[str, Any]) -> None:
     if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:
         raise UserError(f"seed must be a whole number from 0, got {plain['seed']!r}")
-    from neural_sim.pipeline import STAGES  # after what needs no heavy import to refuse
-
     if not isinstance(plain["stages"], list) or not plain["stages"]:
-        raise UserError(f"stages must be a list of {', '.join(STAGES)}, got {plain['stages']!r}")
-    for stage in plain["stages"]:
-        if stage not in STAGES:
-            raise UserError(f"stages: unknown stage {stage!r}, want some of {', '.join(STAGES)}")
+        raise UserError(f"stages must be a list of names, got {plain['stages']!r}")
     parts = isinstance(plain["score_at"], list) and all(
         type(at) in (int, float) and 0 < at <= 1 for at in plain["score_at"]
     )
@@ -172,7 +189,9 @@ def _check_arguments(node: Mapping[str, Any], where: str) -> None:
     """Keys and scalar types against the constructor's signature, since plain YAML takes anything."""
     make = hydra.utils.get_object(node["_target_"])
     known = signature(make).parameters
-    hints = typing.get_type_hints(make.__init__ if isinstance(make, type) else make)
+    # A dataclass's own hints are resolved where each field was declared, which may be another module.
+    whole = is_dataclass(make) or not isinstance(make, type)
+    hints = typing.get_type_hints(make if whole else make.__init__)
     for key, value in node.items():
         if key.startswith("_"):
             continue
@@ -185,20 +204,15 @@ def _check_arguments(node: Mapping[str, Any], where: str) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a YAML scalar fits a type hint. Hints that are not about scalars are left to the constructor."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return any(_fits(value, option) for option in typing.get_args(hint))
-    if typing.get_origin(hint) is typing.Literal:
-        return value in typing.get_args(hint)
-    if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if hint in (str, bool):
-        return isinstance(value, hint)
-    if hint is type(None):
-        return value is None
-    return hint is Any or not isinstance(value, (str, int, float, bool, type(None)))
+    """Whether a YAML scalar fits a type hint. Lists and mappings are left to the constructor."""
+    if isinstance(value, bool):  # an int to Python, not to a user
+        return hint is Any or bool in (hint, *typing.get_args(hint))
+    if not isinstance(value, (str, int, float, type(None))):
+        return True
+    from beartype import BeartypeConf
+    from beartype.door import is_bearable
+
+    return is_bearable(value, hint, conf=BeartypeConf(is_pep484_tower=True))
 
 
 def _type_name(hint: Any) -> str:
@@ -216,44 +230,23 @@ def _task(config: DictConfig) -> float | None:
     # Libraries on each other's deprecations: nothing that a user of this program can act on.
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
-    folder = Path(runtime.runtime.output_dir)
     try:
-        if "stress" in config:
-            return _finish_stress(stress(config, folder), runtime.mode)
-        if "compare" in config:
-            return _compare(config, folder)
-        experiment = build(config)
-        from neural_sim.pipeline import run
-        from neural_sim.studies import STUDIES
+        context, others = context_of(config, Path(runtime.runtime.output_dir))
+        from neural_sim.stages.walk import walk
 
-        asked = STUDIES.keys() & set(config)
-        for key in asked:
-            STUDIES[key](experiment, _instantiate(_plain(config)[key], key), folder)
-        return None if asked else run(experiment, folder)
+        return walk(context, others)
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise
         _log.debug("details", exc_info=True)
         print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
         sys.exit(2)
+    except RuntimeError as error:
+        from neural_sim.stages.context import StageFailure
 
-
-def _compare(config: DictConfig, folder: Path) -> None:
-    """Compare finished runs, as conf/experiment/compare.yaml says."""
-    plain = _plain(config)
-    comparison = _instantiate(plain["compare"], "compare")
-    from neural_sim.report.tracking import tracking_uri
-
-    comparison.run(tracking_uri(plain["paths"]["mlflow"]), plain["seed"], plain, folder)
-
-
-def _finish_stress(failed: int, mode: RunMode | None) -> float:
-    """Exit status 1 where a check failed; in a sweep the job raises, so that the others go on."""
-    if failed and mode == RunMode.MULTIRUN:
-        raise RuntimeError(f"stress: {failed} checks failed")
-    if failed:
+        if runtime.mode == RunMode.MULTIRUN or not isinstance(error, StageFailure):
+            raise
         sys.exit(1)
-    return 0.0
 
 
 def main() -> None:

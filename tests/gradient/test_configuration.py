@@ -25,18 +25,22 @@ def experiment(*overrides):
     ],
 )
 def test_each_choice_is_one_override(override, expected):
-    assert experiment("gradient=pathwise", override).gradient.draws == expected
+    assert experiment("gradient=pathwise", override).loop.gradient.draws == expected
 
 
 def test_the_papers_method_is_its_plain_form():
     paper = experiment("baseline=neural_sim_paper")
-    assert paper.gradient == PathwiseEstimator(mode="reverse")
-    assert paper.gradient.draws == RelaxedDraws()
-    assert paper.distribution.factors[0].bin_mean == "linear" and paper.synthesis.label_gradient == "ignored"
+    assert paper.loop.gradient == PathwiseEstimator(mode="reverse")
+    assert paper.loop.gradient.draws == RelaxedDraws()
+    assert paper.imaging.distribution.factors[0].bin_mean == "linear"
+    assert paper.imaging.synthesis.label_gradient == "ignored"
 
 
 def test_boxes_move_by_one_override():
-    assert experiment("synthesis.label_gradient=differentiable").synthesis.label_gradient == "differentiable"
+    assert (
+        experiment("synthesis.label_gradient=differentiable").imaging.synthesis.label_gradient
+        == "differentiable"
+    )
 
 
 @pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.relaxation=concrete"])

@@ -13,9 +13,9 @@ from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import certify, line, untrusted
 from neural_sim.outer.retrained import Check, FiniteDifference
+from neural_sim.outer.settings import Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.settings import Trust
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.lanczos import Spectrum
 from neural_sim.solver.solution import Solution, Status

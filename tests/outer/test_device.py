@@ -13,8 +13,8 @@ from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.settings import Outer
 from neural_sim.parameter.update import Mirror
-from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping

@@ -15,11 +15,11 @@ from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.settings import Outer, Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.settings import Outer, Trust
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping

@@ -17,11 +17,11 @@ from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.probing import ProbeSet
+from neural_sim.outer.settings import Outer
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene, join

@@ -11,10 +11,10 @@ from neural_sim.detector.retinanet import Detector
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.rewarded import RewardLoop
+from neural_sim.outer.settings import Outer
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
-from neural_sim.settings import Outer
 from neural_sim.synthesis.scene import join
 
 

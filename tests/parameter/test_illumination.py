@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from neural_sim.parameter.illumination import Illumination, PlainProjectedGradient, ProjectedGradient
+from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.light_update import PlainProjectedGradient, ProjectedGradient
 from neural_sim.parameter.update import UpdateState
 
 DOUBLE = torch.float64

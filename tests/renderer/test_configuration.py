@@ -18,12 +18,12 @@ def experiment(*overrides):
 
 def test_nerf_w_brings_varied_light_and_fields_with_codes():
     made = experiment("renderer=nerf_w", "scale=smoke", "views.lights.rig.anchors=4")
-    assert isinstance(made.renderer, NerfWRenderer)
-    assert made.views.lights is not None and made.views.lights.rig.anchors == 4
-    fitting = made.field.fitting(made.field.field())
+    assert isinstance(made.imaging.renderer, NerfWRenderer)
+    assert made.imaging.views.lights is not None and made.imaging.views.lights.rig.anchors == 4
+    fitting = made.imaging.field.fitting(made.imaging.field.field())
     assert isinstance(fitting, AppearanceFitting) and isinstance(fitting.field, AppearanceField)
     assert fitting.grid.resolution == 64  # the scale's
-    weights = made.views.lights.weights(made.views.count, torch.Generator())
+    weights = made.imaging.views.lights.weights(made.imaging.views.count, torch.Generator())
     assert ((weights == 1.0).sum(0) >= 2).all()
 
 
@@ -34,5 +34,5 @@ def test_views_too_few_for_the_anchors_are_refused():
 
 def test_without_it_no_light_varies_and_no_field_has_codes():
     made = experiment()
-    assert made.views.lights is None and isinstance(made.field.field(), GridField)
-    assert not isinstance(made.renderer, NerfWRenderer)
+    assert made.imaging.views.lights is None and isinstance(made.imaging.field.field(), GridField)
+    assert not isinstance(made.imaging.renderer, NerfWRenderer)

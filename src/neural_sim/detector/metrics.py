@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from torch import Tensor
 from torchmetrics.detection import MeanAveragePrecision
@@ -10,14 +11,21 @@ from torchmetrics.detection import MeanAveragePrecision
 from neural_sim.types import LabelledImages
 
 
+@dataclass(frozen=True)
+class AveragePrecision:
+    """``ap`` is the mean over overlaps 0.50 to 0.95 and classes, ``ap50`` that at an overlap of 0.50; both by class
+    name, too. A class without a box is nan and stays out of the means."""
+
+    ap: float
+    ap50: float
+    per_class: dict[str, float]
+    per_class_ap50: dict[str, float]
+
+
 def evaluate(
     predictions: Sequence[dict[str, Tensor]], images: LabelledImages, class_names: Sequence[str]
-) -> dict[str, float | dict[str, float]]:
+) -> AveragePrecision:
     """Average precision of ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
-
-    Returns:
-        ``ap`` (mean over overlaps 0.50 to 0.95 and classes), ``ap50``, and ``per_class`` and ``per_class_ap50``
-        by class name. A class without a box in ``images`` is nan and stays out of the means.
 
     Raises:
         ValueError: where there are no images, predictions and images differ in number, or a label has no name.
@@ -38,12 +46,12 @@ def evaluate(
     found = [{key: _single(value) for key, value in prediction.items()} for prediction in predictions]
     per_class = _average_precision(found, truth, None, len(class_names))
     per_class_50 = _average_precision(found, truth, [0.5], len(class_names))
-    return {
-        "ap": _mean(per_class),
-        "ap50": _mean(per_class_50),
-        "per_class": dict(zip(class_names, per_class, strict=True)),
-        "per_class_ap50": dict(zip(class_names, per_class_50, strict=True)),
-    }
+    return AveragePrecision(
+        _mean(per_class),
+        _mean(per_class_50),
+        dict(zip(class_names, per_class, strict=True)),
+        dict(zip(class_names, per_class_50, strict=True)),
+    )
 
 
 def _single(value: Tensor) -> Tensor:

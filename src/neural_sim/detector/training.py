@@ -10,12 +10,32 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neural_sim.checks import at_least
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.devices import trainer_on
 from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class Training:
+    """What every detector trained from scratch gets, whatever the method that chose its images."""
+
+    image_size: int = 96
+    images_per_object: int = 100
+    warm_epochs: int = 30
+    cold_epochs: int = 30
+    batch_size: int = 32
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-4
+
+    def __post_init__(self) -> None:
+        at_least("training", 1, images_per_object=self.images_per_object, batch_size=self.batch_size)
+        at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
+        at_least("training", 16, image_size=self.image_size)
+        at_least("training", 0, learning_rate=self.learning_rate, weight_decay=self.weight_decay)
 
 
 @dataclass(frozen=True)

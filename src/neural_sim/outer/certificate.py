@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.retrained import Check
-from neural_sim.settings import OnUntrusted, Trust
+from neural_sim.outer.settings import OnUntrusted, Trust
 from neural_sim.solver.solution import Status
 
 Action = Literal["kept", "shrunk", "skipped", "stopped"]

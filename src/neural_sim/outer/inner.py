@@ -15,8 +15,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
 from neural_sim.devices import placed, synchronise
+from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.settings import Outer
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import HARD, Draws, HardDraws, RenderedObject, Scene
 from neural_sim.types import LabelledImages

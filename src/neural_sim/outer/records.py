@@ -2,47 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.outer.certificate import Certificate
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What was spent: labelled images made, optimiser steps of detectors, Hessian products, seconds on the wall clock
-    and seconds of all processor cores together."""
-
-    images: int = 0
-    detector_steps: int = 0
-    products: int = 0
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-
-    def __add__(self, other: Cost) -> Cost:
-        return Cost(
-            self.images + other.images,
-            self.detector_steps + other.detector_steps,
-            self.products + other.products,
-            self.seconds + other.seconds,
-            self.cpu_seconds + other.cpu_seconds,
-        )
-
-    @staticmethod
-    def of(records: Sequence[Mapping[str, Any]]) -> Cost:
-        """The sum over iteration records (as dictionaries). Phases ``hypergradient_*`` are parts of ``hypergradient``,
-        which counts them already."""
-        total = Cost()
-        for record in records:
-            phases = record["seconds"].items()
-            seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
-            counts = (record[key] for key in ("images", "detector_steps", "products"))
-            total += Cost(*counts, seconds=seconds, cpu_seconds=record["cpu_seconds"])
-        return total
+from neural_sim.outer.cost import Cost
 
 
 @dataclass(frozen=True)
@@ -70,13 +38,33 @@ class IterationRecord:
     cpu_seconds: float
 
 
+def cost_of(record: IterationRecord) -> Cost:
+    """Of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``, which counts them already."""
+    phases = record.seconds.items()
+    seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
+    return Cost(record.images, record.detector_steps, record.products, seconds, record.cpu_seconds)
+
+
+def record_of(stored: Mapping[str, Any]) -> IterationRecord:
+    """A record from what ``dataclasses.asdict`` made of one."""
+    certificate = stored["certificate"]
+    return IterationRecord(**{**stored, "certificate": certificate and Certificate(**certificate)})
+
+
 @dataclass(frozen=True)
 class LearnedPsi:
     """The loop's outcome. ``trajectory`` is psi before the first iteration and after each: its last is what the
-    method reports."""
+    method reports. ``before`` is what was spent before the first: on the warm start, whose backbone every loop has."""
 
     trajectory: Float[Tensor, "iterations+1 objects K"]
     records: list[IterationRecord]
+    before: Cost = field(default_factory=Cost)
+
+    def cost(self, iterations: int) -> Cost:
+        """What was spent up to the end of so many iterations; nothing before the first, whose psi is given."""
+        return sum(
+            (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
+        )
 
     @property
     def last(self) -> Float[Tensor, "objects K"]:

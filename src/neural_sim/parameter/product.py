@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.factor import BinnedFactor, BinNoise, Coordinate, Relaxation
 from neural_sim.parameter.illumination import Illumination
@@ -115,6 +116,11 @@ class SceneDistribution:
         """The factor that weighs lights, if there is one."""
         return next((factor for factor in self.factors if isinstance(factor, Illumination)), None)
 
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """What hard draws of given probabilities depend on, without how they are relaxed and from which logits."""
+        return {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
+
     # --- psi ---
 
     @property
@@ -146,6 +152,11 @@ class SceneDistribution:
         """Every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
         return parts | {f.name: f.log_probabilities(parts[f.name]).exp() for f in self.binned}
+
+    def digest_of(self, psi: Float[Tensor, "objects K"]) -> str:
+        """Digest of the probabilities and weights that psi gives, to 12 digits after the point."""
+        p = self.probabilities(psi.detach().cpu().double())
+        return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
     def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
         """psi with the weights of lights brought back to their constraint."""

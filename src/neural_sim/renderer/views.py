@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.cameras import orbit
+from neural_sim.checks import at_least
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
-from neural_sim.renderer.rig import LightRig
+from neural_sim.renderer.rig import LightRig, VariedLight
 from neural_sim.types import PinholeCamera, PosedViews
 
 log = logging.getLogger(__name__)
@@ -111,3 +115,54 @@ def render_views(
         seen = (light_of == number).nonzero()[:, 0]
         images[seen] = renderer.render(item.mesh, camera, camera_to_world[seen], rig.lighting(light))
     return PosedViews(images, camera_to_world, camera, weights)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Secs. 4 and B.2).
+
+    ``count`` views are trained on; ``held_out`` more, the last, only score the field. ``image_size`` in pixels,
+    ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
+    """
+
+    count: int = 100
+    held_out: int = 16
+    image_size: int = 128
+    field_of_view_deg: float = 40.0
+    distance_range: tuple[float, float] = (2.4, 4.0)
+    supersample: int = 2
+    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    lights: VariedLight | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        at_least("views", 1, count=self.count, image_size=self.image_size, supersample=self.supersample)
+        at_least("views", 0, held_out=self.held_out, seed=self.seed)
+        if self.backend not in ("auto", "pyrender", "raycast"):
+            raise ValueError(f"views.backend must be auto, pyrender or raycast, got {self.backend!r}")
+        if not 1.0 < self.distance_range[0] <= self.distance_range[1]:
+            raise ValueError(
+                f"views.distance_range must be ordered and above 1 radius, got {self.distance_range}"
+            )
+        if self.lights is not None:
+            self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
+
+    def camera(self, image_size: int) -> PinholeCamera:
+        """The square camera of this field of view."""
+        return PinholeCamera(image_size, image_size, math.radians(self.field_of_view_deg))
+
+    @property
+    def rig(self) -> LightRig | None:
+        """The anchor lights, None where the light is fixed."""
+        return self.lights.rig if self.lights is not None else None
+
+    def render(self, renderer: MeshRenderer, item: ObjectMesh) -> PosedViews:
+        """All views of one object, those held out last; equal seeds give equal poses and lights whatever the object."""
+        generator, total = torch.Generator().manual_seed(self.seed), self.count + self.held_out
+        uniform = torch.rand((3, total), generator=generator)
+        near, far = self.distance_range
+        poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], near + (far - near) * uniform[2])
+        rig = weights = None
+        if self.lights is not None:
+            rig, weights = self.lights.rig, self.lights.weights(total, generator)
+        return render_views(renderer, item, self.camera(self.image_size), poses, rig, weights)

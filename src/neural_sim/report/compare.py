@@ -43,7 +43,7 @@ class Compare:
         if self.clock not in get_args(Clock):
             raise ValueError(f"compare.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
-    def run(self, uri: str, seed: int, config: Mapping[str, Any], folder: Path) -> list[Comparison]:
+    def compare(self, uri: str, seed: int, config: Mapping[str, Any], folder: Path) -> list[Comparison]:
         """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow.
 
         Raises:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from neural_sim.digests import digest, tensor_digest
 from neural_sim.report.tracking import flatten
-from neural_sim.store import digest, tensor_digest
 from neural_sim.types import LabelledImages
 
 KEYS = ("scoring", "configuration", "test_set")

@@ -15,12 +15,12 @@ from neural_sim.gradient.base import MixedDerivative
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.settings import OnUntrusted, Outer
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.settings import OnUntrusted, Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
 from neural_sim.stress.rendering import block

@@ -41,7 +41,7 @@ class Suite:
             importlib.import_module(f"{__package__}.{family}")
         return [name for family in self.families for name in CASES if name.split("/")[0] == family]
 
-    def run(self, seed: int, progress: bool = False) -> list[Result]:
+    def run_all(self, seed: int, progress: bool = False) -> list[Result]:
         """All results; a case that fails or raises does not keep the others from running."""
         scope, names = Scope(seed, self.full), self.names()
         shown = tqdm(names, desc="stress", disable=not progress, leave=False)

@@ -1,102 +1,18 @@
-"""Budgets and sizes of a run's stages, validated where they are made."""
+"""Settings of the psi loop."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-import torch
-
-from neural_sim.cameras import orbit
+from neural_sim.checks import at_least
 from neural_sim.gradient.significance import SMALLEST
-from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.illumination import LightUpdate, ProjectedGradient
+from neural_sim.parameter.light_update import LightUpdate, ProjectedGradient
 from neural_sim.parameter.update import Update
-from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import Quality
-from neural_sim.renderer.rig import LightRig, VariedLight
-from neural_sim.renderer.views import render_views
-from neural_sim.types import PinholeCamera, PosedViews
 
 Start = Literal["previous", "warm", "fresh"]
 OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
-
-
-def _at_least(where: str, smallest: float, **values: float) -> None:
-    for name, value in values.items():
-        if not value >= smallest:
-            raise ValueError(f"{where}.{name} must be at least {smallest}, got {value}")
-
-
-@dataclass(frozen=True)
-class Views:
-    """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Secs. 4 and B.2).
-
-    ``count`` views are trained on; ``held_out`` more, the last, only score the field. ``image_size`` in pixels,
-    ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
-    """
-
-    count: int = 100
-    held_out: int = 16
-    image_size: int = 128
-    field_of_view_deg: float = 40.0
-    distance_range: tuple[float, float] = (2.4, 4.0)
-    supersample: int = 2
-    backend: Literal["auto", "pyrender", "raycast"] = "auto"
-    lights: VariedLight | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _at_least("views", 1, count=self.count, image_size=self.image_size, supersample=self.supersample)
-        _at_least("views", 0, held_out=self.held_out, seed=self.seed)
-        if self.backend not in ("auto", "pyrender", "raycast"):
-            raise ValueError(f"views.backend must be auto, pyrender or raycast, got {self.backend!r}")
-        if not 1.0 < self.distance_range[0] <= self.distance_range[1]:
-            raise ValueError(
-                f"views.distance_range must be ordered and above 1 radius, got {self.distance_range}"
-            )
-        if self.lights is not None:
-            self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
-
-    def camera(self, image_size: int) -> PinholeCamera:
-        """The square camera of this field of view."""
-        return PinholeCamera(image_size, image_size, math.radians(self.field_of_view_deg))
-
-    @property
-    def rig(self) -> LightRig | None:
-        """The anchor lights, None where the light is fixed."""
-        return self.lights.rig if self.lights is not None else None
-
-    def render(self, renderer: MeshRenderer, item: ObjectMesh) -> PosedViews:
-        """All views of one object, those held out last; equal seeds give equal poses and lights whatever the object."""
-        generator, total = torch.Generator().manual_seed(self.seed), self.count + self.held_out
-        uniform = torch.rand((3, total), generator=generator)
-        near, far = self.distance_range
-        poses = orbit(2 * torch.pi * uniform[0], 2 * torch.pi * uniform[1], near + (far - near) * uniform[2])
-        rig = weights = None
-        if self.lights is not None:
-            rig, weights = self.lights.rig, self.lights.weights(total, generator)
-        return render_views(renderer, item, self.camera(self.image_size), poses, rig, weights)
-
-
-@dataclass(frozen=True)
-class Training:
-    """What every detector trained from scratch gets, whatever the method that chose its images."""
-
-    image_size: int = 96
-    images_per_object: int = 100
-    warm_epochs: int = 30
-    cold_epochs: int = 30
-    batch_size: int = 32
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-4
-
-    def __post_init__(self) -> None:
-        _at_least("training", 1, images_per_object=self.images_per_object, batch_size=self.batch_size)
-        _at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
-        _at_least("training", 16, image_size=self.image_size)
-        _at_least("training", 0, learning_rate=self.learning_rate, weight_decay=self.weight_decay)
 
 
 @dataclass(frozen=True)
@@ -126,7 +42,7 @@ class Trust:
             "max_residual": self.max_residual, "max_stationarity": self.max_stationarity,
             "max_sensitivity": self.max_sensitivity,
         }  # fmt: skip
-        _at_least("outer.trust", 0, **{name: limit for name, limit in limits.items() if limit is not None})
+        at_least("outer.trust", 0, **{name: limit for name, limit in limits.items() if limit is not None})
         if self.min_cosine is not None and not -1.0 <= self.min_cosine <= 1.0:
             raise ValueError(f"outer.trust.min_cosine must lie in [-1, 1], got {self.min_cosine}")
         if self.level is not None and not SMALLEST <= self.level < 1.0:
@@ -180,17 +96,17 @@ class Outer:
     certify_per_bin: int = 1
 
     def __post_init__(self) -> None:
-        _at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
-        _at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
-        _at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
-        _at_least("outer", 0, certify_every=self.certify_every)
+        at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
+        at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
+        at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
+        at_least("outer", 0, certify_every=self.certify_every)
         if self.quality is not None and self.quality not in get_args(Quality):
             raise ValueError(
                 f"outer.quality must be one of {', '.join(get_args(Quality))} or null, got {self.quality!r}"
             )
         if not 0.0 < self.refresh <= 1.0:
             raise ValueError(f"outer.refresh must lie in (0, 1], got {self.refresh}")
-        _at_least("outer", 1, certify_per_bin=self.certify_per_bin)
+        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
         if self.start not in get_args(Start):
             raise ValueError(f"outer.start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
         if self.learned is not None and not self.learned:

@@ -5,7 +5,7 @@ import trimesh
 
 from neural_sim.objects.mesh import normalise
 from neural_sim.renderer.rig import VariedLight
-from neural_sim.settings import Views
+from neural_sim.renderer.views import Views
 
 
 class Nothing:

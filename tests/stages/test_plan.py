@@ -4,13 +4,14 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import build, conf_directory
-from neural_sim.plan import plan
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.plan import plan
 
 
 def left_out(*overrides):
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         experiment = build(compose("config", list(overrides)))
-    return {omission.what: omission for omission in plan(experiment, 6)}
+    return {omission.what: omission for omission in plan(Graph(experiment))}
 
 
 def test_the_default_differentiates_no_render_and_renders_every_bin_once():

@@ -3,8 +3,8 @@
 import pytest
 from hydra import compose, initialize_config_dir
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.main import build, conf_directory
+from neural_sim.stages.graph import Graph
 
 
 def keys(tmp_path, *overrides):
@@ -12,8 +12,8 @@ def keys(tmp_path, *overrides):
         config = compose(
             "config", ["+experiment=pose_gap", "scale=smoke", *overrides, f"paths.store={tmp_path}"]
         )
-    made = Artifacts(build(config))
-    return made._trained_key(made.psi("initial")), made._targets_key()
+    graph = Graph(build(config))
+    return graph.warm_start.key, graph.targets.key
 
 
 @pytest.mark.parametrize("other", ["floor=0.0", "temperature=1.0", "bin_mean=linear"])
@@ -24,7 +24,7 @@ def test_methods_that_relax_differently_share_the_detectors_of_a_distribution(tm
 @pytest.mark.parametrize(
     "other",
     ["seed=1", "parameter.pose.bins=9", "parameter.pose.other_range_deg=[-30,30]", "unlearned.distance=[2.5,4.0]",
-     "training.cold_epochs=4", "detector=micro", "parameter.pose.initial={dominant: 1}", "gap=uniform"],
+     "training.warm_epochs=4", "detector=micro", "parameter.pose.initial={dominant: 1}", "gap=uniform"],
 )  # fmt: skip
 def test_what_images_are_drawn_from_tells_detectors_apart(tmp_path, other):
     assert keys(tmp_path)[0] != keys(tmp_path, other)[0]
@@ -33,3 +33,17 @@ def test_what_images_are_drawn_from_tells_detectors_apart(tmp_path, other):
 def test_detectors_do_not_depend_on_the_target_but_its_images_do(tmp_path):
     ours, other = keys(tmp_path), keys(tmp_path, "parameter.pose.target={dominant: 1}")
     assert ours[0] == other[0] and ours[1] != other[1]
+
+
+def test_the_scored_detector_of_the_start_is_the_warm_start_where_epochs_are_equal(tmp_path):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        graph = Graph(
+            build(compose("config", ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]))
+        )
+    assert graph.trained_on(graph.psi("initial"), "the start").key == graph.warm_start.key
+    assert graph.trained_on(graph.psi("target"), "the target").key != graph.warm_start.key
+
+
+def test_objects_that_no_source_has_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"names \['drill'\], objects are"):
+        keys(tmp_path, "objects.names=[pitcher,mug]")

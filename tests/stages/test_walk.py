@@ -3,49 +3,51 @@
 import json
 import shutil
 import signal
-from dataclasses import replace
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from mlflow import MlflowClient
 
-from neural_sim.artifacts import Artifacts
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.training import train_detector
-from neural_sim.main import build, conf_directory
-from neural_sim.pipeline import run
+from neural_sim.main import conf_directory, context_of
 from neural_sim.report import logged
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
+from neural_sim.stages.target_sets import TargetSets
+from neural_sim.stages.walk import walk
 from neural_sim.synthesis.export import write_coco
 from neural_sim.synthesis.scene import join
-from neural_sim.target.coco import CocoTarget
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
     "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64", "training.cold_epochs=12",
     "training.warm_epochs=12", "training.images_per_object=24", "target.val_per_object=8",
-    "objects.names=[pitcher,drill]", "stages=[views,field,warm_start,psi,evaluate]",
+    "objects.names=[pitcher,drill]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
 ]  # fmt: skip
 
 
-def _experiment(folder, *overrides):
+def _context(folder, *overrides):
     paths = [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        return build(compose("config", [*SMALL, *paths, *overrides]))
+        return context_of(compose("config", [*SMALL, *paths, *overrides]), folder / "run")
+
+
+def _targets(context) -> TargetSets:
+    return context.results(context.graph.targets)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, empty_store):
-    made = tmp_path_factory.mktemp("pipeline")
+    made = tmp_path_factory.mktemp("walk")
     shutil.copy(empty_store, made / "mlflow.db")
     return made
 
 
 @pytest.fixture(scope="module")
 def returned(folder):
-    return run(_experiment(folder), folder / "run")
+    return walk(*_context(folder))
 
 
 def _pixels(images):
@@ -53,48 +55,62 @@ def _pixels(images):
 
 
 def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distribution(folder, returned):
-    made = Artifacts(_experiment(folder))
-    training, val = made.x.training, made.targets["val"]
-    generator = torch.Generator().manual_seed(1_000_003 + 1)
-    drawn = join(made.scene.training_set(made.psi("initial"), training.images_per_object, generator))
-    start = made.detector.init(generator)
+    context, _ = _context(folder)
+    graph, training, targets = context.graph, context.experiment.training, _targets(context)
+    generator, detector = torch.Generator().manual_seed(1_000_003 + 1), graph.warm_start.build()
+    scene = context.results(graph.scene)
+    drawn = join(scene.training_set(graph.psi("initial"), training.images_per_object, generator))
     params, _ = train_detector(
-        made.detector, start, drawn, generator, epochs=training.cold_epochs, batch_size=training.batch_size,
-        learning_rate=training.learning_rate, weight_decay=training.weight_decay, progress=False,
+        detector, detector.init(generator), drawn, generator, epochs=training.cold_epochs,
+        batch_size=training.batch_size, learning_rate=training.learning_rate,
+        weight_decay=training.weight_decay, progress=False,
     )  # fmt: skip
-    expected = evaluate(made.detector.predict(params, val.images), val, made.names)["ap"]
-    assert returned == expected and 0.0 < expected < 1.0
-    test = made.targets["test"]
-    assert evaluate(made.detector.predict(params, test.images), test, made.names)["ap"] != expected
+    val, test = (
+        evaluate(detector.predict(params, part.images), part, list(graph.names)).ap
+        for part in (targets.val, targets.test)
+    )
+    assert returned == val and 0.0 < val < 1.0 and test != val
 
 
 def test_another_test_set_does_not_change_it(folder, returned):
     overrides = ["target.test_per_object=3", "target.test_per_biased_object=9"]
-    made, other = Artifacts(_experiment(folder)), Artifacts(_experiment(folder, *overrides))
-    assert len(made.targets["test"]) != len(other.targets["test"])
-    assert run(other.x, folder / "other") == returned
+    (context, _), (other, steps) = _context(folder), _context(folder, *overrides)
+    assert len(_targets(context).test) != len(_targets(other).test)
+    assert walk(other, steps) == returned
 
 
 def test_without_evaluation_there_is_no_score(folder, returned):
-    assert run(_experiment(folder, "stages=[views,field]"), folder / "fields") is None
+    assert walk(*_context(folder, "stages=[views,field]")) is None
+
+
+def test_what_no_asked_stage_makes_must_be_in_the_store(folder, returned, tmp_path):
+    with pytest.raises(ValueError, match=r"views of pitcher is not in .*; add stage views to \['field'\]"):
+        walk(*_context(tmp_path, "stages=[field]"))
+    context, steps = _context(folder, "stages=[psi]")
+    assert walk(context, steps) is None
+    assert {omission.why for omission in context.account.left_out if omission.stage == "psi"} >= {
+        "baseline=ns keeps its distribution"
+    }
 
 
 def test_val_and_test_share_no_image(folder, returned):
-    rendered = Artifacts(_experiment(folder)).targets
-    assert not _pixels(rendered["val"]) & _pixels(rendered["test"])
+    rendered = _targets(_context(folder)[0])
+    assert not _pixels(rendered.val) & _pixels(rendered.test)
     # A user's file may list one photograph under two names.
-    twice = type(rendered["test"]).concatenate([rendered["test"], rendered["test"].select(slice(0, 6))])
+    twice = type(rendered.test).concatenate([rendered.test, rendered.test.select(slice(0, 6))])
     path = write_coco(twice, ["pitcher", "drill"], folder / "photos")
     for seed in range(4):
-        x = _experiment(folder, f"seed={seed}")
-        config = {**x.config, "target": {"val_fraction": 0.5}}
-        coco = Artifacts(replace(x, target=CocoTarget(path, val_fraction=0.5), config=config)).targets
-        assert len(coco["val"]) + len(coco["test"]) == len(twice)
-        assert not _pixels(coco["val"]) & _pixels(coco["test"])
+        target = ["target=coco", f"target.annotations={path}", "target.val_fraction=0.5", f"seed={seed}"]
+        small = [word for word in SMALL if not word.startswith("target.")]
+        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+            config = compose("config", [*small, *target, f"paths.store={folder / 'store'}"])
+        coco = _targets(context_of(config, folder)[0])
+        assert len(coco.val) + len(coco.test) == len(twice)
+        assert not _pixels(coco.val) & _pixels(coco.test)
 
 
 LOOP = ["baseline=random_search", "outer.iterations=1", "outer.images_per_object=4"]  # two rounds
-WHOLE = [*LOOP, "stages=[views,field,warm_start,psi,evaluate,report]"]
+WHOLE = [*LOOP, "stages=[views,field,target_sets,warm_start,psi,evaluate,report]"]
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +133,8 @@ def test_a_run_is_watched_while_its_loop_goes_on(folder, returned, uri, monkeypa
         seen.append(_seen(uri))
 
     monkeypatch.setattr(LiveRun, "iteration", watched)
-    run(_experiment(folder, *WHOLE), folder / "live")
-    results = json.loads((folder / "live" / "results.json").read_text())
+    walk(*_context(folder, *WHOLE))
+    results = json.loads((folder / "run" / "results.json").read_text())
     losses = [record["validation_loss"] for record in results["iterations"]]
     assert len(losses) == 2
     assert [(held.status, shown) for held, shown in seen] == [
@@ -136,16 +152,16 @@ def test_a_run_is_watched_while_its_loop_goes_on(folder, returned, uri, monkeypa
 @pytest.mark.slow
 def test_a_loop_from_the_store_shows_its_iterations_too(folder, returned, uri):
     overrides = [*LOOP, "seed=1"]
-    run(_experiment(folder, *overrides), folder / "stored")
-    run(_experiment(folder, *overrides, "stages=[psi,evaluate,report]"), folder / "stored")
+    walk(*_context(folder, *overrides))
+    walk(*_context(folder, *overrides, "stages=[psi,evaluate,report]"))
     held, losses = _seen(uri)
-    written = json.loads((folder / "stored" / "results.json").read_text())["iterations"]
+    written = json.loads((folder / "run" / "results.json").read_text())["iterations"]
     assert losses == {step: record["validation_loss"] for step, record in enumerate(written)}
     assert len(losses) == 2 and held.status == "FINISHED"
 
 
 def test_a_run_without_the_report_is_not_tracked(folder, tmp_path):
-    run(_experiment(folder, f"paths.mlflow={tmp_path / 'none.db'}", "stages=[views,field]"), tmp_path)
+    walk(*_context(folder, f"paths.mlflow={tmp_path / 'none.db'}", "stages=[views,field]"))
     assert not list(tmp_path.glob("none.db*"))
 
 
@@ -161,6 +177,6 @@ def test_a_run_that_fails_or_is_interrupted_says_so(folder, returned, uri, monke
     for act, expected, status in ((broken, RuntimeError, "FAILED"), (interrupted, SystemExit, "KILLED")):
         monkeypatch.setattr(LiveRun, "iteration", act)
         with pytest.raises(expected):
-            run(_experiment(folder, *WHOLE, "seed=2"), folder / "broken")
+            walk(*_context(folder, *WHOLE, "seed=2"))
         assert _seen(uri)[0].status == status
     assert signal.getsignal(signal.SIGINT) == handler

@@ -1,0 +1,26 @@
+"""What a method or a training spends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What was spent: labelled images made, optimiser steps of detectors, Hessian products, seconds on the wall clock
+    and seconds of all processor cores together."""
+
+    images: int = 0
+    detector_steps: int = 0
+    products: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(
+            self.images + other.images,
+            self.detector_steps + other.detector_steps,
+            self.products + other.products,
+            self.seconds + other.seconds,
+            self.cpu_seconds + other.cpu_seconds,
+        )

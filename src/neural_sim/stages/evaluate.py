@@ -1,0 +1,50 @@
+"""Stage ``evaluate``: what detectors trained on a distribution score on target images."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from torch import Tensor
+
+from neural_sim.detector.metrics import AveragePrecision, evaluate
+from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.stage import Results, Stage
+from neural_sim.stages.target_sets import TargetSetsStage
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Average precision on a part of the target set, and every image's detections."""
+
+    ap: AveragePrecision
+    detections: list[dict[str, Tensor]]
+
+
+@dataclass(frozen=True)
+class ScoresStage(Stage[Scores]):
+    """A detector's scores on ``part`` of the target sets."""
+
+    name: ClassVar[str] = "evaluate"
+    kind: ClassVar[str] = "evaluate"
+
+    trained: DetectorStage
+    targets: TargetSetsStage
+    part: Literal["val", "test"] = "test"
+
+    @property
+    def title(self) -> str:
+        return f"{self.part} scores of the {self.trained.title}"
+
+    def make(self, results: Results) -> Scores:
+        params, images = results(self.trained).params, getattr(results(self.targets), self.part)
+        detections = self.trained.build().predict(params, images.images)
+        return Scores(evaluate(detections, images, list(self.trained.scene.names)), detections)
+
+    def pack(self, value: Scores) -> dict[str, Any]:
+        return {"ap": dataclasses.asdict(value.ap), "detections": value.detections}
+
+    def unpack(self, stored: Mapping[str, Any]) -> Scores:
+        return Scores(AveragePrecision(**stored["ap"]), stored["detections"])

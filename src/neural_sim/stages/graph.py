@@ -1,0 +1,155 @@
+"""The stages of one experiment and how they hang together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.base import HypergradientLoop
+from neural_sim.devices import device_of
+from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.evaluate import ScoresStage
+from neural_sim.stages.experiment import Experiment
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.psi import HypergradientParts, PsiStage
+from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.symmetry import SymmetryStage
+from neural_sim.stages.target_sets import TargetSetsStage
+from neural_sim.stages.views import ViewsStage
+from neural_sim.types import PinholeCamera
+
+Psi = Float[Tensor, "objects K"]
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Stages by what they give. ``on_record`` is told of every iteration of the psi loop as it ends.
+
+    Raises:
+        ValueError: objects that a setting names and the source lacks.
+    """
+
+    experiment: Experiment
+    on_record: Callable[[IterationRecord], object] | None = None
+
+    def __post_init__(self) -> None:
+        imaging, loop = self.experiment.imaging, self.experiment.loop
+        unknown = {*imaging.distribution.biased, *(loop.outer.learned or ())} - set(self.names)
+        if unknown:
+            raise ValueError(
+                f"biased or outer.learned names {sorted(unknown)}, objects are {list(self.names)}"
+            )
+
+    @cached_property
+    def meshes(self) -> Meshes:
+        imaging = self.experiment.imaging
+        return Meshes(imaging.objects, imaging.views.backend, imaging.views.supersample)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the objects, in the order of their class labels."""
+        return self.meshes.names
+
+    @cached_property
+    def device(self) -> torch.device:
+        return device_of(self.experiment.run.accelerator)
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Of synthesised and of rendered target images."""
+        return self.experiment.imaging.views.camera(self.experiment.training.image_size)
+
+    # --- images ---
+
+    @cached_property
+    def views(self) -> tuple[ViewsStage, ...]:
+        digests, settings = self.meshes.digests, self.experiment.imaging.views
+        return tuple(ViewsStage(name, digests[name], settings, self.meshes) for name in self.names)
+
+    @cached_property
+    def fields(self) -> tuple[FieldStage, ...]:
+        recipe = self.experiment.imaging.field
+        return tuple(FieldStage(views, recipe, self.device) for views in self.views)
+
+    @cached_property
+    def scene(self) -> SceneStage:
+        imaging = self.experiment.imaging
+        return SceneStage(
+            self.names, self.fields, imaging.renderer, self.camera, imaging.synthesis,
+            imaging.distribution.drawn, imaging.distribution,
+        )  # fmt: skip
+
+    @cached_property
+    def targets(self) -> TargetSetsStage:
+        imaging = self.experiment.imaging
+        return TargetSetsStage(
+            imaging.target, self.meshes.digests, imaging.distribution, imaging.synthesis, self.camera,
+            imaging.views.rig, self.experiment.run.seed, self.meshes,
+        )  # fmt: skip
+
+    def symmetry(self, name: str, angle: str) -> SymmetryStage:
+        """Of an object's bins of an angle."""
+        imaging = self.experiment.imaging
+        camera = imaging.views.camera(48)
+        return SymmetryStage(
+            name, self.meshes.digests[name], angle, imaging.distribution, camera, self.meshes
+        )
+
+    # --- psi and detectors ---
+
+    def psi(self, which: Literal["initial", "target"]) -> Psi:
+        """The configured psi of all objects."""
+        return self.experiment.imaging.distribution.psi(which, list(self.names))
+
+    @cached_property
+    def warm_start(self) -> DetectorStage:
+        """The detector that the psi loop begins with; with equal epochs it is also the one scored as ``ns``."""
+        epochs = self.experiment.training.warm_epochs
+        return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
+
+    def _detector(self, psi: Psi, epochs: int, name: str, called: str) -> DetectorStage:
+        x = self.experiment
+        probabilities = x.imaging.distribution.digest_of(psi)
+        return DetectorStage(
+            self.scene, x.detector, x.training, epochs, probabilities, x.run.seed, psi, name, called, self.device
+        )  # fmt: skip
+
+    @cached_property
+    def learned(self) -> PsiStage:
+        """The method's psi."""
+        x = self.experiment
+        follows = isinstance(x.loop.method, HypergradientLoop)
+        parts = HypergradientParts(x.loop.gradient, x.loop.solver) if follows else None
+        return PsiStage(
+            self.warm_start, self.targets, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
+            self.psi("initial"), x.run.seed, x.run.progress, self.on_record,
+        )  # fmt: skip
+
+    # --- scores ---
+
+    def trained_on(self, psi: Psi, called: str) -> DetectorStage:
+        """The detector that is scored for a distribution."""
+        return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
+
+    def scores(self, psi: Psi, called: str, part: Literal["val", "test"] = "test") -> ScoresStage:
+        """Of the detector trained on a distribution."""
+        return ScoresStage(self.trained_on(psi, called), self.targets, part)
+
+    def compared(self, learned: LearnedPsi) -> dict[str, Psi]:
+        """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
+        return {"ns": self.psi("initial"), "learned": learned.last, "matched": self.psi("target")}
+
+    def on_the_way(self, learned: LearnedPsi) -> dict[int, Psi]:
+        """psi by iterations done: at the start, after the parts of all iterations in ``score_at``, at the end."""
+        last = len(learned.trajectory) - 1
+        asked = {0, last, *(math.floor(part * last + 0.5) for part in self.experiment.run.score_at)}
+        return {iteration: learned.trajectory[iteration] for iteration in sorted(asked)}

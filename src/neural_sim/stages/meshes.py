@@ -1,0 +1,48 @@
+"""The objects of a run as meshes, loaded when a stage first draws one, and what draws them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol
+
+from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.views import choose_mesh_renderer
+
+
+class ObjectSource(Protocol):
+    """Where objects come from, such as a folder of meshes."""
+
+    def names(self) -> list[str]: ...
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each object's geometry and texture, by name."""
+        ...
+
+    def load(self) -> list[ObjectMesh]: ...
+
+
+@dataclass(frozen=True)
+class Meshes:
+    """The objects of ``source`` by name, and a mesh renderer."""
+
+    source: ObjectSource
+    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    supersample: int = 2
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.source.names())
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        return self.source.digests()
+
+    @cached_property
+    def items(self) -> dict[str, ObjectMesh]:
+        return {item.name: item for item in self.source.load()}
+
+    @cached_property
+    def renderer(self) -> MeshRenderer:
+        return choose_mesh_renderer(self.backend, self.supersample)

@@ -1,0 +1,108 @@
+"""Stage ``psi``: the distribution that a method learns, and the iterations on the way to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
+from neural_sim.gradient.estimators import Estimator
+from neural_sim.outer.cost import Cost
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import OuterLoop, learn_psi
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.records import IterationRecord, LearnedPsi, record_of
+from neural_sim.outer.rewarded import RewardLoop
+from neural_sim.outer.settings import Outer
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.target_sets import TargetSetsStage
+from neural_sim.synthesis.scene import Draws, HardDraws
+
+Method = Fixed | HypergradientLoop | RewardMethod
+
+
+@dataclass(frozen=True)
+class HypergradientParts:
+    """What a method needs that follows the hypergradient."""
+
+    estimator: Estimator
+    solver: AdjointSolver
+
+
+@dataclass(frozen=True)
+class PsiStage(Stage[LearnedPsi]):
+    """The psi loop of ``method`` from the warm start's distribution.
+
+    ``parts`` are those of a method that follows the hypergradient, None for others. ``on_record`` is told of every
+    iteration as it ends.
+    """
+
+    name: ClassVar[str] = "psi"
+    kind: ClassVar[str] = "psi"
+
+    warm_start: DetectorStage
+    targets: TargetSetsStage
+    distribution: SceneDistribution
+    method: Method
+    parts: HypergradientParts | None
+    outer: Outer
+    initial: Float[Tensor, "objects K"]
+    seed: int
+    progress: bool = field(default=False, metadata=UNKEYED)
+    on_record: Callable[[IterationRecord], object] | None = field(default=None, metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        return "psi loop"
+
+    @property
+    def draws(self) -> Draws:
+        """How the method wants its images drawn: as its estimator does, or as a method that sees rewards says."""
+        if self.parts is not None:
+            return self.parts.estimator.draws
+        return HardDraws(explore=getattr(self.method, "explores", False))
+
+    def make(self, results: Results) -> LearnedPsi:
+        if isinstance(self.method, Fixed):
+            psi = self.distribution.psi(self.method.which, list(self.warm_start.scene.names))
+            return LearnedPsi(psi[None], [], Cost())
+        warm_start = results(self.warm_start)
+        learned = learn_psi(self.loop(results), self.progress, self.on_record)
+        return replace(learned, before=warm_start.cost)
+
+    def loop(self, results: Results) -> OuterLoop:
+        """The method's loop, not yet run, on renders of ``outer.quality``. Raises ``ValueError`` for a method
+        without one."""
+        method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
+        if self.outer.quality is not None:
+            scene = replace(scene, renderer=scene.renderer.at(self.outer.quality))
+        generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 2)
+        inner = InnerLoop(
+            scene, self.warm_start.build(), results(self.warm_start).params, results(self.targets).val, self.outer,
+            training.batch_size, training.weight_decay, generator, self.draws,
+        )  # fmt: skip
+        if self.parts is not None:
+            return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver)
+        if isinstance(method, (Fixed, HypergradientLoop)):
+            raise ValueError(f"baseline={method.name} has no outer loop")
+        return RewardLoop(inner, self.initial, method)
+
+    def pack(self, value: LearnedPsi) -> dict[str, Any]:
+        return {
+            "trajectory": value.trajectory,
+            "records": [dataclasses.asdict(record) for record in value.records],
+            "before": dataclasses.asdict(value.before),
+        }
+
+    def unpack(self, stored: Mapping[str, Any]) -> LearnedPsi:
+        records = [record_of(record) for record in stored["records"]]
+        return LearnedPsi(stored["trajectory"], records, Cost(**stored["before"]))

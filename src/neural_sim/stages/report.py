@@ -1,0 +1,97 @@
+"""Stage ``report``: figures, the final training set, results.json, MLflow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from neural_sim.devices import peak_memory_mb
+from neural_sim.report.identity import identity
+from neural_sim.report.run import (
+    RunResults,
+    write_detections,
+    write_figures,
+    write_results,
+    write_training_set,
+)
+from neural_sim.stages.context import Context
+from neural_sim.stages.evaluate import Scores
+from neural_sim.synthesis.scene import join
+
+
+def write_report(context: Context) -> None:
+    """All that a run leaves in its folder and in MLflow."""
+    graph, results, folder = context.graph, context.results, context.folder
+    if context.live is None:
+        raise RuntimeError("report: want an open MLflow run, see Context.tracked")
+    learned = results(graph.learned)
+    test = results(graph.targets).test
+    scores: dict[str, Scores] = {}
+    if "evaluate" in context.stages:
+        compared = graph.compared(learned).items()
+        scores = {called: results(graph.scores(psi, called)) for called, psi in compared}
+    report = _results(context, scores)
+    parts = graph.trained_on(learned.last, "learned").images(results(graph.scene))
+    drawn = [dataclasses.replace(part, images=part.images.to("cpu")) for part in parts]
+    detections = scores["learned"].detections if scores else []
+    write_figures(report, join(drawn), test, detections, folder / "figures")
+    write_training_set(drawn, list(graph.names), folder / "training_set")
+    if scores:
+        write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
+    write_results(report, folder)
+    context.live.finish(report, folder)
+    print(report.summary())
+    print(f"results: {folder}\n{context.live.where}")
+
+
+def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:
+    """What there is to report: a run without evaluation has no AP."""
+    x, graph, results = context.experiment, context.graph, context.results
+    distribution, learned = x.imaging.distribution, results(graph.learned)
+    psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.psi("target")}
+    angles = [factor.name for factor in distribution.binned if factor.coordinate in ("phi", "rho")]
+    fields = {stage.views.object: results(stage).history for stage in graph.fields}
+    return RunResults(
+        experiment=x.run.name,
+        method=x.loop.method.name,
+        seed=x.run.seed,
+        names=list(graph.names),
+        biased=distribution.biased,
+        probabilities={which: distribution.probabilities(value) for which, value in psi.items()},
+        records=[dataclasses.asdict(record) for record in learned.records],
+        ap={called: dataclasses.asdict(part.ap) for called, part in scores.items()},
+        validation_ap=context.returned,
+        fields=fields,
+        seconds=dict(context.account.seconds),
+        memory=peak_memory_mb(graph.device),
+        left_out=[dataclasses.asdict(omission) for omission in context.account.left_out],
+        config=x.config,
+        curve=_curve(context) if scores else (),
+        symmetric_bins={
+            name: {angle: results(graph.symmetry(name, angle)) for angle in angles} for name in graph.names
+        },
+        identity=_identity(context),
+    )
+
+
+def _curve(context: Context) -> list[dict[str, Any]]:
+    """What the method had spent and what its psi was worth, at its start, on the way as asked, and at its end."""
+    graph, results = context.graph, context.results
+    learned, points = results(graph.learned), []
+    for iteration, psi in graph.on_the_way(learned).items():
+        ap = results(graph.scores(psi, f"psi after {iteration} iterations")).ap
+        spent = dataclasses.asdict(learned.cost(iteration))
+        points.append({"iteration": iteration, **spent, "ap": dataclasses.asdict(ap)})
+    return points
+
+
+def _identity(context: Context) -> dict[str, Any]:
+    """What says which runs this one can be compared with."""
+    graph, imaging = context.graph, context.experiment.imaging
+    sources = {"background": imaging.synthesis.background, "target": imaging.target}
+    read = {name: source.digest() for name, source in sources.items() if hasattr(source, "digest")}
+    scored, learned = graph.scores(graph.psi("initial"), "initial"), graph.learned
+    code = {"scoring": scored.description["code"], "method": learned.description["code"]}
+    test = context.results(graph.targets).test
+    return identity(context.experiment.config, {"objects": graph.meshes.digests, **read}, code, test)

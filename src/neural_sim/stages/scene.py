@@ -1,0 +1,40 @@
+"""The fields of all objects with what renders and composes their images; assembled in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+
+@dataclass(frozen=True)
+class SceneStage(Stage[Scene]):
+    """Of ``distribution`` the key holds what draws of given probabilities depend on (``drawn``): methods that relax
+    draws in different ways share all that is made from hard ones."""
+
+    name: ClassVar[str] = "field"
+    kind: ClassVar[str] = "scene"
+    stored: ClassVar[bool] = False
+
+    names: tuple[str, ...]
+    fields: tuple[FieldStage, ...]
+    renderer: NerfRenderer
+    camera: PinholeCamera
+    synthesizer: Synthesizer
+    drawn: Any
+    distribution: SceneDistribution = field(metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        return "scene of all objects"
+
+    def make(self, results: Results) -> Scene:
+        fields = tuple(results(stage).field for stage in self.fields)
+        return Scene(self.names, fields, self.renderer, self.camera, self.synthesizer, self.distribution)

@@ -1,0 +1,102 @@
+"""A content-addressed store of stage results: what was made once from the same inputs is not made again.
+
+Entries are written to a temporary name and moved into place, so that a killed run leaves none half written. Making is
+locked between processes: runs side by side wait for a result that one of them is making, and a lock goes with the
+process that holds it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pickle
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored result. ``seconds`` is what it took to make, also when it was found rather than made."""
+
+    value: Any
+    seconds: float
+    found: bool
+
+
+@dataclass(frozen=True)
+class Store:
+    """Results under ``root/<kind>/<key>.pt``, with the key's description beside each as JSON."""
+
+    root: Path
+
+    def fetch(self, kind: str, key: str, description: Mapping[str, Any], make: Callable[[], Any]) -> Entry:
+        """The result ``key``, from the store or from ``make``.
+
+        ``make`` returns tensors, numbers, strings and lists and dicts of these: all that is read back is read
+        with ``weights_only``, so that a shared store cannot run code. An unreadable entry is made again, with
+        a warning.
+        """
+        path = self.root / kind / f"{key}.pt"
+        found = _read(path)
+        if found is not None:
+            return found
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(path):
+            found = _read(path)  # another process may have made it meanwhile
+            if found is not None:
+                return found
+            begin = time.perf_counter()
+            value = make()
+            seconds = time.perf_counter() - begin
+            text = json.dumps(description, indent=1, sort_keys=True)
+            _write(path.with_suffix(".json"), lambda name: Path(name).write_text(text))
+            _write(path, lambda name: torch.save({"value": value, "seconds": seconds}, name))
+        return Entry(value, seconds, found=False)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Alone with an entry. The operating system frees the lock when its holder ends, however that ends."""
+    lock = FileLock(path.with_suffix(".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        _log.info("store: waiting for another run, which is making %s", path)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _read(path: Path) -> Entry | None:
+    if not path.is_file():
+        return None
+    try:
+        stored = torch.load(path, weights_only=True)
+        return Entry(stored["value"], stored["seconds"], found=True)
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError) as error:
+        _log.warning("store: %s cannot be read (%s); it is made again", path, error)
+        return None
+
+
+def _write(path: Path, write: Callable[[str], object]) -> None:
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    try:
+        write(name)
+        os.replace(name, path)
+    finally:
+        if os.path.exists(name):
+            os.unlink(name)

@@ -1,0 +1,27 @@
+"""Stage ``stress``: the suite of stiff and extreme cases, as conf/experiment/stress.yaml says."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from neural_sim.report.stress import report
+from neural_sim.stages.context import Context, StageFailure
+from neural_sim.stress.suite import Suite
+
+
+@dataclass(frozen=True)
+class StressStep(Suite):
+    """See :class:`Suite`."""
+
+    def run(self, context: Context) -> None:
+        """Every check to the run's folder and to MLflow.
+
+        Raises:
+            StageFailure: where a check failed, when all is written.
+        """
+        config, begun = context.config, time.time()
+        failed = report(self.run_all(config["seed"], config["progress"]), config, context.folder, begun)
+        if failed:
+            raise StageFailure(f"stress: {failed} checks failed")
+        context.returned = 0.0

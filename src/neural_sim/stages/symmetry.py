@@ -1,0 +1,36 @@
+"""Which bins of an angle an object's symmetry makes the same, for reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.target.symmetry import equivalent_bins
+from neural_sim.types import PinholeCamera
+
+
+@dataclass(frozen=True)
+class SymmetryStage(Stage[list[list[int]]]):
+    """Groups of bins, numbered from 1, that look the same; ``content`` is the digest of the object's mesh."""
+
+    name: ClassVar[str] = "report"
+    kind: ClassVar[str] = "symmetry"
+
+    object: str
+    content: str
+    angle: str
+    distribution: SceneDistribution
+    camera: PinholeCamera
+    meshes: Meshes = field(metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        return f"symmetry of {self.object}"
+
+    def make(self, results: Results) -> list[list[int]]:
+        item, renderer = self.meshes.items[self.object], self.meshes.renderer
+        groups = equivalent_bins(item, renderer, self.distribution, self.angle, self.camera)
+        return [[b + 1 for b in group] for group in groups]

@@ -1,0 +1,66 @@
+"""Stage ``target_sets``: the labelled target images, in a part that steers psi and a part that is scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.rig import LightRig
+from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.pixels import from_bytes, to_bytes
+from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import LabelledImages, PinholeCamera
+
+
+@dataclass(frozen=True)
+class TargetSets:
+    """``val`` steers psi, ``test`` is scored; they share no image."""
+
+    val: LabelledImages
+    test: LabelledImages
+
+
+@dataclass(frozen=True)
+class TargetSetsStage(Stage[TargetSets]):
+    """The sets of a configured target; ``contents`` are the digests of the objects' meshes by name."""
+
+    name: ClassVar[str] = "target_sets"
+    kind: ClassVar[str] = "target"
+
+    target: Any
+    contents: Mapping[str, str]
+    distribution: SceneDistribution
+    synthesizer: Synthesizer
+    camera: PinholeCamera
+    rig: LightRig | None
+    seed: int
+    meshes: Meshes = field(metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        return "target sets"
+
+    def make(self, results: Results) -> TargetSets:
+        meshes = self.meshes
+        drawn = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
+        return TargetSets(**self.target.sets(meshes.items, meshes.renderer, *drawn))
+
+    def pack(self, value: TargetSets) -> dict[str, dict[str, Tensor]]:
+        return {part.name: _packed(getattr(value, part.name)) for part in fields(TargetSets)}
+
+    def unpack(self, stored: Mapping[str, Mapping[str, Tensor]]) -> TargetSets:
+        return TargetSets(**{part: _unpacked(images) for part, images in stored.items()})
+
+
+def _packed(images: LabelledImages) -> dict[str, Tensor]:
+    held = {field.name: getattr(images, field.name).cpu() for field in fields(LabelledImages)}
+    return held | {"images": to_bytes(images.images)}
+
+
+def _unpacked(stored: Mapping[str, Tensor]) -> LabelledImages:
+    return LabelledImages(**{**stored, "images": from_bytes(stored["images"])})

@@ -1,0 +1,100 @@
+"""The version of the code that a result depends on: all modules that its maker imports, computed from their source."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT.name
+
+
+def code_version(modules: Iterable[str], root: Path = ROOT) -> str:
+    """Digest of the source of ``modules`` and of every module of this package that they import, at any depth.
+
+    Comments, layout and docstrings are left out, so that an edit of prose keeps stored results. Modules outside the
+    package count by their own source, without what they import; the standard library and installed packages that
+    cannot be read as source do not count.
+    """
+    total = hashlib.sha256()
+    for name in sorted(closure(modules, root)):
+        path = _source(name, root)
+        if path is not None:
+            total.update(name.encode() + _read(path, root).meaning)
+    return total.hexdigest()[:12]
+
+
+def closure(modules: Iterable[str], root: Path = ROOT) -> set[str]:
+    """``modules`` and all modules of the package under ``root`` that they import, directly or not."""
+    found: set[str] = set()
+    waiting = [name for name in modules if _source(name, root) is not None]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        path = _source(name, root)
+        if path is not None and path.is_relative_to(root):
+            waiting += _read(path, root).imports
+    return found
+
+
+@dataclass(frozen=True)
+class _File:
+    """What one source file means, and the modules of the package that it imports."""
+
+    meaning: bytes
+    imports: tuple[str, ...]
+
+
+def _read(path: Path, root: Path) -> _File:
+    state = path.stat()
+    return _parsed(path, root, state.st_mtime_ns, state.st_size)
+
+
+@cache
+def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
+    tree = ast.parse(path.read_text())
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            # What is imported from a package may be a module or a name that its __init__ defines.
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        found |= {name for name in names if name.split(".")[0] == root.name and _source(name, root)}
+    meaning = hashlib.sha256(ast.dump(_without_docstrings(tree)).encode()).digest()
+    return _File(meaning, tuple(sorted(found)))
+
+
+def _source(name: str, root: Path) -> Path | None:
+    """The file of a module, None where there is none: builtins, extensions, names that are no modules."""
+    first, *rest = name.split(".")
+    if first == root.name:
+        place = root.joinpath(*rest)
+        candidates = (place / "__init__.py", place.with_suffix(".py"))
+        return next((path for path in candidates if path.is_file()), None)
+    module = sys.modules.get(name)
+    try:
+        path = inspect.getsourcefile(module) if module else None
+    except TypeError:
+        return None
+    return Path(path) if path and "site-packages" not in path and Path(path).is_file() else None
+
+
+def _without_docstrings(tree: ast.AST) -> ast.AST:
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            value = body[0].value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                node.body = body[1:]  # pyright: ignore[reportAttributeAccessIssue]
+    return tree

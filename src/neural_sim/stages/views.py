@@ -1,0 +1,49 @@
+"""Stage ``views``: the posed views of an object that train its field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from neural_sim.renderer.views import Views
+from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.pixels import from_bytes, to_bytes
+from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.types import PinholeCamera, PosedViews
+
+
+@dataclass(frozen=True)
+class ViewsStage(Stage[PosedViews]):
+    """Views of one object; ``content`` is the digest of its mesh. Not the run's seed, so that runs share them."""
+
+    name: ClassVar[str] = "views"
+    kind: ClassVar[str] = "views"
+    keep: ClassVar[bool] = False  # large, read once
+
+    object: str
+    content: str
+    settings: Views
+    meshes: Meshes = field(metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        return f"views of {self.object}"
+
+    def make(self, results: Results) -> PosedViews:
+        return self.settings.render(self.meshes.renderer, self.meshes.items[self.object])
+
+    def pack(self, value: PosedViews) -> dict[str, Any]:
+        camera, weights = value.camera, value.light_weights
+        return {
+            "images": to_bytes(value.images),
+            "camera_to_world": value.camera_to_world.cpu(),
+            "camera": [camera.width, camera.height, camera.field_of_view],
+            "light_weights": None if weights is None else weights.cpu(),
+        }
+
+    def unpack(self, stored: Mapping[str, Any]) -> PosedViews:
+        width, height, field_of_view = stored["camera"]
+        camera = PinholeCamera(int(width), int(height), float(field_of_view))
+        images = from_bytes(stored["images"])
+        return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"])

@@ -1,0 +1,83 @@
+"""A run: the stages of ``stages=[...]``, one after another."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Mapping
+
+from neural_sim.stages.context import Context, Step
+from neural_sim.stages.plan import plan
+from neural_sim.stages.report import write_report
+
+_log = logging.getLogger(__name__)
+
+
+def views(context: Context) -> None:
+    for stage in context.shown(context.graph.views, "views"):
+        context.results(stage)
+
+
+def fields(context: Context) -> None:
+    for stage in context.shown(context.graph.fields, "field"):
+        fitted = context.results(stage)
+        if context.live:
+            context.live.fields({stage.views.object: fitted.history})
+
+
+def target_sets(context: Context) -> None:
+    context.results(context.graph.targets)
+
+
+def warm_start(context: Context) -> None:
+    context.results(context.graph.warm_start)
+
+
+def psi(context: Context) -> None:
+    learned = context.results(context.graph.learned)
+    if context.live:
+        context.live.iterations([dataclasses.asdict(record) for record in learned.records])
+
+
+def evaluate(context: Context) -> None:
+    graph, results = context.graph, context.results
+    learned = results(graph.learned)
+    on_the_way = {f"psi after {i} iterations": at for i, at in graph.on_the_way(learned).items()}
+    for called, at in context.shown([*graph.compared(learned).items(), *on_the_way.items()], "evaluate"):
+        results(graph.scores(at, called))
+    # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
+    context.returned = results(graph.scores(learned.last, "learned", "val")).ap.ap
+
+
+STEPS: Mapping[str, Callable[[Context], None]] = {
+    "views": views,
+    "field": fields,
+    "target_sets": target_sets,
+    "warm_start": warm_start,
+    "psi": psi,
+    "evaluate": evaluate,
+    "report": write_report,
+}
+"""The stages of a run from objects to a report, in their order."""
+
+
+def walk(context: Context, others: Mapping[str, Step]) -> float | None:
+    """Run the context's stages: those of ``STEPS`` in its order, then ``others`` in theirs.
+
+    Returns what a sweep may maximise: the AP on validation images of the detector trained on the learned distribution.
+    None where nothing was evaluated.
+    """
+    asked = [name for name in STEPS if name in context.stages]
+    if asked:
+        context.account.left_out += plan(context.graph)
+    for omission in context.account.left_out:
+        share = "" if omission.share in (None, 1.0) else f" ({omission.share:.0%})"
+        _log.info("left out: %s%s: %s", omission.what, share, omission.why)
+    with context.tracked():
+        for name in asked:
+            with context.timed(name):
+                STEPS[name](context)
+        for name, step in others.items():
+            with context.timed(name):
+                step.run(context)
+    return context.returned

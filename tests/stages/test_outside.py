@@ -1,0 +1,55 @@
+"""A stage from outside the package: one class, one configuration node."""
+
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.stages.walk import walk
+
+PLUGIN = '''
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Count:
+    """Counts the objects and writes the number."""
+
+    times: int = 1
+
+    def run(self, context):
+        (context.folder / "count.txt").write_text(str(self.times * len(context.graph.names)))
+'''
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    (tmp_path / "my_stage.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("my_stage", None)
+
+
+def context(folder, *overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        config = compose("config", ["+experiment=pose_gap", "scale=smoke", *overrides])
+    return context_of(config, folder)
+
+
+def test_a_stage_from_outside_is_one_class_and_one_node(tmp_path, plugin):
+    overrides = ["+count={_target_: my_stage.Count, times: 2}", "stages=[count]"]
+    assert walk(*context(tmp_path, *overrides)) is None
+    assert (tmp_path / "count.txt").read_text() == "12"
+
+
+def test_its_settings_are_checked_like_all_others(tmp_path, plugin):
+    with pytest.raises(UserError, match=r"count.times: want int, got 'two'"):
+        context(tmp_path, "+count={_target_: my_stage.Count, times: two}", "stages=[count]")
+
+
+def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin):
+    with pytest.raises(UserError) as caught:
+        context(tmp_path, "+count={_target_: my_stage.Count}", "stages=[views,fields]")
+    known = "views, field, target_sets, warm_start, psi, evaluate, report, count"
+    assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}"

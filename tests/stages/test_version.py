@@ -1,0 +1,100 @@
+"""The version of a stage's code changes with every module that it imports, at any depth, and with no other."""
+
+import importlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from neural_sim.stages.version import PACKAGE, ROOT, closure, code_version
+
+STAGES = ("views", "field", "scene", "target_sets", "detector", "psi", "evaluate", "symmetry")
+
+
+def package(folder: Path, files: dict[str, str]) -> Path:
+    root = folder / "pack"
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return root
+
+
+CHAIN = {
+    "__init__.py": "",
+    "a.py": "from pack.b import f\n",
+    "b.py": "def f():\n    import pack.sub.c\n    return 1\n",
+    "sub/__init__.py": "",
+    "sub/c.py": "x = 1\n",
+    "other.py": "from pack.a import f\n",
+}
+
+
+def test_the_closure_follows_imports_at_any_depth_and_inside_functions(tmp_path):
+    root = package(tmp_path, CHAIN)
+    assert closure(["pack.a"], root) == {"pack.a", "pack.b", "pack.sub.c"}
+
+
+@pytest.mark.parametrize("touched", ["a.py", "b.py", "sub/c.py", "other.py"])
+def test_only_what_is_imported_counts(tmp_path, touched):
+    before = code_version(["pack.a"], package(tmp_path / "before", CHAIN))
+    changed = {**CHAIN, touched: CHAIN[touched] + "y = 2\n"}
+    after = code_version(["pack.a"], package(tmp_path / "after", changed))
+    assert (before != after) == (touched != "other.py")
+
+
+def test_prose_does_not_count(tmp_path):
+    before = code_version(["pack.a"], package(tmp_path / "before", CHAIN))
+    changed = {**CHAIN, "b.py": '"""What."""\n# why\n' + CHAIN["b.py"]}
+    assert code_version(["pack.a"], package(tmp_path / "after", changed)) == before
+
+
+def test_a_plug_in_counts_by_its_own_source(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    versions = []
+    for text in ("x = 1\n", "x = 22\n"):
+        (tmp_path / "plugged_in.py").write_text(text)
+        sys.modules.pop("plugged_in", None)
+        importlib.invalidate_caches()
+        importlib.import_module("plugged_in")
+        versions.append(code_version(["plugged_in"]))
+    assert versions[0] != versions[1]
+
+
+@pytest.fixture(scope="module")
+def modules():
+    names = {
+        path: ".".join(path.relative_to(ROOT.parent).with_suffix("").parts) for path in ROOT.rglob("*.py")
+    }
+    return {name.removesuffix(".__init__"): path for path, name in names.items()}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_touching_any_module_that_a_stage_imports_changes_its_version_and_no_other_does(
+    tmp_path, stage, modules
+):
+    copy = tmp_path / PACKAGE
+    shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    name = f"{PACKAGE}.stages.{stage}"
+    imported = closure([name])
+    before = code_version([name], copy)
+    for module, path in modules.items():
+        place = copy / path.relative_to(ROOT)
+        text = place.read_text()
+        place.write_text(text + "\n_TOUCHED = 1\n")
+        assert (code_version([name], copy) != before) == (module in imported), module
+        place.write_text(text)
+
+
+@pytest.mark.parametrize("stage", ["views", "psi"])  # a process each
+def test_all_that_importing_a_stage_loads_is_in_its_closure(stage):
+    name = f"{PACKAGE}.stages.{stage}"
+    code = f"import sys, {name}; print(*[m for m in sys.modules if m.split('.')[0] == '{PACKAGE}'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    packages = {
+        m for m in loaded if (ROOT.parent / m.replace(".", "/")).is_dir()
+    }  # empty but for a docstring
+    assert loaded - packages <= closure([name])
