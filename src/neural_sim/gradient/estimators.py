@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
 from torch import Tensor
 
+from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
@@ -47,16 +48,34 @@ class StratifiedEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
+        scored = losses.probes
+        if scored is None:
+            raise ValueError("stratified: wants losses of probes, got none")
+        return self._over_strata(
+            lambda index: scores(scored, params, vector, index, self.chunk_size, self.theta_mode),
+            images,
+            probes,
+        )
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        return self._over_strata(lambda index: found.probes[index.to(found.probes.device)], images, probes)
+
+    def _over_strata(
+        self, scored: Callable[[Tensor], Tensor], images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
         distribution = images.distribution
-        if losses.probes is None or set(probes) != set(distribution.names):
+        if set(probes) != set(distribution.names):
             raise ValueError(
                 f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
             )
         share, psi, parts = float(images.weights.sum()), distribution.split(images.psi), {}
         for factor in distribution.factors:
             held = probes[factor.name]
-            along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            parts[factor.name] = by_strata(along.to(images.psi), held.bins, factor, psi[factor.name], share)
+            along = scored(held.index).to(images.psi)
+            parts[factor.name] = by_strata(along, held.bins, factor, psi[factor.name], share)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
@@ -80,7 +99,18 @@ class ReinforceEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
-        along = scores(losses.cached, params, vector, images.index, self.chunk_size)
+        return self._by_score_function(
+            scores(losses.cached, params, vector, images.index, self.chunk_size), images
+        )
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        by_weight = found.images[images.index.to(found.images.device)]
+        return self._by_score_function(by_weight / images.weights.to(by_weight), images)
+
+    def _by_score_function(self, along: Tensor, images: ObjectImages) -> MixedDerivative:
         share = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:
