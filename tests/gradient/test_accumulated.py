@@ -10,6 +10,7 @@ import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
 from neural_sim.detector.optimiser import AdamW
+from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, places, standing
 from neural_sim.gradient.base import ObjectImages, Probes
@@ -191,6 +192,39 @@ def test_pathwise_is_the_derivative_of_the_training_on_images_that_move(problem,
     ]
     expected = torch.tensor(expected, dtype=DOUBLE)
     assert float((ours - expected).norm()) < 1e-6 * float(expected.norm())
+
+
+def test_pathwise_goes_through_the_backbone_once_for_all_steps(rooms):
+    """Pixels, features, six steps of the detector's pyramid and head: against the same training at psi +- h."""
+    rates, every = (3e-3, 5e-3, 4e-3, 2e-3), [torch.tensor([0, 2]), torch.tensor([1, 3])] * 2
+    labels = rooms.targets.labels
+
+    def inputs_of(leaves, rows):
+        return (*rooms.detector.features(rooms.backbone, leaves[0]), rooms.targets.deltas[rows])
+
+    def losses(params, inputs, rows):
+        return rooms.detector.per_image_loss(params, inputs[:-1], Targets(labels[rows], inputs[-1]))
+
+    def trained(psi):
+        with torch.no_grad():
+            images = rooms.compose(*rooms.render(psi)).images
+            inputs = inputs_of((images,), torch.arange(len(images)))
+        held = Examples(inputs, losses, inputs_of=inputs_of)
+        made = train(
+            RULE, flatten(rooms.trainable), tuple(every), rates,
+            lambda theta, rows: held.gradient(theta, rooms.trainable, rows),
+        )  # fmt: skip
+        return made, held
+
+    direction = flatten(rooms.vector)
+    made, held = trained(rooms.psi)
+    found = EXACT.accumulate(made, held, rooms.trainable, direction, torch.Generator(), with_inputs=True)
+    ours = PathwiseEstimator(chunk_size=3).accumulated(found, rooms.object_images(), {}).value
+    along = torch.tensor([1.0, -0.5, 0.3, -0.8], dtype=DOUBLE)
+    expected = extrapolated(
+        lambda step: float(trained(rooms.psi + step * along)[0].end @ direction), 10 * STEP
+    )
+    assert float(ours @ along) == pytest.approx(expected, rel=1e-5)
 
 
 def test_pathwise_wants_the_derivative_by_inputs(problem):

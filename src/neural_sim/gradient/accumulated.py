@@ -110,7 +110,7 @@ class Unrolled:
     part: float = 1.0
     max_memory_mb: float = 2048.0
     probes_per_step: int = 1
-    score_every: int = 1
+    score_every: int = 2
     chunk_size: int = 64
 
     def __post_init__(self) -> None:
@@ -145,13 +145,14 @@ class Unrolled:
         if probes is None:
             return self._sum(steps, trajectory, examples, with_inputs)
         total, scored = slope.new_zeros(probes.count), 0
+        tables = [table.to(slope.device) for table in probes.groups]
 
         def watched() -> Iterator[ReversedStep]:
             nonlocal scored
             turns = places(probes.per_bin, self.probes_per_step or probes.per_bin, generator)
             for step, weight in zip(steps, standing(count, self.score_every, generator), strict=True):
                 if weight:
-                    scored += self._score(probes, step, next(turns), weight, total)
+                    scored += self._score(probes.losses, tables, step, next(turns), weight, total)
                 yield step
 
         found = self._sum(watched(), trajectory, examples, with_inputs)
@@ -170,15 +171,22 @@ class Unrolled:
         return Accumulated(images, inputs, images.new_zeros(0), 0, examples.inputs_of)
 
     def _score(
-        self, probes: ProbeGroups, step: ReversedStep, chosen: Tensor, weight: int, total: Tensor
+        self,
+        losses: IndexedLoss,
+        tables: Sequence[Tensor],
+        step: ReversedStep,
+        chosen: Int[Tensor, "columns"],
+        weight: int,
+        total: Tensor,
     ) -> int:
         """Add one step's scores of the probes in some columns, standing for all columns and ``weight`` steps."""
-        rows = [table[:, chosen].to(total.device) for table in probes.groups]
+        columns = chosen.to(total.device)
+        rows = [table[:, columns] for table in tables]
         along = scores(
-            probes.losses, step.params, step.along, torch.cat([part.reshape(-1) for part in rows]),
+            losses, step.params, step.along, torch.cat([part.reshape(-1) for part in rows]),
             self.chunk_size, "central_difference",
         )  # fmt: skip
-        scale = weight * probes.per_bin / len(chosen)
+        scale = weight * tables[0].shape[-1] / len(chosen)
         for part, found in zip(rows, along.split([part.numel() for part in rows]), strict=True):
             # What all bins share moves nothing, and would be noise wherever probes are scored unequally often.
             total.index_add_(0, part.reshape(-1), scale * (found - found.mean()))

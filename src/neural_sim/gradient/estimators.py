@@ -27,6 +27,7 @@ class StratifiedEstimator:
     """
 
     draws: ClassVar[HardDraws] = HardDraws()
+    through_images: ClassVar[bool] = False
     probes_per_bin: int = 16
     chunk_size: int = 64
     theta_mode: ThetaMode = "central_difference"
@@ -87,6 +88,7 @@ class ReinforceEstimator:
     """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
 
     draws: ClassVar[HardDraws] = HardDraws(explore=True)
+    through_images: ClassVar[bool] = False
     probes_per_bin: ClassVar[int] = 0
     chunk_size: int = 64
 

@@ -60,6 +60,7 @@ class PathwiseEstimator:
         ValueError: any of these out of its range, with the key and the value.
     """
 
+    through_images: ClassVar[bool] = True
     probes_per_bin: ClassVar[int] = 0
     mode: Mode = "forward"
     relaxation: Relaxation = "gumbel_softmax"
