@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import torch
 
 from neural_sim.cameras import orbit
+from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.illumination import ProjectedGradient
 from neural_sim.parameter.update import Update
@@ -19,6 +20,7 @@ from neural_sim.renderer.views import render_views
 from neural_sim.types import PinholeCamera, PosedViews
 
 Start = Literal["previous", "warm", "fresh"]
+AdjointKind = Literal["implicit", "unrolled"]
 OnUntrusted = Literal["shrink", "skip", "stop"]
 
 
@@ -139,6 +141,9 @@ class Outer:
     first iteration's hypergradient is taken at the warm start as it is, unless ``train_first``.
     psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951);
     ``update`` steps logits of bins, ``light_update`` weights of lights.
+    ``adjoint`` says what the hypergradient is of: a stationary point, by the solver (``implicit``, the paper's Eq. 2),
+    or the training that was run (``unrolled``, as ``unrolled`` says), which every iteration must then have: it wants
+    ``train_first`` and epochs, and no retrained finite differences, which are of a stationary point.
     ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
     poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
     estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
@@ -157,6 +162,8 @@ class Outer:
     learning_rate: float = 3e-3
     start: Start = "fresh"
     train_first: bool = False
+    adjoint: AdjointKind = "implicit"
+    unrolled: Unrolled = field(default_factory=Unrolled)
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
@@ -187,6 +194,15 @@ class Outer:
             raise ValueError("outer.learned: want the names of objects, or null for all, got none")
         if not 0.0 < self.final_step <= 1.0:
             raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
+        if self.adjoint not in get_args(AdjointKind):
+            raise ValueError(
+                f"outer.adjoint must be one of {', '.join(get_args(AdjointKind))}, got {self.adjoint!r}"
+            )
+        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or self.certify_every):
+            raise ValueError(
+                "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and certify_every=0, got "
+                f"{self.train_first}, {self.epochs} and {self.certify_every}"
+            )
         if self.on_untrusted not in get_args(OnUntrusted):
             raise ValueError(
                 f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
