@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 import torch
@@ -141,56 +141,46 @@ class Unrolled:
         ``like`` gives the parameters' names and shapes. ``generator`` draws which probes are scored where.
         """
         steps = reversed_steps(trajectory, examples, like, slope, self.product, with_inputs)
-        count = len(trajectory) - trajectory.first
-        if probes is None:
-            return self._sum(steps, trajectory, examples, with_inputs)
-        total, scored = slope.new_zeros(probes.count), 0
-        tables = [table.to(slope.device) for table in probes.groups]
-
-        def watched() -> Iterator[ReversedStep]:
-            nonlocal scored
-            turns = places(probes.per_bin, self.probes_per_step or probes.per_bin, generator)
-            for step, weight in zip(steps, standing(count, self.score_every, generator), strict=True):
-                if weight:
-                    scored += self._score(probes.losses, tables, step, next(turns), weight, total)
-                yield step
-
-        found = self._sum(watched(), trajectory, examples, with_inputs)
-        return replace(found, probes=total, scored=scored)
-
-    def _sum(
-        self, steps: Iterable[ReversedStep], trajectory: Trajectory, examples: Examples, with_inputs: bool
-    ) -> Accumulated:
-        count = len(examples.inputs[0])
-        images = torch.zeros_like(trajectory.end[:1]).expand(count).clone()
+        scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
+        per_bin = probes.per_bin if probes else 1
+        turns = places(per_bin, self.probes_per_step or per_bin, generator)
+        weights = standing(len(trajectory) - trajectory.first, self.score_every, generator)
+        images = torch.zeros_like(slope[:1]).expand(len(examples.inputs[0])).clone()
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if with_inputs else ()
         for step in steps:
             images.index_add_(0, step.rows, step.scores / len(step.rows))
             for into, part in zip(inputs, step.inputs, strict=True):
                 into.index_add_(0, step.rows, part)
-        return Accumulated(images, inputs, images.new_zeros(0), 0, examples.inputs_of)
+            if scoring is not None and (weight := next(weights)):
+                scoring.add(step, next(turns), weight)
+        total, scored = (slope.new_zeros(0), 0) if scoring is None else (scoring.total, scoring.scored)
+        return Accumulated(images, inputs, total, scored, examples.inputs_of)
 
-    def _score(
-        self,
-        losses: IndexedLoss,
-        tables: Sequence[Tensor],
-        step: ReversedStep,
-        chosen: Int[Tensor, "columns"],
-        weight: int,
-        total: Tensor,
-    ) -> int:
-        """Add one step's scores of the probes in some columns, standing for all columns and ``weight`` steps."""
-        columns = chosen.to(total.device)
-        rows = [table[:, columns] for table in tables]
+
+class _Scoring:
+    """Sums of probes' scores, from the steps that score them."""
+
+    def __init__(self, probes: ProbeGroups, like: Tensor, chunk_size: int) -> None:
+        self.losses, self.per_bin, self.chunk_size = probes.losses, probes.per_bin, chunk_size
+        self.tables = [table.to(like.device) for table in probes.groups]
+        self.total, self.scored = like.new_zeros(probes.count), 0
+        self._levels: list[Tensor] = []
+
+    def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: int) -> None:
+        """One step's scores of the probes in some columns, standing for all columns and ``weight`` steps."""
+        columns = chosen.to(self.total.device)
+        rows = [table[:, columns].reshape(-1) for table in self.tables]
         along = scores(
-            losses, step.params, step.along, torch.cat([part.reshape(-1) for part in rows]),
-            self.chunk_size, "central_difference",
-        )  # fmt: skip
-        scale = weight * tables[0].shape[-1] / len(chosen)
-        for part, found in zip(rows, along.split([part.numel() for part in rows]), strict=True):
-            # What all bins share moves nothing, and would be noise wherever probes are scored unequally often.
-            total.index_add_(0, part.reshape(-1), scale * (found - found.mean()))
-        return len(along)
+            self.losses, step.params, step.along, torch.cat(rows), self.chunk_size, "central_difference"
+        )
+        parts = along.split([part.numel() for part in rows])
+        means = [part.mean() for part in parts]
+        scale = weight * self.per_bin / len(columns)
+        # What all bins share moves nothing, and would be noise wherever probes are scored unequally often. It is taken
+        # from the step before: a mean of these scores themselves would hide a part of their own noise.
+        for into, part, level in zip(rows, parts, self._levels or means, strict=True):
+            self.total.index_add_(0, into, scale * (part - level))
+        self._levels, self.scored = means, self.scored + len(along)
 
 
 def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[Int[Tensor, "per_step"]]:
