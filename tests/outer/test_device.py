@@ -9,6 +9,7 @@ from trips import counted
 
 from neural_sim import devices
 from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.unrolled import Examples
 from neural_sim.outer.inner import InnerLoop
@@ -86,21 +87,23 @@ def test_the_loop_on_the_trainings_derivative_is_the_cpus(scene, pretend, monkey
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
 
 
-def test_steps_walked_back_through_wait_for_nothing(scene, pretend):
-    """Scores of probes bring their rows there and wait for the length of a difference; steps alone do neither."""
+@pytest.mark.parametrize("scored", [False, True])
+def test_steps_walked_back_through_wait_for_nothing(scene, pretend, scored):
+    """Scores of probes bring their columns there and wait twice, for a difference's length; steps alone do neither."""
     trips = {}
     for epochs in (1, 3):
         module = _module(scene, ReinforceEstimator(), "pretend", epochs, adjoint="unrolled", train_first=True)
         inner, cached = module.inner, module.inner.validation
         inner.train(cached, module.settings.unrolled.recording)
         examples = Examples(cached.inputs, cached.losses_from)
+        probes = ProbeGroups(cached.losses, [torch.arange(6).view(2, 3)]) if scored else None
         slope = torch.ones_like(inner.trajectory.end)
         with counted() as ledger:
-            module.settings.unrolled.accumulate(
-                inner.trajectory, examples, inner.trainable, slope, torch.Generator()
+            Unrolled(score_every=1).accumulate(
+                inner.trajectory, examples, inner.trainable, slope, torch.Generator(), probes
             )
         trips[len(inner.trajectory)] = ledger.count()
-    assert trips == {2: trips[2], 6: trips[2]}
+    assert trips == {2: trips[2], 6: trips[2] + 4 * (2 + 1) * scored}
 
 
 def test_detector_steps_wait_for_nothing(scene, pretend):
