@@ -9,7 +9,9 @@ from trips import counted
 
 from neural_sim import devices
 from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.unrolled import Examples
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
@@ -30,7 +32,7 @@ TINY = {
 }  # fmt: skip
 
 
-def _module(scene, estimator, device, epochs=1, iterations=1):
+def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
     generator = torch.Generator().manual_seed(0)
     detector, psi = Detector(**TINY), torch.zeros(2, 4)
     scene = dataclasses.replace(
@@ -46,6 +48,7 @@ def _module(scene, estimator, device, epochs=1, iterations=1):
         epochs=epochs,
         curvature_images=4,
         pool_per_bin=2,
+        **outer,
     )
     params = devices.placed(detector.init(generator), torch.device(device))
     inner = InnerLoop(scene, detector, params, validation, settings, 4, 0.0, generator, estimator.draws)
@@ -71,6 +74,36 @@ def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
     losses = [[record.validation_loss for record in learned.records] for learned in found]
     assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+def test_the_loop_on_the_trainings_derivative_is_the_cpus(scene, pretend, monkeypatch, estimator):
+    monkeypatch.setattr(devices, "CACHES", 1)
+    found = []
+    for device in ("cpu", "pretend"):
+        module = _module(scene, estimator, device, epochs=2, adjoint="unrolled", train_first=True)
+        found.append(learn_psi(module, progress=False))
+        assert module.inner.trajectory.end.device.type == device
+    assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("scored", [False, True])
+def test_steps_walked_back_through_wait_for_nothing(scene, pretend, scored):
+    """Scores of probes bring their columns there and wait twice, for a difference's length; steps alone do neither."""
+    trips = {}
+    for epochs in (1, 3):
+        module = _module(scene, ReinforceEstimator(), "pretend", epochs, adjoint="unrolled", train_first=True)
+        inner, cached = module.inner, module.inner.validation
+        inner.train(cached, module.settings.unrolled.recording)
+        examples = Examples(cached.inputs, cached.losses_from)
+        probes = ProbeGroups(cached.losses, [torch.arange(6).view(2, 3)]) if scored else None
+        slope = torch.ones_like(inner.trajectory.end)
+        with counted() as ledger:
+            Unrolled(score_every=1).accumulate(
+                inner.trajectory, examples, inner.trainable, slope, torch.Generator(), probes
+            )
+        trips[len(inner.trajectory)] = ledger.count()
+    assert trips == {2: trips[2], 6: trips[2] + 4 * (2 + 1) * scored}
 
 
 def test_detector_steps_wait_for_nothing(scene, pretend):

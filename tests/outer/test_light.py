@@ -134,18 +134,22 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
         assert bool((found.standard_error > 0.0).all())
 
 
+@pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
 @pytest.mark.parametrize(
     "estimator",
     [StratifiedEstimator(2), PathwiseEstimator(), PathwiseEstimator("reverse"), ReinforceEstimator()],
     ids=lambda e: type(e).__name__ + getattr(e, "mode", ""),
 )  # fmt: skip
-def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator):
+def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator, adjoint):
     scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
     detector = Detector(2, 32, **DETECTOR)
     validation = join(scene.training_set(start.float(), 3, generator, HARD))
     light_update = ProjectedGradient(shrink=False)
-    settings = Outer(Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update)
+    settings = Outer(
+        Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update,
+        train_first=adjoint == "unrolled", adjoint=adjoint,
+    )  # fmt: skip
     inner = InnerLoop(
         scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
     )

@@ -63,6 +63,18 @@ class CachedSet:
         """The predictor's outputs on the images ``index``."""
         return self.detector.outputs(params, tuple(level[index] for level in self.features))
 
+    @property
+    def inputs(self) -> tuple[Tensor, ...]:
+        """What the losses are functions of where images and boxes move: features, then the targets' boxes."""
+        return (*self.features, self.targets.deltas)
+
+    def losses_from(
+        self, params: Parameters, inputs: tuple[Tensor, ...], index: Tensor
+    ) -> Float[Tensor, "n"]:
+        """Losses of the images ``index`` from these rows of :attr:`inputs`, differentiable in them."""
+        targets = Targets(self.targets.labels[index], inputs[-1])
+        return self.detector.per_image_loss(params, inputs[:-1], targets)
+
     def losses_of(self, outputs: Outputs, index: Tensor) -> Float[Tensor, "n"]:
         """Losses of the images ``index`` as a function of their outputs alone, for Gauss-Newton products."""
         return self.detector.losses_of(outputs, self.targets.select(index))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import lightning.pytorch as pl
 import torch
@@ -10,8 +11,10 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from neural_sim.detector.losses import proximal_loss
+from neural_sim.detector.optimiser import AdamW, State
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
+from neural_sim.detector.trajectory import Recorder, Recording, Trajectory
 
 Batch = tuple[tuple[Tensor, ...], Targets]
 
@@ -30,6 +33,10 @@ class DetectorModule(pl.LightningModule):
         weight_decay: decoupled, on convolution weights only.
         warmup_fraction: part of ``total_steps`` in which the learning rate rises.
         proximal: adds ``proximal / 2 |learned - anchor|^2`` to the loss; ``anchor`` holds the learned names.
+        recording: what is kept of the steps, for :meth:`trajectory`.
+
+    Raises:
+        ValueError: for a recording that does not fit its memory.
     """
 
     def __init__(
@@ -43,6 +50,7 @@ class DetectorModule(pl.LightningModule):
         warmup_fraction: float,
         proximal: float = 0.0,
         anchor: Parameters | None = None,
+        recording: Recording | None = None,
     ) -> None:
         super().__init__()
         self.detector = detector
@@ -59,10 +67,23 @@ class DetectorModule(pl.LightningModule):
         self._losses: list[Tensor] = []
         self._sizes: list[int] = []
         self._epochs: list[int] = []
+        self._recorder = None
+        if recording is not None:
+            self._recorder = Recorder(recording, AdamW(self._decay()), total_steps, _flat(self._values))
 
     def parameters_by_name(self) -> Parameters:
         """The learned parameters as they are now, detached copies."""
         return {name: value.detach().clone() for name, value in zip(self._names, self._values, strict=True)}
+
+    def trajectory(self, rows: Sequence[Tensor]) -> Trajectory:
+        """The steps done, on batches of these ``rows``.
+
+        Raises:
+            ValueError: where nothing was to be recorded.
+        """
+        if self._recorder is None:
+            raise ValueError("DetectorModule: want a recording for a trajectory, got None")
+        return self._recorder.trajectory(tuple(rows), _flat(self._values))
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         inputs, targets = batch
@@ -81,6 +102,28 @@ class DetectorModule(pl.LightningModule):
         inputs, targets = batch
         moved = Targets(targets.labels.to(device), targets.deltas.to(device))
         return tuple(x.to(device) for x in inputs), moved
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        if self._recorder is None:
+            return
+
+        def state() -> State:
+            held = [optimizer.state[value] for value in self._values]
+            moments = (
+                _flat(
+                    [
+                        part.get(name, torch.zeros_like(value))
+                        for part, value in zip(held, self._values, strict=True)
+                    ]
+                )
+                for name in ("exp_avg", "exp_avg_sq")
+            )
+            return (_flat(self._values), *moments)
+
+        def gradient() -> Tensor:
+            return _flat([torch.zeros_like(v) if v.grad is None else v.grad for v in self._values])
+
+        self._recorder.step(state, gradient, optimizer.param_groups[0]["lr"])
 
     def on_train_epoch_end(self) -> None:
         self._epochs.append(len(self._sizes) - self.steps_done)
@@ -104,8 +147,23 @@ class DetectorModule(pl.LightningModule):
         schedule = LambdaLR(optimiser, self._rate)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
+    def _decay(self) -> Tensor:
+        """The weight decay of each entry of the learned parameters."""
+        decays = [self.weight_decay if value.ndim > 1 else 0.0 for value in self._values]
+        return torch.cat(
+            [
+                value.detach().new_full((value.numel(),), decay)
+                for value, decay in zip(self._values, decays, strict=True)
+            ]
+        )
+
     def _rate(self, step: int) -> float:
         if step < self.warmup_steps:
             return (step + 1) / self.warmup_steps
         done = (step - self.warmup_steps) / max(1, self.total_steps - self.warmup_steps)
         return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+
+def _flat(tensors: Iterable[Tensor]) -> Tensor:
+    """Copies of all entries in one vector."""
+    return torch.cat([tensor.detach().reshape(-1) for tensor in tensors])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.targets import Targets
+from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import trainer_on
 from neural_sim.types import LabelledImages
 
@@ -40,19 +41,22 @@ class Training:
 
 @dataclass(frozen=True)
 class TrainingHistory:
-    """``losses``: mean training loss of each epoch, as met by the steps; ``steps``: optimiser steps done."""
+    """``losses``: mean training loss of each epoch, as met by the steps; ``steps``: optimiser steps done;
+    ``trajectory``: the steps themselves, where they were to be recorded."""
 
     losses: tuple[float, ...]
     steps: int
+    trajectory: Trajectory | None = field(default=None, compare=False)
 
 
 class Batches:
-    """Inputs and targets in batches, in an order that the generator shuffles anew each epoch."""
+    """Inputs and targets in batches, in an order that the generator shuffles each epoch; ``drawn`` are their rows."""
 
     def __init__(
         self, inputs: tuple[Tensor, ...], targets: Targets, batch_size: int, generator: torch.Generator
     ) -> None:
         self.inputs, self.targets, self.batch_size, self.generator = inputs, targets, batch_size, generator
+        self.drawn: list[Tensor] = []
 
     def __len__(self) -> int:
         return -(-len(self.targets) // self.batch_size)
@@ -60,6 +64,7 @@ class Batches:
     def __iter__(self) -> Iterator[Batch]:
         order = torch.randperm(len(self.targets), generator=self.generator, device=self.generator.device)
         for index in order.to(self.targets.labels.device).split(self.batch_size):
+            self.drawn.append(index)
             yield tuple(x[index] for x in self.inputs), self.targets.select(index)
 
 
@@ -76,6 +81,7 @@ def train_detector(
     progress: bool = False,
     proximal: float = 0.0,
     anchor: Parameters | None = None,
+    recording: Recording | None = None,
 ) -> tuple[Parameters, TrainingHistory]:
     """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
 
@@ -84,13 +90,15 @@ def train_detector(
             pyramid and the head alone are trained.
         warmup_fraction: part of the steps over which the learning rate rises linearly.
         proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
+        recording: what the history keeps of the steps (None: nothing).
 
     Returns:
         New parameters, detached, all of them (the frozen ones are the given tensors), and the history, whose losses
         leave the proximal term out.
 
     Raises:
-        ValueError: without images, epochs or a batch size; for a proximal term without its anchor.
+        ValueError: without images, epochs or a batch size; for a proximal term without its anchor; for a recording
+            that does not fit its memory.
     """
     if len(images) == 0 or epochs < 1 or batch_size < 1:
         raise ValueError(
@@ -111,11 +119,12 @@ def train_detector(
     batches = Batches(inputs, targets, batch_size, generator)
     module = DetectorModule(
         detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction,
-        proximal, anchor,
+        proximal, anchor, recording,
     )  # fmt: skip
     _fit(module, batches, epochs, progress, next(iter(learned.values())).device)
     values = {**fixed, **module.parameters_by_name()}
-    history = TrainingHistory(tuple(module.epoch_losses), module.steps_done)
+    trajectory = module.trajectory(batches.drawn) if recording else None
+    history = TrainingHistory(tuple(module.epoch_losses), module.steps_done, trajectory)
     return {name: values[name] for name in params}, history
 
 

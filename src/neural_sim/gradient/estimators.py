@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, get_args
 
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
 from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
@@ -32,6 +33,7 @@ class StratifiedEstimator:
     """
 
     draws: ClassVar[HardDraws] = HardDraws()
+    through_images: ClassVar[bool] = False
     probes_per_bin: int = 16
     chunk_size: int = 64
     theta_mode: ThetaMode = "central_difference"
@@ -56,16 +58,33 @@ class StratifiedEstimator:
 
         The null of its significance is that a factor's bins, or lights, have one mean score: then the value is zero.
         """
+        scored = losses.probes
+        if scored is None:
+            raise ValueError("stratified: wants losses of probes, got none")
+        return self._over_strata(
+            lambda index: scores(scored, params, vector, index, self.chunk_size, self.theta_mode),
+            images,
+            probes,
+        )
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        return self._over_strata(lambda index: found.probes[index.to(found.probes.device)], images, probes)
+
+    def _over_strata(
+        self, scored: Callable[[Tensor], Tensor], images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
         distribution = images.distribution
-        if losses.probes is None or set(probes) != set(distribution.names):
+        if set(probes) != set(distribution.names):
             raise ValueError(
                 f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
             )
         share, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
         for factor in distribution.factors:
             held = probes[factor.name]
-            along = scores(losses.probes, params, vector, held.index, self.chunk_size, self.theta_mode)
-            along = along.to(images.psi)
+            along = scored(held.index).to(images.psi)
             parts[factor.name] = by_strata(along, held.bins, factor, psi[factor.name], share)
             p_values[factor.name] = _told_apart(along, held.bins, factor)
         return MixedDerivative(
@@ -80,6 +99,7 @@ class ReinforceEstimator:
     """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
 
     draws: ClassVar[HardDraws] = HardDraws(explore=True)
+    through_images: ClassVar[bool] = False
     probes_per_bin: ClassVar[int] = 0
     chunk_size: int = 64
 
@@ -95,7 +115,19 @@ class ReinforceEstimator:
 
         The null of its significance is that scores do not depend on the bins, or lights, that a factor drew.
         """
-        along = scores(losses.cached, params, vector, images.index, self.chunk_size).to(images.psi)
+        return self._by_score_function(
+            scores(losses.cached, params, vector, images.index, self.chunk_size), images
+        )
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        by_weight = found.images[images.index.to(found.images.device)]
+        return self._by_score_function(by_weight / images.weights.to(by_weight), images)
+
+    def _by_score_function(self, along: Tensor, images: ObjectImages) -> MixedDerivative:
+        along = along.to(images.psi)
         share = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:

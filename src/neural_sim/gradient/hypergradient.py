@@ -1,6 +1,7 @@
-"""The hypergradient of Eq. 2.
+"""The hypergradient, by either adjoint.
 
-``dL_val/dpsi = - d/dpsi <dL_train/dtheta, v>`` with ``(H + lambda I) v = dL_val/dtheta``.
+Implicit (Eq. 2): ``dL_val/dpsi = - d/dpsi <dL_train/dtheta, v>`` with ``(H + lambda I) v = dL_val/dtheta``. Unrolled:
+the derivative of the training that was run, :mod:`gradient.unrolled`.
 """
 
 from __future__ import annotations
@@ -16,16 +17,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.detector.losses import proximal_loss
+from neural_sim.detector.trajectory import Trajectory
+from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
+from neural_sim.gradient.unrolled import Examples
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.gauss_newton import CompositeTerm
 from neural_sim.solver.hvp import Term, gradient
 from neural_sim.solver.operator import norm
-from neural_sim.solver.solution import Solution
+from neural_sim.solver.solution import Solution, Status
 
 Estimate = Callable[[Params], MixedDerivative]
+UnrolledEstimate = Callable[[Accumulated], MixedDerivative]
 
 
 @dataclass(frozen=True)
@@ -102,8 +107,10 @@ class Hypergradient:
     ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
     ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
     unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
-    ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve, mixed.
-    ``raises`` counts how often lambda had to be raised.
+    ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve (or
+    unrolled), mixed. ``raises`` counts how often lambda had to be raised. Where training was unrolled, ``solution``
+    says so: its steps are those walked back through, its products their Hessian's, its value ``dL_val/dtheta``; there
+    is no damping.
     """
 
     psi_gradients: dict[str, Float[Tensor, "k"]]
@@ -166,6 +173,51 @@ def hypergradient(
         validation_norm=norm(right_hand_side),
         seconds=seconds,
         raises=adjoint.raises,
+    )
+
+
+def unrolled_hypergradient(
+    inner: InnerProblem,
+    trajectory: Trajectory,
+    examples: Examples,
+    validation: Sequence[Term],
+    estimates: Mapping[str, UnrolledEstimate],
+    unrolled: Unrolled,
+    generator: torch.Generator,
+    probes: ProbeGroups | None = None,
+    with_inputs: bool = False,
+) -> Hypergradient:
+    """The derivative of the training that was run, for every object.
+
+    ``trajectory`` is that training, of ``examples``, which ended at ``inner.params``. ``estimates`` maps an object's
+    name to what its estimator makes of the sums over the steps. ``probes`` and ``with_inputs`` say what is summed up.
+    """
+    began = time.perf_counter()
+    slope = gradient(validation, inner.params)
+    stationarity = norm(gradient(inner.terms(), inner.params))
+    validated = time.perf_counter()
+    found = unrolled.accumulate(trajectory, examples, inner.params, slope, generator, probes, with_inputs)
+    walked = time.perf_counter()
+    parts = {name: estimate(found) for name, estimate in estimates.items()}
+    steps = len(trajectory) - trajectory.first
+    finite = bool(found.images.isfinite().all())
+    solution = Solution(
+        slope, Status.UNROLLED if finite else Status.NON_FINITE, steps, 0.0, (0.0, 0.0), steps, False
+    )
+    return Hypergradient(
+        psi_gradients={name: part.value for name, part in parts.items()},
+        standard_errors={name: part.standard_error for name, part in parts.items()},
+        p_values={name: part.p_values for name, part in parts.items()},
+        solution=solution,
+        damping=Damped(0.0, None),
+        sensitivity=math.nan,
+        stationarity=stationarity,
+        validation_norm=norm(slope),
+        seconds={
+            "validation": validated - began,
+            "unrolled": walked - validated,
+            "mixed": time.perf_counter() - walked,
+        },
     )
 
 

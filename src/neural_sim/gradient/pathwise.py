@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.devices import moved
+from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import (
     Losses,
     MixedDerivative,
@@ -61,6 +62,7 @@ class PathwiseEstimator:
         ValueError: any of these out of its range, with the key and the value.
     """
 
+    through_images: ClassVar[bool] = True
     probes_per_bin: ClassVar[int] = 0
     mode: Mode = "forward"
     relaxation: Relaxation = "gumbel_softmax"
@@ -105,16 +107,27 @@ class PathwiseEstimator:
         Tangents that came with the images are used whatever the mode. The significance is that of
         :func:`significance.zero_mean` for the groups' contributions. Raises ``ValueError`` for images without a path.
         """
-        path = images.path
-        if path is None:
-            raise ValueError(
-                "pathwise: these images carry no rendered path, which this estimator differentiates"
-            )
-        inputs = (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
+        path = _path(images)
         cotangents = input_cotangents(
-            losses.from_images, params, vector, inputs, images.index, images.weights,
+            losses.from_images, params, vector, _inputs(images, path), images.index, images.weights,
             self.chunk_size, self.theta_mode,
         )  # fmt: skip
+        return self._through_images(path, cotangents, images)
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included.
+
+        Raises ``ValueError`` for images without a path.
+        """
+        path = _path(images)
+        cotangents = found.cotangents(_inputs(images, path), images.index, self.chunk_size)
+        return self._through_images(path, cotangents, images)
+
+    def _through_images(
+        self, path: RenderedPath, cotangents: tuple[Tensor, ...], images: ObjectImages
+    ) -> MixedDerivative:
         maps = map_cotangents(path, *cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
@@ -127,6 +140,17 @@ class PathwiseEstimator:
         parts = images.distribution.split(sums).items()
         p_values = {name: zero_mean(part - part.mean(-1, keepdim=True)) for name, part in parts}
         return replace(from_contributions(sums), p_values=p_values)
+
+
+def _path(images: ObjectImages) -> RenderedPath:
+    if images.path is None:
+        raise ValueError("pathwise: these images carry no rendered path, which this estimator differentiates")
+    return images.path
+
+
+def _inputs(images: ObjectImages, path: RenderedPath) -> tuple[Tensor, ...]:
+    """What moves with psi: the images, and their boxes where those do."""
+    return (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
 
 
 def map_cotangents(

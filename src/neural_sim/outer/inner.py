@@ -14,6 +14,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.detector.training import train_detector
+from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
@@ -74,6 +75,7 @@ class InnerLoop:
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
         self.images = self.steps = 0
+        self.trajectory: Trajectory | None = None
 
     @property
     def trainable(self) -> Parameters:
@@ -88,8 +90,11 @@ class InnerLoop:
             return self.scene.training_set(psi, count, self.generator, self.draws)
         return [self.pool.draw(label, psi[label], count, self.generator) for label in labels]
 
-    def train(self, images: CachedSet) -> float:
-        """Train theta on the images; returns the last epoch's loss, nan where there are no epochs."""
+    def train(self, images: CachedSet, recording: Recording | None = None) -> float:
+        """Train theta on the images; returns the last epoch's loss, nan where there are no epochs.
+
+        What ``recording`` wants kept of the steps is in ``trajectory``.
+        """
         if self.settings.epochs == 0:
             return math.nan
         self.theta, history = train_detector(
@@ -104,8 +109,10 @@ class InnerLoop:
             weight_decay=0.0 if self.detector.proximal > 0.0 else self.weight_decay,
             proximal=self.detector.proximal,
             anchor=self.warm_start,
+            recording=recording,
         )
         self.steps += history.steps
+        self.trajectory = history.trajectory
         return history.losses[-1]
 
     @torch.no_grad()

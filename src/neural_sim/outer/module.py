@@ -19,6 +19,7 @@ from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.retrained import Check, as_double, binned_problem, check
+from neural_sim.outer.unrolling import through_training
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.product import Factor
 from neural_sim.parameter.update import UpdateState
@@ -47,6 +48,7 @@ class SimulatorModule(OuterLoop):
         self._adjoint: Tensor | None = None
         # A generator of its own, so that being certified does not change a run.
         self._check_generator = torch.Generator().manual_seed(inner.generator.initial_seed() + 1)
+        self._recording = self.settings.unrolled.recording if self.settings.adjoint == "unrolled" else None
         self._stopped = False
 
     def training_step(self, batch: int, batch_idx: int) -> None:
@@ -61,7 +63,7 @@ class SimulatorModule(OuterLoop):
         with timed(seconds, "train", self.inner.device):
             # The warm start has trained on this psi already, on more images and for longer than an iteration would.
             arrived = not self.records and not self.settings.train_first
-            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached)
+            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached, self._recording)
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
@@ -128,8 +130,13 @@ class SimulatorModule(OuterLoop):
             subset=None if subset is None else subset.to(device),
         )  # fmt: skip
         probed = self._probes
-        losses = bound_losses(cached, self.inner.backbone, images.labels, probed.cached if probed else None)
         held = object_images(self.scene, rendered, self.psi, weights)
+        if self.settings.adjoint == "unrolled":
+            learned = {self.scene.names[label]: held[self.scene.names[label]] for label in self._learned}
+            return self._with_fixed(
+                through_training(self.inner, inner, self.estimator, cached, images.labels, learned, probed)
+            )
+        losses = bound_losses(cached, self.inner.backbone, images.labels, probed.cached if probed else None)
         estimates = {
             name: self._bind(losses, held[name], probed.probes[label] if probed else {})
             for label, name in enumerate(self.scene.names)

@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from neural_sim.checks import at_least
+from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.significance import SMALLEST
 from neural_sim.parameter.light_update import LightUpdate, ProjectedGradient
 from neural_sim.parameter.update import Update
 from neural_sim.renderer.nerf import Quality
 
 Start = Literal["previous", "warm", "fresh"]
+AdjointKind = Literal["implicit", "unrolled"]
 OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
 
@@ -69,6 +71,9 @@ class Outer:
     anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
     renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
     objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
+    ``adjoint`` says what the hypergradient is of: a stationary point, by the solver (``implicit``, the paper's Eq. 2),
+    or the training that was run (``unrolled``, as ``unrolled`` says), which every iteration must then have: it wants
+    ``train_first`` and epochs, and no retrained finite differences, which are of a stationary point.
     ``on_untrusted`` is what happens to a step that fails ``trust``: the step of one factor of one object where its
     derivative is not significant, of all where the doubt is about all. ``keep`` takes it whole, as the paper does;
     ``stop`` skips the former, and ends the loop at the latter or where no object is left. Every ``certify_every`` steps
@@ -83,6 +88,8 @@ class Outer:
     learning_rate: float = 3e-3
     start: Start = "fresh"
     train_first: bool = False
+    adjoint: AdjointKind = "implicit"
+    unrolled: Unrolled = field(default_factory=Unrolled)
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
@@ -116,4 +123,13 @@ class Outer:
         if self.on_untrusted not in get_args(OnUntrusted):
             raise ValueError(
                 f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
+            )
+        if self.adjoint not in get_args(AdjointKind):
+            raise ValueError(
+                f"outer.adjoint must be one of {', '.join(get_args(AdjointKind))}, got {self.adjoint!r}"
+            )
+        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or self.certify_every):
+            raise ValueError(
+                "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and certify_every=0, got "
+                f"{self.train_first}, {self.epochs} and {self.certify_every}"
             )

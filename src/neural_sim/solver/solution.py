@@ -20,6 +20,7 @@ class Status(enum.Enum):
     LEAST_SQUARES = "singular and inconsistent: the value minimises the residual, which cannot vanish"
     SINGULAR = "operator is singular to rounding: the value is the minimum-norm solution on its range"
     DIVERGED = "residual grew: lower the step scale or raise damping"
+    UNROLLED = "no system was solved: the derivative is that of the training that was run"
     NON_FINITE = "operator, right-hand side or solution is not finite"
 
     @property

@@ -1,0 +1,306 @@
+"""The derivative of the training that was run: what it costs, what each saving adds in error, and what it foretells.
+
+`python benchmarks/unrolled.py` writes docs/numerics.md. One iteration of the psi loop on `+experiment=pose_gap` at
+64 px from uniform poses, where no bin is unseen: a training, and for every bin of an object the same training again
+with a part of that object's images drawn from that bin instead. Their validation losses are the response that a
+hypergradient should foretell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from jaxtyping import Float, Int
+from machine import machine
+from section import replace_section
+from torch import Tensor
+from unrolled_report import centred, report, table
+from worlds import SMALL
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Parameters
+from neural_sim.detector.training import TrainingHistory, train_detector
+from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, places, standing
+from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
+from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
+from neural_sim.main import build, conf_directory
+from neural_sim.solver.flatten import unflatten
+from neural_sim.solver.hvp import gradient
+from neural_sim.stages.context import Context
+from neural_sim.synthesis.pool import ImagePool
+from neural_sim.synthesis.scene import join
+
+START = ("+experiment=pose_gap", "gap=uniform")
+PER_BIN = 24
+ALL = Unrolled(probes_per_step=0, score_every=1)
+EXACT = replace(ALL, product="reverse_over_reverse")
+PARTS = (0.75, 0.5, 0.25)
+FEW = ((2, 1), (1, 1), (1, 2), (1, 4))
+
+
+@dataclass(frozen=True)
+class World:
+    """All objects' images of every bin, under the warm start's backbone, and what every training starts from."""
+
+    context: Context
+    pool: CachedSet
+    validation: CachedSet
+    start: Parameters
+    p: Float[Tensor, "objects k"]
+
+    @staticmethod
+    def of(overrides: list[str]) -> World:
+        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+            context = Context.of(build(compose("config", [*SMALL, *START, *overrides])))
+        graph, results = context.graph, context.results
+        scene = results(graph.scene)
+        generator, psi = torch.Generator().manual_seed(5), graph.psi("initial")
+        detector = graph.warm_start.build()
+        backbone, _ = detector.split(results(graph.warm_start).params)
+        source = ImagePool.render(scene, PER_BIN, generator)
+        drawn = [source.probes(i, "pose", PER_BIN, psi[i], generator) for i in range(len(psi))]
+        pool = CachedSet.of(detector, backbone, join(drawn))
+        p = scene.distribution.probabilities(psi)["pose"].float()
+        validation = CachedSet.of(detector, backbone, results(graph.targets).val)
+        return World(context, pool, validation, {**detector.init(generator), **backbone}, p)
+
+    def probes(self, label: int) -> Int[Tensor, "k per_bin"]:
+        """Rows of one object's images, bin by bin."""
+        bins = self.p.shape[1]
+        return (label * bins * PER_BIN + torch.arange(bins * PER_BIN)).view(bins, PER_BIN)
+
+    def rows(self, seed: int, label: int = 0, to: int = 0, part: float = 0.0) -> Int[Tensor, "n"]:
+        """A training set's rows, ``part`` of one object's images from the bin ``to``; all else as without."""
+        generator, found = torch.Generator().manual_seed(seed), []
+        for i, p in enumerate(self.p):
+            chosen, moved = torch.rand(
+                2, self.context.experiment.loop.outer.images_per_object, generator=generator
+            )
+            place = torch.randint(PER_BIN, chosen.shape, generator=generator)
+            bins = torch.searchsorted(p.cumsum(0), chosen).clamp_max(len(p) - 1)
+            bins = torch.where(moved < part, to, bins) if i == label else bins
+            found.append(self.probes(i)[bins, place])
+        return torch.cat(found)
+
+    def train(
+        self, rows: Tensor, seed: int, recording: Recording | None = None
+    ) -> tuple[Parameters, TrainingHistory]:
+        """As the psi loop trains; returns the trained pyramid and head."""
+        x = self.context.experiment
+        theta, history = train_detector(
+            self.context.graph.warm_start.build(), self.start, self.pool.select(rows), torch.Generator().manual_seed(seed),
+            epochs=x.loop.outer.epochs, batch_size=x.training.batch_size, learning_rate=x.loop.outer.learning_rate,
+            weight_decay=x.training.weight_decay, recording=recording,
+        )  # fmt: skip
+        return self.context.graph.warm_start.build().split(theta)[1], history
+
+    @torch.no_grad()
+    def loss(self, trained: Parameters) -> float:
+        return float(sum(term(trained) for term in self.validation.mean_terms()))
+
+
+@dataclass(frozen=True)
+class Walked:
+    """One recorded training, and every way back through it."""
+
+    world: World
+    label: int
+    rows: Tensor
+    trained: Parameters
+    trajectory: Trajectory
+
+    def scores(self, product: Product = "central_difference") -> Float[Tensor, "steps k per_bin"]:
+        """Of every probe of the object in every step, the last step first."""
+        world, data = self.world, self.world.pool.select(self.rows)
+        slope = gradient(world.validation.mean_terms(), self.trained)
+        examples = Examples(data.inputs, data.losses_from)
+        table, found = world.probes(self.label), []
+        for step in reversed_steps(self.trajectory, examples, self.trained, slope, product):
+            along = scores(
+                world.pool.losses, step.params, step.along, table.reshape(-1), 96, "central_difference"
+            )
+            found.append((along - along.mean()).view_as(table))
+        return torch.stack(found)
+
+    def implicit(self, generator: torch.Generator, solved: bool = True) -> Float[Tensor, "k"]:
+        """The same by v = (H + lambda I)^-1 dL_val/dtheta, or by dL_val/dtheta itself."""
+        world, data = self.world, self.world.pool.select(self.rows)
+        slope = gradient(world.validation.mean_terms(), self.trained)
+        if solved:
+            chosen = torch.randperm(len(data), generator=generator)[: world.made.x.outer.curvature_images]
+            weights = torch.full((len(data),), 1.0 / len(data))
+            inner = InnerProblem(
+                self.trained, SplitLoss(data.outputs, data.losses_of), weights, subset=chosen
+            )
+            slope = world.made.x.solver.solve(
+                inner.terms(chosen), self.trained, slope, None, generator
+            ).vector
+        index = world.probes(self.label)
+        along = scores(world.pool.losses, self.trained, unflatten(slope, self.trained), index.reshape(-1))
+        return -centred(along.view_as(index).mean(1))
+
+
+def walked(world: World, label: int, seed: int) -> Walked:
+    rows = world.rows(seed)
+    trained, history = world.train(rows, seed, Recording())
+    if history.trajectory is None:
+        raise ValueError("the training was not recorded")
+    return Walked(world, label, rows, trained, history.trajectory)
+
+
+def clock(work: Callable[[], Any]) -> float:
+    """Seconds of processor time, which other processes disturb less than those on the wall."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
+
+
+def costs(world: World, repeats: int) -> dict[str, float]:
+    """Medians of a training's seconds, and of everything else in trainings beside it; megabytes of what is kept."""
+    rows, found, none = world.rows(0), [], torch.Generator()
+    data = world.pool.select(rows)
+    examples = Examples(data.inputs, data.losses_from)
+    every = ProbeGroups(world.pool.losses, [world.probes(i)[:, :16] for i in range(len(world.p))])
+    kept = 0
+    for seed in range(repeats):
+        trained, history = world.train(rows, seed, Recording())
+        run = history.trajectory
+        if run is None:
+            raise ValueError("the training was not recorded")
+        slope = gradient(world.validation.mean_terms(), trained)
+        states = [part for state in run.checkpoints.values() for part in state]
+        kept = sum(part.numel() * part.element_size() for part in (*states, *run.gradients.values()))
+        bare = replace(run, gradients={})
+
+        def back(how: Unrolled, probes=None, run=run, trained=trained, slope=slope, **wanted) -> float:
+            return clock(lambda: how.accumulate(run, examples, trained, slope, none, probes, **wanted))
+
+        once = clock(lambda seed=seed: world.train(rows, seed))
+        walks = {
+            "recording": clock(lambda seed=seed: world.train(rows, seed, Recording())) - once,
+            "central differences": back(ALL),
+            "reverse over reverse": back(EXACT),
+            "gradients computed again": back(ALL, run=bare),
+            "with derivatives by features": back(ALL, with_inputs=True),
+            "and a probe of each bin a step": back(replace(ALL, probes_per_step=1), every),
+            "and one every second step (default)": back(Unrolled(), every),
+        }
+        found.append({"seconds": once} | {key: spent / once for key, spent in walks.items()})
+    medians = {key: float(torch.tensor([row[key] for row in found]).median()) for key in found[0]}
+    return medians | {"megabytes": kept / MEGABYTE}
+
+
+def errors(run: Walked, draws: int = 200) -> dict[str, float]:
+    """Relative errors of the bins' mean scores against exact products, all probes in all steps."""
+    exact, near = run.scores("reverse_over_reverse"), run.scores()
+    means, generator = bin_means(exact), torch.Generator().manual_seed(0)
+
+    def error(values: list[Tensor]) -> float:
+        return float(torch.stack([(v - means).norm() / means.norm() for v in values]).square().mean().sqrt())
+
+    found = {"central differences": error([bin_means(near)])}
+    for count, every in FEW:
+        steps = "every step" if every == 1 else f"one step in {every}"
+        drawn = [few(exact, count, every, generator) for _ in range(draws)]
+        found[f"{count} of {PER_BIN} probes, {steps}"] = error(drawn)
+    for part in PARTS:
+        found[f"the last {part:.0%} of the steps"] = error([bin_means(exact, part)])
+    spread = exact.sum(0).var(1)
+    for count in (16, 48):
+        own = float((spread / count).sum().sqrt() / means.norm())
+        found[f"(the noise of {count} probes a bin themselves)"] = own
+    return found
+
+
+def bin_means(scored: Float[Tensor, "steps k per_bin"], part: float = 1.0) -> Float[Tensor, "k"]:
+    """The derivative of L_val by the bins' shares, from the last part of the steps."""
+    return centred(scored[: math.ceil(part * len(scored))].sum(0).mean(1))
+
+
+def few(
+    scored: Float[Tensor, "steps k per_bin"], count: int, every: int, generator: torch.Generator
+) -> Float[Tensor, "k"]:
+    """The same from the few probes that the walk would have scored."""
+    turns, total = places(PER_BIN, count, generator), torch.zeros(scored.shape[1])
+    for step, weight in zip(scored, standing(len(scored), every, generator), strict=True):
+        if weight:
+            total += weight * centred(step[:, next(turns)].mean(1))
+    return centred(total)
+
+
+def responses(world: World, label: int, seeds: int, part: float) -> dict[str, Any]:
+    """Changes of the validation loss by bin, and the ways to foretell them, a row for each seed."""
+    shares, share = centred_shares(world.p[label]), part / len(world.p)
+    true, told = [], {}
+    for seed in range(seeds):
+        run = walked(world, label, seed)
+        base = world.loss(run.trained)
+        moved = [world.train(world.rows(seed, label, b, part), seed)[0] for b in range(len(shares))]
+        true.append(torch.tensor([world.loss(trained) - base for trained in moved]))
+        ways = {"unrolled": run.bins(replace(ALL, probes_per_step=4, score_every=2))}
+        ways |= {
+            f"unrolled, the last {p:.0%}": run.bins(replace(ALL, probes_per_step=4), p) for p in PARTS[1:]
+        }
+        generator = torch.Generator().manual_seed(seed)
+        ways |= {"implicit": run.implicit(generator), "dL_val/dtheta alone": run.implicit(generator, False)}
+        for name, means in ways.items():
+            told.setdefault(name, []).append(share * (shares @ means))
+    return {"response": true, "foretold": told}
+
+
+def centred_shares(p: Float[Tensor, "k"]) -> Float[Tensor, "k k"]:
+    """Row b: what moving all images to bin b changes in the bins' shares."""
+    return torch.eye(len(p)) - p
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
+    parser.add_argument("--objects", nargs="+", default=["pitcher"])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--part", type=float, default=0.5, help="of an object's images that move to a bin")
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--docs", type=Path, default=Path("docs/numerics.md"))
+    parser.add_argument("--json", type=Path, default=Path("outputs/benchmarks/unrolled.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    world = World.of(arguments.overrides)
+    labels = {name: world.made.scene.names.index(name) for name in arguments.objects}
+    spent = costs(world, arguments.repeats)
+    print(json.dumps(spent, indent=1), flush=True)
+    wrong = errors(walked(world, labels[arguments.objects[0]], 0))
+    print(json.dumps(wrong, indent=1), flush=True)
+    found = {}
+    for name, label in labels.items():
+        found[name] = responses(world, label, arguments.seeds, arguments.part)
+        print(table(found), flush=True)
+    text = report(found, spent, wrong, vars(arguments) | {"per_bin": PER_BIN})
+    rows = {
+        name: {
+            "response": torch.stack(held["response"]).tolist(),
+            "foretold": {way: torch.stack(told).tolist() for way, told in held["foretold"].items()},
+        }
+        for name, held in found.items()
+    }
+    arguments.json.parent.mkdir(parents=True, exist_ok=True)
+    arguments.json.write_text(
+        json.dumps({"machine": machine(), "costs": spent, "errors": wrong, "objects": rows}, indent=1)
+    )
+    replace_section(arguments.docs, "Unrolled", text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Optimiser steps as pure functions of flat vectors, which training's derivative walks back through.
+
+A state is theta, then the rule's own buffers. A step is made of elementwise operations that autograd knows, so that its
+derivative is written nowhere twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+State = tuple[Tensor, ...]
+
+
+class Rule(Protocol):
+    """One optimiser. ``step`` takes the batch's gradient, the learning rate and the number of steps done before it."""
+
+    def begin(self, theta: Float[Tensor, "n"]) -> State: ...
+
+    def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State: ...
+
+
+@dataclass(frozen=True)
+class AdamW:
+    """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2), as ``torch.optim.AdamW`` steps.
+
+    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments.
+    """
+
+    weight_decay: float | Float[Tensor, "n"] = 1e-2
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+
+    def begin(self, theta: Float[Tensor, "n"]) -> State:
+        return theta, torch.zeros_like(theta), torch.zeros_like(theta)
+
+    def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
+        theta, first, second = state
+        fast, slow = self.betas
+        first = fast * first + (1.0 - fast) * gradient
+        second = slow * second + (1.0 - slow) * gradient.square()
+        corrected, spread = first / (1.0 - fast ** (done + 1)), second / (1.0 - slow ** (done + 1))
+        theta = (1.0 - rate * self.weight_decay) * theta - rate * corrected / (_root(spread) + self.eps)
+        return theta, first, second
+
+
+@dataclass(frozen=True)
+class SGD:
+    """Gradient descent as ``torch.optim.SGD`` steps: weight decay joins the gradient, momentum is heavy-ball.
+
+    ``weight_decay`` is one number, or one for each entry of theta. The buffer is the momentum's.
+    """
+
+    weight_decay: float | Float[Tensor, "n"] = 0.0
+    momentum: float = 0.0
+
+    def begin(self, theta: Float[Tensor, "n"]) -> State:
+        return theta, torch.zeros_like(theta)
+
+    def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
+        theta, buffer = state
+        buffer = self.momentum * buffer + gradient + self.weight_decay * theta
+        return theta - rate * buffer, buffer
+
+
+def pulled_back(
+    rule: Rule,
+    state: State,
+    gradient: Float[Tensor, "n"],
+    rate: float,
+    done: int,
+    cotangents: Sequence[Tensor],
+) -> tuple[list[Tensor], Float[Tensor, "n"]]:
+    """Cotangents of a step's outcome pulled back onto its state, and onto its gradient.
+
+    That the gradient depends on theta is left to the caller: a product of the batch's Hessian with the second.
+    """
+    leaves = [part.detach().requires_grad_() for part in (*state, gradient)]
+    with torch.enable_grad():
+        stepped = rule.step(tuple(leaves[:-1]), leaves[-1], rate, done)
+    *earlier, along = torch.autograd.grad(stepped, leaves, list(cotangents), materialize_grads=True)
+    return earlier, along
+
+
+def _root(values: Tensor) -> Tensor:
+    """Square root whose derivative at 0 is 0, not infinite: there an entry has had no gradient so far."""
+    positive = values > 0.0
+    return torch.where(positive, values, 1.0).sqrt() * positive

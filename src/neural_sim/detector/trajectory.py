@@ -1,0 +1,182 @@
+"""What is kept of a training, so that it can be walked backwards: its batches, learning rates, states and gradients."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.detector.optimiser import Rule, State
+
+logger = logging.getLogger(__name__)
+GradientAt = Callable[[Tensor, Tensor], Tensor]
+MEGABYTE = 2**20
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How much of a training is kept.
+
+    Args:
+        part: of the steps, the last ones, that can be walked back through.
+        max_memory_mb: what is kept fits this. States are kept at every sqrt(steps)-th step and all gradients beside
+            them: steps in between are then repeated elementwise. Where gradients do not fit, they are computed again,
+            which costs one more training.
+
+    Raises:
+        ValueError: either of these out of its range.
+    """
+
+    part: float = 1.0
+    max_memory_mb: float = 2048.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.part <= 1.0:
+            raise ValueError(f"unrolled.part must lie in (0, 1], got {self.part}")
+        if not self.max_memory_mb > 0.0:
+            raise ValueError(f"unrolled.max_memory_mb must be above 0, got {self.max_memory_mb}")
+
+    def first(self, steps: int) -> int:
+        """The first of the recorded steps."""
+        return steps - max(1, math.ceil(self.part * steps))
+
+    def keeps_gradients(self, steps: int, state_bytes: int, vector_bytes: int) -> bool:
+        """Whether the gradients of all recorded steps fit beside the states.
+
+        Raises:
+            ValueError: where not even the states fit, with what they take.
+        """
+        count = steps - self.first(steps)
+        length = segment_length(count)
+        # States at the segments' first steps, then one segment's states and gradients while it is walked.
+        least = (math.ceil(count / length) + length) * state_bytes + length * vector_bytes
+        if least > self.max_memory_mb * MEGABYTE:
+            raise ValueError(
+                f"unrolled.max_memory_mb: {count} steps take {least / MEGABYTE:.0f} MB at least, got "
+                f"{self.max_memory_mb:g}; raise it, or lower unrolled.part"
+            )
+        return least + count * vector_bytes <= self.max_memory_mb * MEGABYTE
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A training that was run. Vectors are flat, in the order of the learned parameters.
+
+    ``rows`` are those of each step's batch in the training set, whose mean loss (and proximal term) the step's gradient
+    was of; ``rates`` the learning rates. ``checkpoints`` are the states before some steps, ``gradients`` those of
+    all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
+    """
+
+    rule: Rule
+    rows: tuple[Int[Tensor, "batch"], ...]
+    rates: tuple[float, ...]
+    checkpoints: Mapping[int, State]
+    gradients: Mapping[int, Float[Tensor, "n"]]
+    end: Float[Tensor, "n"]
+
+    def __post_init__(self) -> None:
+        steps = len(self.rows)
+        if steps == 0 or len(self.rates) != steps:
+            raise ValueError(
+                f"trajectory: want a learning rate for each of 1 or more steps, got {len(self.rates)} for {steps}"
+            )
+        if not self.checkpoints or not all(0 <= step < steps for step in self.checkpoints):
+            raise ValueError(
+                f"trajectory: want checkpoints at steps in [0, {steps}), got {sorted(self.checkpoints)}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def first(self) -> int:
+        """The first step that can be walked back through."""
+        return min(self.checkpoints)
+
+    def segments(self) -> list[range]:
+        """The steps from checkpoint to checkpoint, the last ones first."""
+        starts = sorted(self.checkpoints)
+        ends = [*starts[1:], len(self)]
+        return [range(begin, end) for begin, end in zip(starts, ends, strict=True)][::-1]
+
+    def replayed(self, segment: range, gradient_at: GradientAt) -> list[tuple[State, Float[Tensor, "n"]]]:
+        """The state before each step of a segment, and its gradient: as kept, else ``gradient_at(theta, rows)``."""
+        found, state = [], self.checkpoints[segment.start]
+        for step in segment:
+            gradient = self.gradients.get(step)
+            if gradient is None:
+                gradient = gradient_at(state[0], self.rows[step])
+            found.append((state, gradient))
+            if step + 1 < segment.stop:
+                state = self.rule.step(state, gradient, self.rates[step], step)
+        return found
+
+
+def segment_length(steps: int) -> int:
+    """Steps from one kept state to the next, at which the states kept and those of one segment are fewest together."""
+    return max(1, math.isqrt(max(0, steps - 1)) + 1)
+
+
+class Recorder:
+    """Takes the steps of one training as they come.
+
+    Args:
+        recording: how much is kept.
+        rule: the optimiser's.
+        steps: that the training will take.
+        theta: of the size that will be trained.
+
+    Raises:
+        ValueError: where the states do not fit ``recording.max_memory_mb``.
+    """
+
+    def __init__(self, recording: Recording, rule: Rule, steps: int, theta: Float[Tensor, "n"]) -> None:
+        self.rule = rule
+        self._first = recording.first(steps)
+        self._length = segment_length(steps - self._first)
+        self._rates: list[float] = []
+        self._checkpoints: dict[int, State] = {}
+        self._gradients: dict[int, Tensor] = {}
+        vector = theta.numel() * theta.element_size()
+        self._keeps_gradients = recording.keeps_gradients(steps, len(rule.begin(theta)) * vector, vector)
+        if not self._keeps_gradients:
+            logger.info(
+                "unrolled: gradients do not fit %g MB and are computed again", recording.max_memory_mb
+            )
+
+    def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
+        """Note a step before it is made; ``state`` and ``gradient`` are asked for copies where they are kept."""
+        number = len(self._rates)
+        self._rates.append(rate)
+        if number < self._first:
+            return
+        if (number - self._first) % self._length == 0:
+            self._checkpoints[number] = state()
+        if self._keeps_gradients:
+            self._gradients[number] = gradient()
+
+    def trajectory(self, rows: tuple[Int[Tensor, "batch"], ...], end: Float[Tensor, "n"]) -> Trajectory:
+        """What was recorded, of batches with these rows; ``end`` is theta after the last step."""
+        return Trajectory(self.rule, rows, tuple(self._rates), self._checkpoints, self._gradients, end)
+
+
+def train(
+    rule: Rule,
+    theta: Float[Tensor, "n"],
+    rows: tuple[Int[Tensor, "batch"], ...],
+    rates: tuple[float, ...],
+    gradient_at: GradientAt,
+    recording: Recording = Recording(),
+) -> Trajectory:
+    """The training of these batches and learning rates from ``theta``, recorded, without a Trainer."""
+    recorder = Recorder(recording, rule, len(rows), theta)
+    state = rule.begin(theta)
+    for done, (batch, rate) in enumerate(zip(rows, rates, strict=True)):
+        gradient = gradient_at(state[0], batch)
+        recorder.step(lambda held=state: held, lambda held=gradient: held, rate)
+        state = rule.step(state, gradient, rate, done)
+    return recorder.trajectory(rows, state[0])

@@ -1,0 +1,201 @@
+"""What the steps of a training say of its images, summed over the steps: scores, and derivatives by their inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.detector.trajectory import Recording, Trajectory
+from neural_sim.gradient.base import IndexedLoss, Params
+from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.unrolled import Examples, InputsOf, Product, ReversedStep, reversed_steps
+
+
+@dataclass(frozen=True)
+class Accumulated:
+    """Sums over the steps that were walked back through. ``along`` in step t is a_t of :mod:`gradient.unrolled`.
+
+    ``images`` [N]: the derivative of L_val by each training image's weight, 1 in the means of its batches.
+    ``inputs``: that by the training images' inputs, which ``inputs_of`` makes; empty unless asked for.
+    ``probes`` [m]: every probe's score, estimated from the steps that scored it; the mean over the probes of a bin is
+    unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to a number that all bins of a group share.
+    ``scored`` counts the pairs of a probe and a step that were scored.
+    """
+
+    images: Float[Tensor, "N"]
+    inputs: tuple[Tensor, ...]
+    probes: Float[Tensor, "m"]
+    scored: int
+    inputs_of: InputsOf | None = None
+
+    def cotangents(
+        self, leaves: tuple[Tensor, ...], index: Int[Tensor, "n"], chunk_size: int = 16
+    ) -> tuple[Tensor, ...]:
+        """The derivative of L_val by images, and by their boxes where these move: that by the inputs pulled back.
+
+        ``leaves`` are those of the rows ``index``, at most ``chunk_size`` of them in memory at a time.
+
+        Raises:
+            ValueError: where no derivative by the inputs was accumulated.
+        """
+        if not self.inputs or self.inputs_of is None:
+            raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
+        parts = []
+        chunks = zip(index.split(chunk_size), *(leaf.split(chunk_size) for leaf in leaves), strict=True)
+        for rows, *chunk in chunks:
+            held, there = (
+                tuple(part.detach().requires_grad_() for part in chunk),
+                rows.to(self.inputs[0].device),
+            )
+            with torch.enable_grad():
+                made = self.inputs_of(held, there)
+            # A frozen label is an input that no image moves.
+            moved = [
+                (x, pulled[there]) for x, pulled in zip(made, self.inputs, strict=True) if x.requires_grad
+            ]
+            values, pulled = zip(*moved, strict=True)
+            parts.append(torch.autograd.grad(values, held, pulled, materialize_grads=True))
+        return tuple(torch.cat(column) for column in zip(*parts, strict=True))
+
+
+@dataclass(frozen=True)
+class ProbeGroups:
+    """The probes that steps score a few of.
+
+    Each group is a table [strata, per_bin] of rows of ``losses``: one object's images of one factor's bins, or under
+    its lights, where a column may be one scene. All groups have as many columns.
+    """
+
+    losses: IndexedLoss
+    groups: Sequence[Int[Tensor, "strata per_bin"]]
+
+    def __post_init__(self) -> None:
+        widths = {table.shape[-1] for table in self.groups}
+        if len(widths) != 1 or 0 in widths or any(table.ndim != 2 for table in self.groups):
+            shapes = [tuple(table.shape) for table in self.groups]
+            raise ValueError(f"probes: want tables [strata, per_bin] of one per_bin above 0, got {shapes}")
+
+    @property
+    def per_bin(self) -> int:
+        return self.groups[0].shape[-1]
+
+    @property
+    def count(self) -> int:
+        """Rows up to the largest in any group."""
+        return 1 + max(int(table.max()) for table in self.groups)
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """How the training's derivative is taken.
+
+    Args:
+        product: of a batch's Hessian with a vector, see :func:`gradient.unrolled.reversed_steps`.
+        part: of the steps, the last ones, that are walked back through; 1 is exact.
+        max_memory_mb: for what is kept of the training, see :class:`detector.trajectory.Recording`.
+        probes_per_step: of every bin, taken in turn from a shuffled order, that a step scores; 0: all of them.
+        score_every: steps from which one, drawn at random, stands for all in scoring probes.
+        chunk_size: probes whose losses are computed at a time.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    product: Product = "central_difference"
+    part: float = 1.0
+    max_memory_mb: float = 2048.0
+    probes_per_step: int = 1
+    score_every: int = 2
+    chunk_size: int = 64
+
+    def __post_init__(self) -> None:
+        if self.product not in get_args(Product):
+            raise ValueError(f"unrolled.product must be one of {get_args(Product)}, got {self.product!r}")
+        for key, least in (("probes_per_step", 0), ("score_every", 1), ("chunk_size", 1)):
+            if getattr(self, key) < least:
+                raise ValueError(f"unrolled.{key} must be at least {least}, got {getattr(self, key)}")
+        _ = self.recording
+
+    @property
+    def recording(self) -> Recording:
+        """What a training must keep for this."""
+        return Recording(self.part, self.max_memory_mb)
+
+    def accumulate(
+        self,
+        trajectory: Trajectory,
+        examples: Examples,
+        like: Params,
+        slope: Float[Tensor, "n"],
+        generator: torch.Generator,
+        probes: ProbeGroups | None = None,
+        with_inputs: bool = False,
+    ) -> Accumulated:
+        """Walk back through a training from ``slope``, its outcome's ``dL_val/dtheta``.
+
+        ``like`` gives the parameters' names and shapes. ``generator`` draws which probes are scored where.
+        """
+        steps = reversed_steps(trajectory, examples, like, slope, self.product, with_inputs)
+        scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
+        per_bin = probes.per_bin if probes else 1
+        turns = places(per_bin, self.probes_per_step or per_bin, generator)
+        weights = standing(len(trajectory) - trajectory.first, self.score_every, generator)
+        images = torch.zeros_like(slope[:1]).expand(len(examples.inputs[0])).clone()
+        inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if with_inputs else ()
+        for step in steps:
+            images.index_add_(0, step.rows, step.scores / len(step.rows))
+            for into, part in zip(inputs, step.inputs, strict=True):
+                into.index_add_(0, step.rows, part)
+            if scoring is not None and (weight := next(weights)):
+                scoring.add(step, next(turns), weight)
+        total, scored = (slope.new_zeros(0), 0) if scoring is None else (scoring.total, scoring.scored)
+        return Accumulated(images, inputs, total, scored, examples.inputs_of)
+
+
+class _Scoring:
+    """Sums of probes' scores, from the steps that score them."""
+
+    def __init__(self, probes: ProbeGroups, like: Tensor, chunk_size: int) -> None:
+        self.losses, self.per_bin, self.chunk_size = probes.losses, probes.per_bin, chunk_size
+        self.tables = [table.to(like.device) for table in probes.groups]
+        self.total, self.scored = like.new_zeros(probes.count), 0
+        self._levels: list[Tensor] = []
+
+    def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: int) -> None:
+        """One step's scores of the probes in some columns, standing for all columns and ``weight`` steps."""
+        columns = chosen.to(self.total.device)
+        rows = [table[:, columns].reshape(-1) for table in self.tables]
+        along = scores(
+            self.losses, step.params, step.along, torch.cat(rows), self.chunk_size, "central_difference"
+        )
+        parts = along.split([part.numel() for part in rows])
+        means = [part.mean() for part in parts]
+        scale = weight * self.per_bin / len(columns)
+        # What all bins share moves nothing, and would be noise wherever probes are scored unequally often. It is taken
+        # from the step before: a mean of these scores themselves would hide a part of their own noise.
+        for into, part, level in zip(rows, parts, self._levels or means, strict=True):
+            self.total.index_add_(0, into, scale * (part - level))
+        self._levels, self.scored = means, self.scored + len(along)
+
+
+def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[Int[Tensor, "per_step"]]:
+    """``per_step`` columns at a time from shuffled decks of all: each is as likely as any other in every turn."""
+    left = torch.zeros(0, dtype=torch.long)
+    while True:
+        while len(left) < per_step:
+            left = torch.cat([left, torch.randperm(columns, generator=generator)])
+        yield left[:per_step]
+        left = left[per_step:]
+
+
+def standing(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
+    """For each step how many it stands for: one of every ``every`` in a row, drawn at random, for all of those."""
+    for first in range(0, steps, every):
+        block = min(every, steps - first)
+        chosen = int(torch.randint(block, (), generator=generator))
+        yield from (block if place == chosen else 0 for place in range(block))

@@ -1,0 +1,184 @@
+"""The derivative of the training that was run: reverse mode through its optimiser's steps.
+
+The implicit adjoint asks for a stationary point; a dozen epochs end at none. With lambda_t the derivative of L_val by
+the state before step t (theta and the optimiser's moments), each step back takes
+
+    a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
+    lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
+
+H_t the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta, a_t>``:
+summed over the steps, this score takes the place of ``-<dl/dtheta, v>``; its sign is that of the derivative already.
+Baydin and Pearlmutter 2014, Maclaurin et al. 2015, with states kept instead of reversed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.detector.optimiser import pulled_back
+from neural_sim.detector.trajectory import Trajectory
+from neural_sim.gradient.base import Params
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import plain_norm
+
+Product = Literal["central_difference", "reverse_over_reverse"]
+InputsOf = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, ...]]
+
+
+class LossesFrom(Protocol):
+    """Losses of the training images ``rows``, differentiable twice in parameters and in those rows of the inputs."""
+
+    def __call__(
+        self, params: Params, inputs: tuple[Tensor, ...], rows: Int[Tensor, "n"], /
+    ) -> Float[Tensor, "n"]: ...
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What a training's batches were made of.
+
+    ``inputs`` [N, ...] are what losses are differentiated by where images move. The steps minimised a batch's mean loss
+    plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` makes these inputs of images, and of boxes where these move,
+    given with their rows.
+    """
+
+    inputs: tuple[Tensor, ...]
+    losses: LossesFrom
+    proximal: float = 0.0
+    anchor: Params | None = None
+    inputs_of: InputsOf | None = None
+
+    def __post_init__(self) -> None:
+        if self.proximal < 0.0 or (self.proximal > 0.0 and self.anchor is None):
+            raise ValueError(
+                f"unrolled: proximal must be at least 0 and wants its anchor, got {self.proximal}, "
+                f"{'no anchor' if self.anchor is None else 'an anchor'}"
+            )
+
+    def of(self, rows: Int[Tensor, "n"]) -> tuple[Tensor, ...]:
+        """These rows of the inputs."""
+        return tuple(values[rows] for values in self.inputs)
+
+    def gradient(
+        self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "n"]:
+        """Of what one step minimises."""
+        point = theta.detach().requires_grad_()
+        with torch.enable_grad():
+            loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
+        (slope,) = torch.autograd.grad(loss, point)
+        return slope + self.pull(theta, like)
+
+    def pull(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
+        """The proximal term's gradient."""
+        if self.anchor is None or self.proximal == 0.0:
+            return 0.0
+        return self.proximal * (theta - flatten({name: self.anchor[name] for name in like}))
+
+
+@dataclass(frozen=True)
+class ReversedStep:
+    """One step walked back through.
+
+    ``params`` is theta before it, ``along`` a_t. ``rows`` are its batch's, ``scores`` those images' <dl/dtheta, a_t>,
+    and ``inputs`` the derivative of the mean score by those rows of the inputs, empty unless asked for.
+    """
+
+    step: int
+    params: Params
+    along: Params
+    rows: Int[Tensor, "batch"]
+    scores: Float[Tensor, "batch"]
+    inputs: tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class _Curved:
+    """A batch's curvature along a: ``product`` is H a, the rest as in ``ReversedStep``."""
+
+    product: Float[Tensor, "n"]
+    scores: Float[Tensor, "batch"]
+    inputs: tuple[Tensor, ...]
+
+
+def reversed_steps(
+    trajectory: Trajectory,
+    examples: Examples,
+    like: Params,
+    slope: Float[Tensor, "n"],
+    product: Product = "central_difference",
+    with_inputs: bool = False,
+) -> Iterator[ReversedStep]:
+    """The steps of a training from the last to the first recorded one.
+
+    ``like`` gives the parameters' names and shapes, ``slope`` is ``dL_val/dtheta`` after the last step. Products with a
+    batch's Hessian: ``central_difference``, two gradients at ``theta +- h a``, an error of relative order eps^(2/3);
+    ``reverse_over_reverse``, exact, about three and a half gradients and the memory of a second derivative.
+
+    Raises:
+        ValueError: for an unknown product, or a slope that is not as long as theta.
+    """
+    if product not in get_args(Product):
+        raise ValueError(f"unrolled.product must be one of {get_args(Product)}, got {product!r}")
+    if slope.shape != trajectory.end.shape:
+        raise ValueError(
+            f"unrolled: got a slope of shape {tuple(slope.shape)}, want {tuple(trajectory.end.shape)}"
+        )
+    curved = _differenced if product == "central_difference" else _doubly_reversed
+    cotangents = list(trajectory.rule.begin(slope))  # the buffers after the last step move nothing
+    for segment in trajectory.segments():
+        replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
+        for step in reversed(segment):
+            state, gradient = replayed.pop()
+            cotangents, along = pulled_back(
+                trajectory.rule, state, gradient, trajectory.rates[step], step, cotangents
+            )
+            rows = trajectory.rows[step]
+            found = curved(examples, state[0], like, rows, along, with_inputs)
+            cotangents[0] = cotangents[0] + found.product + examples.proximal * along
+            yield ReversedStep(
+                step, unflatten(state[0], like), unflatten(along, like), rows, found.scores, found.inputs
+            )
+
+
+def _doubly_reversed(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
+) -> _Curved:
+    """<gradient, a> differentiated once more: by theta, by the images' weights and by their inputs at once."""
+    point = theta.detach().requires_grad_()
+    weights = theta.new_full((len(rows),), 1.0 / len(rows)).requires_grad_()
+    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
+    with torch.enable_grad():
+        loss = examples.losses(unflatten(point, like), inputs, rows) @ weights
+        (slope,) = torch.autograd.grad(loss, point, create_graph=True)
+    leaves = (point, weights, *(inputs if with_inputs else ()))
+    product, scores, *moved = torch.autograd.grad(slope, leaves, along, materialize_grads=True)
+    return _Curved(product, scores, tuple(moved))
+
+
+def _differenced(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
+) -> _Curved:
+    """Central differences of losses and gradients; nothing here makes the host wait for a device."""
+    # As ``difference_length`` chooses it, kept on the device; for a zero vector all differences are zero.
+    size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
+    reach = torch.finfo(theta.dtype).eps ** (1 / 3) * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
+    unit = (along.double() / size).to(theta) * reach.to(theta)
+    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
+    sides = []
+    for point in (theta + unit, theta - unit):
+        leaf = point.detach().requires_grad_()
+        with torch.enable_grad():
+            losses = examples.losses(unflatten(leaf, like), inputs, rows)
+            loss = losses.mean()
+        leaves = (leaf, *(inputs if with_inputs else ()))
+        sides.append((losses.detach(), *torch.autograd.grad(loss, leaves, materialize_grads=True)))
+    scale = (0.5 * size / reach).to(theta)
+    scores, product, *moved = ((above - below) * scale for above, below in zip(*sides, strict=True))
+    return _Curved(product, scores, tuple(moved))

@@ -1,0 +1,144 @@
+"""What is recorded of a training is what was run: its states, gradients and batches, within the memory given."""
+
+import math
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.training import train_detector
+from neural_sim.detector.trajectory import MEGABYTE, Recorder, Recording, Trajectory, segment_length, train
+
+DOUBLE = torch.float64
+
+
+@pytest.fixture
+def cached(tools, generator):
+    detector = tools.detector()
+    params = tools.noisy(detector.init(generator), generator)
+    backbone, _ = detector.split(params)
+    return detector, params, CachedSet.of(detector, backbone, tools.images(8))
+
+
+def _recorded(cached, recording, **changes):
+    detector, params, images = cached
+    settings = {"epochs": 3, "batch_size": 3, "learning_rate": 1e-2, "weight_decay": 0.1} | changes
+    generator = torch.Generator().manual_seed(5)
+    return train_detector(detector, params, images, generator, recording=recording, **settings)
+
+
+def _mean_gradient(cached, proximal=0.0, anchor=None):
+    detector, params, images = cached
+    like = detector.split(params)[1]
+
+    def at(theta, rows):
+        leaves, first = {}, 0
+        for name, value in like.items():
+            leaves[name] = theta[first : first + value.numel()].view_as(value).clone().requires_grad_()
+            first += value.numel()
+        loss = images.losses(leaves, rows).mean()
+        if proximal:
+            loss = loss + 0.5 * proximal * sum((leaves[n] - anchor[n]).square().sum() for n in leaves)
+        return torch.cat([g.reshape(-1) for g in torch.autograd.grad(loss, list(leaves.values()))])
+
+    return at
+
+
+@pytest.mark.parametrize("proximal", [0.0, 2.0])
+def test_a_recorded_training_is_the_one_that_was_run(cached, proximal):
+    detector, params, _ = cached
+    anchor = {name: value + 0.1 for name, value in detector.split(params)[1].items()}
+    recording = Recording()
+    trained, history = _recorded(cached, recording, proximal=proximal, anchor=anchor)
+    plain, other = _recorded(cached, None, proximal=proximal, anchor=anchor)
+    assert all(torch.equal(trained[name], plain[name]) for name in trained) and history == other
+    trajectory = history.trajectory
+    assert other.trajectory is None and len(trajectory) == history.steps == 9
+    for epoch in range(3):
+        rows = torch.cat(trajectory.rows[3 * epoch : 3 * epoch + 3])
+        assert torch.equal(rows.sort().values, torch.arange(8))
+    end = torch.cat([value.reshape(-1) for value in detector.split(trained)[1].values()])
+    assert torch.equal(trajectory.end, end)
+    gradient_at = _mean_gradient(cached, proximal, anchor)
+    for segment in trajectory.segments():
+        replayed = trajectory.replayed(segment, gradient_at)
+        for step, (state, gradient) in zip(segment, replayed, strict=True):
+            torch.testing.assert_close(
+                gradient, gradient_at(state[0], trajectory.rows[step]), rtol=1e-10, atol=1e-12
+            )
+        (state, gradient), last = replayed[-1], segment[-1]
+        after = trajectory.rule.step(state, gradient, trajectory.rates[last], last)
+        expected = trajectory.checkpoints.get(segment.stop, (end,))
+        for ours, theirs in zip(after, expected, strict=False):
+            torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+def test_the_rates_are_those_of_warm_up_and_cosine_decay(cached):
+    _, history = _recorded(cached, Recording(), warmup_fraction=0.3)
+    cosine = [0.5 * (1.0 + math.cos(math.pi * step / 6.0)) for step in range(6)]
+    assert history.trajectory.rates == pytest.approx([1e-2 * rate for rate in (1 / 3, 2 / 3, 1.0, *cosine)])
+
+
+def test_states_alone_are_kept_where_gradients_do_not_fit(cached):
+    """Nine steps: three states at a time, and three of a segment with their gradients; vectors of 8 n bytes."""
+    detector, params, _ = cached
+    vector = 8 * sum(value.numel() for value in detector.split(params)[1].values())
+    least = ((3 + 3) * 3 + 3) * vector / MEGABYTE
+    whole, few = (
+        _recorded(cached, Recording(max_memory_mb=most))[1].trajectory
+        for most in (least + 9 * vector / MEGABYTE, least)
+    )
+    assert sorted(whole.checkpoints) == sorted(few.checkpoints) == [0, 3, 6]
+    assert len(whole.gradients) == 9 and not few.gradients
+    gradient_at = _mean_gradient(cached)
+    for segment in whole.segments():
+        pairs = zip(whole.replayed(segment, gradient_at), few.replayed(segment, gradient_at), strict=True)
+        for (state, gradient), (again, computed) in pairs:
+            torch.testing.assert_close(gradient, computed, rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(state[0], again[0], rtol=1e-10, atol=1e-12)
+    with pytest.raises(ValueError, match=r"unrolled\.max_memory_mb: 9 steps take"):
+        _recorded(cached, Recording(max_memory_mb=0.9 * least))
+
+
+@pytest.mark.parametrize(("part", "first"), [(1.0, 0), (0.5, 4), (0.01, 8)])
+def test_a_part_is_that_of_the_last_steps(cached, part, first):
+    trajectory = _recorded(cached, Recording(part))[1].trajectory
+    assert trajectory.first == first and set(trajectory.gradients) == set(range(first, 9))
+    assert [step for segment in trajectory.segments()[::-1] for step in segment] == list(range(first, 9))
+
+
+@pytest.mark.parametrize("rule", [SGD(0.1, 0.9), AdamW(0.1)])
+def test_training_without_a_trainer_steps_down_a_quadratic(rule):
+    """One step by hand: both rules move against the gradient of theta^2 / 2, and shrink theta by the decay."""
+    start, rows = torch.tensor([2.0], dtype=DOUBLE), (torch.tensor([0]),)
+    made = train(rule, start, rows, (0.1,), lambda theta, _: theta)
+    expected = 2.0 - 0.1 * (2.0 + 0.2) if isinstance(rule, SGD) else 2.0 * 0.99 - 0.1
+    assert float(made.end) == pytest.approx(expected, rel=1e-7)
+    assert len(made) == 1 and made.first == 0
+
+
+def test_few_states_are_kept():
+    for steps in range(1, 200):
+        length = segment_length(steps)
+        assert length * length >= steps and -(-steps // length) + length <= 2 * steps**0.5 + 2
+
+
+@pytest.mark.parametrize("settings", [{"part": 0.0}, {"part": 1.1}, {"max_memory_mb": 0.0}])
+def test_nonsense_is_refused(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        Recording(**settings)
+
+
+def test_an_empty_trajectory_is_refused():
+    theta = torch.zeros(1)
+    state = AdamW().begin(theta)
+    with pytest.raises(ValueError, match="learning rate for each"):
+        Trajectory(AdamW(), (), (), {0: state}, {}, theta)
+    with pytest.raises(ValueError, match="checkpoints"):
+        Trajectory(AdamW(), (torch.zeros(1),), (0.1,), {}, {}, theta)
+    with pytest.raises(ValueError, match="checkpoints"):
+        Trajectory(AdamW(), (torch.zeros(1),), (0.1,), {1: state}, {}, theta)
+    recorder = Recorder(Recording(), AdamW(), 1, theta)
+    recorder.step(lambda: state, lambda: theta, 0.1)
+    assert recorder.trajectory((torch.zeros(1),), theta).rates == (0.1,)

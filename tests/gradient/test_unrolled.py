@@ -1,0 +1,154 @@
+"""The derivative of a training against central differences of the same training, and against autograd through it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from recorded_training import DOUBLE, EXACT, NAMES, RULES, SHAPE, STEP, Micro, extrapolated
+
+from neural_sim.detector.trajectory import Recording, train
+from neural_sim.gradient.accumulated import Unrolled
+from neural_sim.gradient.unrolled import Examples, reversed_steps
+from neural_sim.solver.flatten import flatten, unflatten
+
+
+@pytest.fixture(scope="module")
+def micro():
+    return Micro()
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    return Micro(proximal=0.5)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+@pytest.mark.parametrize("proximal", [False, True])
+def test_the_derivative_by_image_weights_is_that_of_the_same_training(
+    micro, pulled, rule, proximal, generator
+):
+    problem = pulled if proximal else micro
+    direction = torch.randn(8, generator=generator, dtype=DOUBLE)
+    found = float(problem.accumulated(rule).images @ direction)
+
+    def outcome(step):
+        return problem.outer(problem.trained(rule, problem.weighted(1.0 + step * direction)).end)
+
+    assert found == pytest.approx(extrapolated(outcome, STEP), rel=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+def test_the_derivative_by_inputs_is_that_of_the_same_training(micro, rule, generator):
+    """Features of every level, and the boxes that anchors should predict."""
+    directions = tuple(torch.randn(x.shape, generator=generator, dtype=DOUBLE) for x in micro.cached.inputs)
+    found = micro.accumulated(rule, with_inputs=True).inputs
+    along = sum(float((x * d).sum()) for x, d in zip(found, directions, strict=True))
+    assert all(bool(part.any()) for part in found)
+
+    def outcome(step):
+        moved = tuple(x + step * d for x, d in zip(micro.cached.inputs, directions, strict=True))
+        return micro.outer(micro.trained(rule, Examples(moved, micro.examples.losses)).end)
+
+    assert along == pytest.approx(extrapolated(outcome, STEP), rel=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+def test_central_differences_stand_for_exact_products(pulled, rule):
+    """Six steps, each within the order eps^(2/3) = 4e-11 times third derivatives; 1e-7 leaves room for those."""
+    exact, near = (
+        pulled.accumulated(rule, Unrolled(product=product), with_inputs=True)
+        for product in ("reverse_over_reverse", "central_difference")
+    )
+    for ours, theirs in zip((near.images, *near.inputs), (exact.images, *exact.inputs), strict=True):
+        assert float((ours - theirs).norm()) < 1e-7 * float(theirs.norm())
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+def test_states_kept_and_states_computed_again_give_the_same(pulled, rule):
+    """Six steps in two segments of three; without room for gradients they are computed again."""
+    vector = 8 * flatten(pulled.like).numel()
+    states = len(rule.begin(flatten(pulled.like)))
+    least = ((2 + 3) * states + 3) * vector / 2**20
+    made = pulled.trained(rule, pulled.examples, Recording(max_memory_mb=least))
+    assert sorted(made.checkpoints) == [0, 3] and not made.gradients
+    kept = pulled.accumulated(rule)
+    again = pulled.accumulated(rule, recording=Recording(max_memory_mb=least))
+    torch.testing.assert_close(again.images, kept.images, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+def test_a_part_of_the_steps_is_the_derivative_by_what_comes_late(micro, rule, generator):
+    """As if images had their weights from the third step on; before it, none."""
+    direction = torch.randn(8, generator=generator, dtype=DOUBLE)
+    found = float(micro.accumulated(rule, recording=Recording(part=0.6)).images @ direction)
+    begun = micro.trained(rule, micro.examples)
+    third, _ = begun.replayed(range(3), lambda *_: None)[2]
+
+    def outcome(step):
+        examples, held = micro.weighted(1.0 + step * direction), third
+        for done in range(2, 6):
+            gradient = examples.gradient(held[0], micro.like, micro.rows[done])
+            held = rule.step(held, gradient, begun.rates[done], done)
+        return micro.outer(held[0])
+
+    assert found == pytest.approx(extrapolated(outcome, STEP), rel=1e-6)
+
+
+def _small(generator, rule, steps=5):
+    """Weighted smooth regression of six rows by eight parameters, every step written out with its graph."""
+    design, targets = (
+        torch.randn(6, 4, generator=generator, dtype=DOUBLE),
+        torch.randn(6, generator=generator, dtype=DOUBLE),
+    )
+    like = {
+        "w": torch.randn(4, generator=generator, dtype=DOUBLE),
+        "u": torch.randn(4, generator=generator, dtype=DOUBLE),
+    }
+    rows = tuple(torch.randperm(6, generator=generator)[:3] for _ in range(steps))
+
+    def losses(params, inputs, index):
+        return (
+            torch.tanh(inputs[0] @ params["w"]) + torch.sin(inputs[0] @ params["u"]) - targets[index]
+        ).square()
+
+    return Examples((design,), losses, 0.3, {name: 0.5 * value for name, value in like.items()}), like, rows
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+@pytest.mark.parametrize("segments", [1, 3])
+def test_it_is_autograd_through_the_whole_loop(generator, rule, segments):
+    examples, like, rows = _small(generator, rule)
+    rates = tuple(0.1 * part for part in SHAPE[:5])
+    weights, design = (
+        torch.ones(6, dtype=DOUBLE).requires_grad_(),
+        examples.inputs[0].clone().requires_grad_(),
+    )
+    start, anchor = flatten(like), flatten(examples.anchor)
+    state = rule.begin(start)
+    for done, index in enumerate(rows):
+        point = state[0] if state[0].requires_grad else state[0].clone().requires_grad_()
+        loss = (weights[index] * examples.losses(unflatten(point, like), (design[index],), index)).mean()
+        loss = loss + 0.15 * (point - anchor).square().sum()
+        (gradient,) = torch.autograd.grad(loss, point, create_graph=True)
+        state = rule.step((point, *state[1:]), gradient, rates[done], done)
+    by_weight, by_input = torch.autograd.grad(state[0].square().sum(), (weights, design))
+    made = train(rule, start, rows, rates, lambda theta, index: examples.gradient(theta, like, index))
+    if segments == 1:
+        made = dataclasses.replace(made, checkpoints={0: made.checkpoints[0]})
+    assert len(made.segments()) <= segments
+    found = EXACT.accumulate(made, examples, like, 2.0 * made.end, generator, with_inputs=True)
+    torch.testing.assert_close(made.end, state[0].detach(), rtol=1e-13, atol=0.0)
+    torch.testing.assert_close(found.images, by_weight, rtol=1e-11, atol=1e-14)
+    torch.testing.assert_close(found.inputs[0], by_input, rtol=1e-11, atol=1e-14)
+
+
+def test_an_unknown_product_and_a_slope_of_another_size_are_refused(micro):
+    made = micro.trained(RULES[0], micro.examples)
+    with pytest.raises(ValueError, match=r"unrolled\.product"):
+        next(reversed_steps(made, micro.examples, micro.like, made.end, "sideways"))
+    with pytest.raises(ValueError, match="slope"):
+        next(reversed_steps(made, micro.examples, micro.like, made.end[1:]))
+    with pytest.raises(ValueError, match="proximal"):
+        Examples((), micro.examples.losses, 0.1)

@@ -1,0 +1,146 @@
+"""The psi loop on the derivative of its own training."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import Detector
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
+from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.unrolled import Examples
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.settings import Outer
+from neural_sim.outer.unrolling import inputs_of
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.update import Mirror
+from neural_sim.parameter.zoom import Zoom
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.hvp import gradient
+from neural_sim.solver.solution import Status
+from neural_sim.synthesis.scene import join
+
+MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48, "channels": 8,
+         "head_convs": 1}  # fmt: skip
+ESTIMATORS = [
+    PathwiseEstimator(), PathwiseEstimator("reverse"), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()
+]  # fmt: skip
+EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, score_every=1)
+
+
+def _module(scene, estimator, psi=None, **outer):
+    generator = torch.Generator().manual_seed(0)
+    detector, psi = Detector(2, 32, **MICRO), torch.zeros(2, 4) if psi is None else psi
+    params = detector.init(generator)
+    settings = {
+        "iterations": 2, "images_per_object": 6, "epochs": 2, "train_first": True, "adjoint": "unrolled",
+        "pool_per_bin": 2,
+    }  # fmt: skip
+    validation = join(scene.training_set(psi, 3, generator))
+    chosen = Outer(Mirror(shrink=False), **(settings | outer))
+    inner = InnerLoop(scene, detector, params, validation, chosen, 4, 0.01, generator, estimator.draws)
+    return SimulatorModule(inner, psi, estimator, AdjointSolver())
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
+def test_every_estimator_moves_psi_through_the_training(scene, estimator):
+    joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
+    module = _module(dataclasses.replace(scene, distribution=joint), estimator, torch.zeros(2, 5))
+    learned = learn_psi(module, progress=False)
+    assert len(learned.records) == 2
+    for record in learned.records:
+        assert record.certificate.solver_status == "UNROLLED" and record.certificate.damping == 0.0
+        # Two epochs of 12 images in batches of 4, each step walked back through.
+        assert record.detector_steps == record.products == record.certificate.solver_steps == 6
+        assert record.seconds["hypergradient_unrolled"] > 0.0
+    assert torch.isfinite(learned.last).all()
+    assert all((part.abs().amax(-1) > 0.0).all() for part in joint.split(learned.last).values())
+
+
+def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
+    runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
+    assert torch.equal(*runs)
+
+
+def test_objects_that_are_not_learned_are_not_scored(scene):
+    module = _module(scene, StratifiedEstimator(probes_per_bin=2), learned=("b",))
+    learned = learn_psi(module, progress=False)
+    assert not learned.last[0].any() and learned.last[1].any()
+
+
+def _trained(scene, estimator, **settings):
+    """A module whose inner loop has trained once, with what that training was on."""
+    module = _module(scene, estimator, **settings)
+    rendered = module.inner.draw(module.psi)
+    images = join(rendered)
+    cached = CachedSet.of(module.inner.detector, module.inner.backbone, images)
+    module.inner.train(cached, module.settings.unrolled.recording)
+    return module, rendered, images, cached
+
+
+def test_the_loops_stratified_gradient_is_that_of_its_recorded_training(scene):
+    """The same sums over the steps, and by hand the derivative of sum_b p_b s_b / objects."""
+    module, rendered, images, cached = _trained(scene, StratifiedEstimator(2), unrolled=EXACT)
+    module._draw_probes()
+    found = module._hypergradient(rendered, images, cached)
+    inner, probed = module.inner, module._probes
+    slope = gradient(inner.validation.mean_terms(), inner.trainable)
+    tables = [part["pose"].index.view(4, 2) for part in probed.probes]
+    summed = EXACT.accumulate(
+        inner.trajectory, Examples(cached.inputs, cached.losses_from), inner.trainable, slope,
+        torch.Generator(), ProbeGroups(probed.cached.losses, tables),
+    )  # fmt: skip
+    for name, table in zip(scene.names, tables, strict=True):
+        psi = torch.zeros(4, requires_grad=True)
+        mean = scene.distribution.factors[0].log_probabilities(psi).exp() @ summed.probes[table].mean(1)
+        (expected,) = torch.autograd.grad(0.5 * mean, psi)
+        torch.testing.assert_close(found.psi_gradients[name], expected, rtol=1e-3, atol=1e-6)
+    assert found.solution.status is Status.UNROLLED and found.validation_norm == pytest.approx(
+        float(slope.norm())
+    )
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_inputs_are_made_again_of_images_and_boxes(scene, moving):
+    module, _, images, cached = _trained(scene, PathwiseEstimator())
+    rows = torch.tensor([5, 0, 11])
+    leaves = (images.images[rows], *([images.boxes[rows]] if moving else []))
+    made = inputs_of(module.inner, cached, images.labels)(leaves, rows)
+    for again, kept in zip(made, cached.inputs, strict=True):
+        torch.testing.assert_close(again, kept[rows], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("label_gradient", ["ignored", "differentiable"])
+def test_forward_and_reverse_mode_agree_through_the_training(scene, label_gradient):
+    """The scene's tangents and the paper's second forward, both in float32, from one training."""
+    synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
+    scene = dataclasses.replace(scene, synthesizer=synthesizer)
+    module, rendered, images, cached = _trained(scene, PathwiseEstimator(), unrolled=EXACT)
+    forward = module._hypergradient(rendered, images, cached)
+    bare = [dataclasses.replace(part, tangents=None) for part in rendered]
+    reverse = module._hypergradient(bare, images, cached)
+    for name in scene.names:
+        one, other = forward.psi_gradients[name], reverse.psi_gradients[name]
+        assert float((one - other).norm()) < 1e-3 * float(other.norm())
+
+
+def test_a_training_that_was_not_recorded_is_refused(scene):
+    module = _module(scene, ReinforceEstimator())
+    rendered = module.inner.draw(module.psi)
+    images = join(rendered)
+    cached = CachedSet.of(module.inner.detector, module.inner.backbone, images)
+    module.inner.train(cached)
+    with pytest.raises(ValueError, match="was not recorded"):
+        module._hypergradient(rendered, images, cached)
+
+
+@pytest.mark.parametrize("settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2}])
+def test_unrolling_wants_a_training_in_every_iteration(settings):
+    with pytest.raises(ValueError, match=r"outer\.adjoint=unrolled wants"):
+        Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True} | settings))
+    with pytest.raises(ValueError, match=r"outer\.adjoint must be one of"):
+        Outer(Mirror(), adjoint="explicit")

@@ -1,0 +1,89 @@
+"""A training small enough for float64: the micro detector on images of noise, its batches and learning rates fixed."""
+
+from __future__ import annotations
+
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.trajectory import Recording, train
+from neural_sim.gradient.accumulated import Unrolled
+from neural_sim.gradient.unrolled import Examples
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.types import LabelledImages
+
+DOUBLE = torch.float64
+ALL = Recording()
+EXACT = Unrolled("reverse_over_reverse", score_every=1)
+RULES = [SGD(0.05), SGD(0.05, 0.8), AdamW(0.05)]
+NAMES = ["sgd", "momentum", "adamw"]
+# Warm-up, the peak, and decay to nearly zero; smaller steps where the gradient's size counts.
+SHAPE = (0.3, 0.7, 1.0, 0.9, 0.6, 0.2)
+PEAK = {SGD: 1e-2, AdamW: 3e-3}
+STEP = 1e-5  # of differences: AdamW's steps bend within |gradient| of their start, some entries of which are tiny
+
+
+class Micro:
+    """The micro detector and a few images of noise with boxes, in float64, some to train on and some to validate on."""
+
+    def __init__(self, proximal: float = 0.0) -> None:
+        generator = torch.Generator().manual_seed(3)
+        detector = Detector(
+            3, 32, "micro", anchor_sizes=((14,), (28,)), anchor_reference=48, channels=8, head_convs=1
+        )
+        params = {
+            name: value.double() + 0.05 * torch.randn(value.shape, generator=generator, dtype=DOUBLE)
+            for name, value in detector.init(generator).items()
+        }
+        backbone, self.like = detector.split(params)
+        self.cached = CachedSet.of(detector, backbone, _noise(8, generator))
+        self.validation = CachedSet.of(detector, backbone, _noise(4, generator)).mean_terms()
+        anchor = {name: value + 0.1 for name, value in self.like.items()} if proximal else None
+        self.examples = Examples(self.cached.inputs, self.cached.losses_from, proximal, anchor)
+        orders = [torch.randperm(8, generator=generator) for _ in range(2)]
+        self.rows = tuple(part for order in orders for part in order.split(3))  # batches of 3, 3 and 2
+
+    def weighted(self, weights):
+        """The same examples, every image's loss times its weight."""
+        base = self.examples
+        return Examples(
+            base.inputs,
+            lambda p, x, rows: weights[rows] * base.losses(p, x, rows),
+            base.proximal,
+            base.anchor,
+        )
+
+    def trained(self, rule, examples, recording=ALL):
+        rates = tuple(PEAK[type(rule)] * part for part in SHAPE)
+        return train(
+            rule, flatten(self.like), self.rows, rates,
+            lambda theta, rows: examples.gradient(theta, self.like, rows), recording,
+        )  # fmt: skip
+
+    def outer(self, theta):
+        return float(sum(term(unflatten(theta, self.like)) for term in self.validation))
+
+    def slope(self, theta):
+        point = theta.detach().requires_grad_()
+        return torch.autograd.grad(sum(t(unflatten(point, self.like)) for t in self.validation), point)[0]
+
+    def accumulated(self, rule, how=EXACT, examples=None, recording=ALL, **wanted):
+        examples = examples or self.examples
+        made = self.trained(rule, examples, recording)
+        generator = torch.Generator().manual_seed(0)
+        return how.accumulate(made, examples, self.like, self.slope(made.end), generator, **wanted)
+
+
+def _noise(count, generator):
+    images = torch.rand(count, 3, 32, 32, generator=generator, dtype=DOUBLE)
+    corner = torch.rand(count, 1, 2, generator=generator, dtype=DOUBLE) * 14
+    side = 6 + torch.rand(count, 1, 2, generator=generator, dtype=DOUBLE) * 12
+    labels = torch.randint(0, 3, (count, 1), generator=generator)
+    return LabelledImages(images, torch.cat([corner, corner + side], -1), labels, torch.full((count,), -1))
+
+
+def extrapolated(function, step):
+    """The central difference of a function of one number at 0, its error of fourth order in the step."""
+    coarse, fine = ((function(h) - function(-h)) / (2 * h) for h in (step, step / 2))
+    return (4 * fine - coarse) / 3
