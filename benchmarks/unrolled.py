@@ -99,12 +99,13 @@ class World:
     ) -> tuple[Parameters, TrainingHistory]:
         """As the psi loop trains; returns the trained pyramid and head."""
         x = self.context.experiment
+        detector, generator = self.context.graph.warm_start.build(), torch.Generator().manual_seed(seed)
         theta, history = train_detector(
-            self.context.graph.warm_start.build(), self.start, self.pool.select(rows), torch.Generator().manual_seed(seed),
-            epochs=x.loop.outer.epochs, batch_size=x.training.batch_size, learning_rate=x.loop.outer.learning_rate,
+            detector, self.start, self.pool.select(rows), generator, epochs=x.loop.outer.epochs,
+            batch_size=x.training.batch_size, learning_rate=x.loop.outer.learning_rate,
             weight_decay=x.training.weight_decay, recording=recording,
         )  # fmt: skip
-        return self.context.graph.warm_start.build().split(theta)[1], history
+        return detector.split(theta)[1], history
 
     @torch.no_grad()
     def loss(self, trained: Parameters) -> float:
@@ -139,12 +140,14 @@ class Walked:
         world, data = self.world, self.world.pool.select(self.rows)
         slope = gradient(world.validation.mean_terms(), self.trained)
         if solved:
-            chosen = torch.randperm(len(data), generator=generator)[: world.made.x.outer.curvature_images]
+            chosen = torch.randperm(len(data), generator=generator)[
+                : world.context.experiment.loop.outer.curvature_images
+            ]
             weights = torch.full((len(data),), 1.0 / len(data))
             inner = InnerProblem(
                 self.trained, SplitLoss(data.outputs, data.losses_of), weights, subset=chosen
             )
-            slope = world.made.x.solver.solve(
+            slope = world.context.experiment.loop.solver.solve(
                 inner.terms(chosen), self.trained, slope, None, generator
             ).vector
         index = world.probes(self.label)
@@ -278,7 +281,7 @@ def main() -> None:
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     world = World.of(arguments.overrides)
-    labels = {name: world.made.scene.names.index(name) for name in arguments.objects}
+    labels = {name: world.context.graph.names.index(name) for name in arguments.objects}
     spent = costs(world, arguments.repeats)
     print(json.dumps(spent, indent=1), flush=True)
     wrong = errors(walked(world, labels[arguments.objects[0]], 0))
