@@ -27,51 +27,51 @@ def found(boxes, scores, labels) -> dict[str, torch.Tensor]:
 def test_perfect_detections_score_one_and_absent_classes_nan():
     images = labelled([[0], [1]])
     score = evaluate([found([BOX], [0.9], [0]), found([BOX], [0.8], [1])], images, NAMES)
-    assert score["ap"] == pytest.approx(1.0)
-    assert score["ap50"] == pytest.approx(1.0)
-    assert math.isnan(score["per_class"]["drill"])
-    assert math.isnan(score["per_class_ap50"]["drill"])
+    assert score.ap == pytest.approx(1.0)
+    assert score.ap50 == pytest.approx(1.0)
+    assert math.isnan(score.per_class["drill"])
+    assert math.isnan(score.per_class_ap50["drill"])
 
 
 def test_a_class_only_predicted_is_absent_too():
     images = labelled([[0]])
     score = evaluate([found([BOX, BOX], [0.9, 0.95], [0, 2])], images, NAMES)
-    assert score["ap"] == pytest.approx(1.0)
-    assert math.isnan(score["per_class"]["drill"])
+    assert score.ap == pytest.approx(1.0)
+    assert math.isnan(score.per_class["drill"])
 
 
 def test_overlap_decides_which_thresholds_count():
     # Width 14 of 20 inside the truth: IoU 0.7, so thresholds 0.50 to 0.70 of the ten are met (five of ten).
     score = evaluate([found([[10.0, 10.0, 24.1, 30.0]], [0.9], [0])], labelled([[0]]), NAMES)
-    assert score["ap"] == pytest.approx(0.5)
-    assert score["ap50"] == pytest.approx(1.0)
+    assert score.ap == pytest.approx(0.5)
+    assert score.ap50 == pytest.approx(1.0)
 
 
 def test_a_better_scored_false_positive_halves_the_precision():
     images = labelled([[0], [-1]])
     predictions = [found([BOX], [0.5], [0]), found([BOX], [0.9], [0])]
-    assert evaluate(predictions, images, NAMES)["ap"] == pytest.approx(0.5)
+    assert evaluate(predictions, images, NAMES).ap == pytest.approx(0.5)
 
 
 def test_a_missed_half_has_101_point_recall():
     # Recall stops at 1/2: the recall points 0, 0.01, ..., 0.50 are 51 of 101.
     images = labelled([[0], [0]])
     predictions = [found([BOX], [0.5], [0]), found([], [], [])]
-    assert evaluate(predictions, images, NAMES)["ap"] == pytest.approx(51 / 101)
+    assert evaluate(predictions, images, NAMES).ap == pytest.approx(51 / 101)
 
 
 def test_classes_count_equally():
     images = labelled([[0], [0], [0], [1]])
     predictions = [found([BOX], [0.9], [0])] * 3 + [found([], [], [])]
     score = evaluate(predictions, images, NAMES)
-    assert score["per_class"]["mug"] == 0.0
-    assert score["ap"] == pytest.approx(0.5)
+    assert score.per_class["mug"] == 0.0
+    assert score.ap == pytest.approx(0.5)
 
 
 def test_nothing_found_and_nothing_there():
     empty = found([], [], [])
-    assert evaluate([empty], labelled([[0]]), NAMES)["ap"] == 0.0
-    assert math.isnan(evaluate([empty], labelled([[-1]]), NAMES)["ap"])
+    assert evaluate([empty], labelled([[0]]), NAMES).ap == 0.0
+    assert math.isnan(evaluate([empty], labelled([[-1]]), NAMES).ap)
 
 
 def test_mismatches_and_empty_sets_are_refused():

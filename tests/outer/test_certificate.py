@@ -169,8 +169,8 @@ def test_what_does_not_exist_is_not_doubted():
 
 
 def test_a_gradient_that_is_not_finite_is_never_followed():
-    actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
-    for on_untrusted, action in actions.items():
+    wanted = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}
+    for on_untrusted, action in wanted.items():
         certificate = judge(result(gradient=(math.nan, 0.0)), on_untrusted=on_untrusted)
         assert actions(certificate) == [action] * 2 and "not finite" in certificate.doubts
         assert certificate.void

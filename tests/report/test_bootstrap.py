@@ -30,7 +30,7 @@ def _case(generator, count=30):
 
 def test_equals_coco_evaluation(generator):
     found, images = _case(generator)
-    expected = evaluate(found, images, ["a", "b"])["per_class"]
+    expected = evaluate(found, images, ["a", "b"]).per_class
     for label, name in enumerate(["a", "b"]):
         assert average_precision(match(found, images, label)) == pytest.approx(expected[name], abs=1e-6)
 

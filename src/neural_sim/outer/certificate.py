@@ -66,7 +66,7 @@ class Certificate:
     def void(self) -> bool:
         """Whether nothing of this iteration is followed, not even later through the momentum."""
         done = {action for held in self.actions.values() for action in held.values()}
-        return self.stopped or (bool(self.doubts) and "shrunk" not in done)
+        return self.stopped or (bool(self.doubts) and not done & {"shrunk", "kept"})
 
 
 def certify(
