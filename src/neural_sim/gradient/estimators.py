@@ -46,7 +46,7 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign; for lights :func:`across_lights`."""
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign."""
         distribution = images.distribution
         if losses.probes is None or set(probes) != set(distribution.names):
             raise ValueError(
