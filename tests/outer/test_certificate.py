@@ -82,7 +82,9 @@ def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
 ):
     certificate = judge(found, cosine, on_untrusted=on_untrusted)
     assert certificate.doubts == [doubt] and actions(certificate) == [action] * 2
-    assert certificate.stopped == (action == "stopped") and certificate.void == (action not in ("shrunk", "kept"))
+    assert certificate.stopped == (action == "stopped") and certificate.void == (
+        action not in ("shrunk", "kept")
+    )
     free = Trust(None, None, None, None, None)
     assert judge(found, cosine, free).doubts == (["solver"] if doubt == "solver" else [])
 

@@ -54,7 +54,7 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign; for lights :func:`across_lights`.
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
         The null of its significance is that a factor's bins, or lights, have one mean score: then the value is zero.
         """
