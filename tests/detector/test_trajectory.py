@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.module import DetectorModule
 from neural_sim.detector.optimiser import SGD, AdamW
 from neural_sim.detector.training import train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recorder, Recording, Trajectory, segment_length, train
@@ -128,6 +129,19 @@ def test_few_states_are_kept():
 def test_nonsense_is_refused(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         Recording(**settings)
+
+
+def test_what_was_not_recorded_or_has_no_gradient_is_refused(cached):
+    detector, params, _ = cached
+    backbone, learned = detector.split(params)
+    silent, asked = (
+        DetectorModule(detector, learned, backbone, 3, 1e-2, 0.0, 0.1, recording=recording)
+        for recording in (None, Recording())
+    )
+    with pytest.raises(ValueError, match="want a recording"):
+        silent.trajectory([])
+    with pytest.raises(ValueError, match=r"no gradient, and so no step to record, of \['fpn"):
+        asked.on_before_optimizer_step(asked.configure_optimizers()["optimizer"])
 
 
 def test_an_empty_trajectory_is_refused():

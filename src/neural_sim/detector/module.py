@@ -107,23 +107,19 @@ class DetectorModule(pl.LightningModule):
         if self._recorder is None:
             return
 
+        gradients = [value.grad for value in self._values if value.grad is not None]
+        if len(gradients) < len(self._names):
+            missed = [n for n, value in zip(self._names, self._values, strict=True) if value.grad is None]
+            raise ValueError(f"DetectorModule: no gradient, and so no step to record, of {missed}")
+
+        def moment(name: str) -> Tensor:
+            # Before its first step the optimiser holds none.
+            return _flat(optimizer.state[value].get(name, torch.zeros_like(value)) for value in self._values)
+
         def state() -> State:
-            held = [optimizer.state[value] for value in self._values]
-            moments = (
-                _flat(
-                    [
-                        part.get(name, torch.zeros_like(value))
-                        for part, value in zip(held, self._values, strict=True)
-                    ]
-                )
-                for name in ("exp_avg", "exp_avg_sq")
-            )
-            return (_flat(self._values), *moments)
+            return _flat(self._values), moment("exp_avg"), moment("exp_avg_sq")
 
-        def gradient() -> Tensor:
-            return _flat([torch.zeros_like(v) if v.grad is None else v.grad for v in self._values])
-
-        self._recorder.step(state, gradient, optimizer.param_groups[0]["lr"])
+        self._recorder.step(state, lambda: _flat(gradients), optimizer.param_groups[0]["lr"])
 
     def on_train_epoch_end(self) -> None:
         self._epochs.append(len(self._sizes) - self.steps_done)

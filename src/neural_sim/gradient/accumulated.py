@@ -48,10 +48,8 @@ class Accumulated:
         parts = []
         chunks = zip(index.split(chunk_size), *(leaf.split(chunk_size) for leaf in leaves), strict=True)
         for rows, *chunk in chunks:
-            held, there = (
-                tuple(part.detach().requires_grad_() for part in chunk),
-                rows.to(self.inputs[0].device),
-            )
+            there = rows.to(self.inputs[0].device)
+            held = tuple(part.detach().requires_grad_() for part in chunk)
             with torch.enable_grad():
                 made = self.inputs_of(held, there)
             # A frozen label is an input that no image moves.
@@ -119,7 +117,7 @@ class Unrolled:
         for key, least in (("probes_per_step", 0), ("score_every", 1), ("chunk_size", 1)):
             if getattr(self, key) < least:
                 raise ValueError(f"unrolled.{key} must be at least {least}, got {getattr(self, key)}")
-        _ = self.recording
+        _ = self.recording  # refuses what is out of its own range
 
     @property
     def recording(self) -> Recording:

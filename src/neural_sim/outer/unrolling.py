@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups
-from neural_sim.gradient.base import ObjectImages, Probes
+from neural_sim.gradient.base import MixedDerivative, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, unrolled_hypergradient
 from neural_sim.gradient.unrolled import Examples, InputsOf
@@ -38,19 +38,16 @@ def through_training(
     examples = Examples(
         cached.inputs, cached.losses_from, problem.proximal, problem.anchor, inputs_of(loop, cached, labels)
     )
-    objects = loop.scene.names
+    probes: dict[str, Mapping[str, Probes]] = {name: {} for name in images}
+    groups = None
+    if probed is not None:
+        probes = {name: probed.probes[loop.scene.names.index(name)] for name in images}
+        tables = [part.index.view(-1, probed.per_bin) for held in probes.values() for part in held.values()]
+        groups = ProbeGroups(probed.cached.losses, tables)
 
-    def bound(name: str) -> Mapping[str, Probes]:
-        return probed.probes[objects.index(name)] if probed else {}
+    def estimate(name: str, found: Accumulated) -> MixedDerivative:
+        return estimator.accumulated(found, images[name], probes[name])
 
-    def estimate(name: str, found: Accumulated):
-        return estimator.accumulated(found, images[name], bound(name))
-
-    tables = (
-        [part.index.view(-1, probed.per_bin) for name in images for part in bound(name).values()]
-        if probed
-        else []
-    )
     return unrolled_hypergradient(
         problem,
         loop.trajectory,
@@ -59,7 +56,7 @@ def through_training(
         {name: lambda found, name=name: estimate(name, found) for name in images},
         loop.settings.unrolled,
         loop.generator,
-        ProbeGroups(probed.cached.losses, tables) if probed and tables else None,
+        groups,
         estimator.through_images,
     )
 
