@@ -10,7 +10,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from neural_sim.main import UserError, build, conf_directory
+from neural_sim.main import UserError, build, conf_directory, context_of
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(conf_directory())
@@ -85,7 +85,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
 )
 def test_bad_settings_are_refused_in_one_line_that_names_the_key(override, message):
     with pytest.raises(UserError) as caught:
-        build(_config("+experiment=pose_gap", "scale=smoke", override))
+        context_of(_config("+experiment=pose_gap", "scale=smoke", override), Path())
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -152,4 +152,4 @@ def test_what_the_command_line_names_is_taken():
     made = build(composed("+variant=paper", "field=grid", "detector=tiny", "unlearned.rho_deg=[-45,45]"))
     assert made.config["field"]["field"]["_target_"].endswith("GridField")
     assert made.config["detector"]["architecture"] == "tiny"
-    assert made.distribution.ranges["rho"][1] == pytest.approx(0.7853981633974483)
+    assert made.imaging.distribution.ranges["rho"][1] == pytest.approx(0.7853981633974483)

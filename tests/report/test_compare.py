@@ -70,7 +70,7 @@ def database(empty_store, tmp_path_factory):
 
 
 def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, capsys):
-    (found,) = Compare(("gap",), draws=5).run(database, 0, {"name": "compare"}, tmp_path)
+    (found,) = Compare(("gap",), draws=5).compare(database, 0, {"name": "compare"}, tmp_path)
     assert found.methods == ("neural_sim", "lts") and found.seeds == (0, 1)
     assert found.ap["lts"].value == pytest.approx(0.5, abs=0.01)
     document = json.loads((tmp_path / "compare.json").read_text())
@@ -97,7 +97,7 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
 
 
 def test_two_ways_of_scoring_are_two_tables_whose_headings_say_how_they_differ(database, tmp_path):
-    found = Compare(("gap",), reference="lts", draws=5).run(database, 0, {"name": "compare"}, tmp_path)
+    found = Compare(("gap",), reference="lts", draws=5).compare(database, 0, {"name": "compare"}, tmp_path)
     assert [comparison.methods for comparison in found] == [("lts",), ("lts", "neural_sim")]
     text = (tmp_path / "compare.md").read_text()
     assert "## gap, scoring t: views.size=0\n" in text and "## gap, scoring s: views.size=1\n" in text
@@ -111,9 +111,9 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
     with pytest.raises(
         ValueError, match=r"no evaluated run of compare.reference='ours'.*has no run of this setting"
     ):
-        Compare(("gap",), reference="ours", draws=5).run(database, 0, {}, tmp_path)
+        Compare(("gap",), reference="ours", draws=5).compare(database, 0, {}, tmp_path)
     with pytest.raises(ValueError, match="no experiment 'other'"):
-        Compare(("other",), draws=5).run(database, 0, {}, tmp_path)
+        Compare(("other",), draws=5).compare(database, 0, {}, tmp_path)
 
 
 def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):
@@ -124,6 +124,6 @@ def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):
         (run / "results.json").write_text(json.dumps(held))
         (run / "detections.json").write_text(json.dumps(detections(4)))
         tracking.log_run(uri, "gap", method, {}, {}, {}, {}, run)
-    Compare(("gap",), draws=5).run(uri, 0, {}, tmp_path / "compare")
+    Compare(("gap",), draws=5).compare(uri, 0, {}, tmp_path / "compare")
     text = (tmp_path / "compare" / "compare.md").read_text()
     assert "Seconds are not comparable" in text and "cpu: lts seed 0" in text

@@ -34,7 +34,7 @@ def test_every_method_is_scored_alike(experiment):
         "baseline=lts",
         "baseline=auto_sim",
         "baseline=bayes_opt",
-        "+variant=paper",
+        "baseline=neural_sim_paper",
         "gradient=reinforce",
     ]
     found = [

@@ -1,6 +1,9 @@
 """A stage from outside the package: one class, one configuration node."""
 
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -8,6 +11,7 @@ from hydra import compose, initialize_config_dir
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.stages.walk import walk
 
+ROOT = Path(__file__).parents[2]
 PLUGIN = '''
 from dataclasses import dataclass
 
@@ -20,6 +24,13 @@ class Count:
 
     def run(self, context):
         (context.folder / "count.txt").write_text(str(self.times * len(context.graph.names)))
+
+
+class Fail:
+    def run(self, context):
+        from neural_sim.stages.context import StageFailure
+
+        raise StageFailure("two checks failed")
 '''
 
 
@@ -53,3 +64,12 @@ def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin
         context(tmp_path, "+count={_target_: my_stage.Count}", "stages=[views,fields]")
     known = "views, field, target_sets, warm_start, psi, evaluate, report, count"
     assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}"
+
+
+def test_a_stage_that_finds_a_failure_makes_the_exit_status_one(tmp_path, plugin):
+    arguments = ["+fail={_target_: my_stage.Fail}", "stages=[fail]", f"hydra.run.dir={tmp_path}/run"]
+    command = [sys.executable, "-m", "src.main", *arguments]
+    places = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": places}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1 and "Traceback" not in done.stderr

@@ -6,17 +6,19 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.types import RunMode
 
 import neural_sim.field.quadrature as quadrature
 import neural_sim.parameter.bins as binned
-from neural_sim.main import UserError, _finish_stress, conf_directory, stress
+from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.report import stress as report
 from neural_sim.report.stress import failures, markdown, table, track, write
 from neural_sim.solver.cg import ConjugateGradient
+from neural_sim.stages.context import StageFailure
+from neural_sim.stages.walk import walk
 from neural_sim.stress import cases, linear, rendering, sampling, simplex
 from neural_sim.stress.cases import Check, Result, Scope, run_case
 from neural_sim.stress.suite import FAMILIES, Suite
@@ -26,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_case_of_every_family_passes(family):
-    results = Suite([family], full=False).run(seed=0)
+    results = Suite([family], full=False).run_all(seed=0)
     wrong = [(r.case, r.quantity, r.value, r.tolerance, r.status) for r in failures(results)]
     assert results and not wrong
 
@@ -163,26 +165,22 @@ def test_bad_settings_name_their_key(tmp_path):
         with initialize_config_dir(str(conf_directory()), version_base="1.3"):
             config = compose("config", ["+experiment=stress", override])
         with pytest.raises(UserError, match=message):
-            stress(config, tmp_path)
+            context_of(config, tmp_path)
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         listed = compose("config", ["+experiment=stress"]).stress.families
     assert tuple(listed) == FAMILIES
 
 
-def test_what_failed_is_counted_written_and_decides_the_exit_status(tmp_path, monkeypatch):
+def test_what_failed_is_counted_and_written(tmp_path, monkeypatch):
     monkeypatch.setattr(simplex, "project_sum", lambda values: values)
-    monkeypatch.setattr(report, "track", lambda *arguments: "not logged")
+    monkeypatch.setattr(report, "track", lambda *arguments: SimpleNamespace(where="not logged"))
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         config = compose("config", ["+experiment=stress", "stress.families=[simplex]", "progress=false"])
-    failed = stress(config, tmp_path)
+    with pytest.raises(StageFailure) as caught:
+        walk(*context_of(config, tmp_path))
     held = json.loads((tmp_path / "stress.json").read_text())
-    assert failed == sum(not row["passed"] for row in held) > 0
-    assert _finish_stress(0, RunMode.RUN) == 0.0
-    with pytest.raises(SystemExit) as caught:
-        _finish_stress(failed, RunMode.RUN)
-    assert caught.value.code == 1
-    with pytest.raises(RuntimeError, match="checks failed"):
-        _finish_stress(failed, RunMode.MULTIRUN)
+    failed = sum(not row["passed"] for row in held)
+    assert failed > 0 and str(caught.value) == f"stress: {failed} checks failed"
 
 
 @pytest.mark.slow
