@@ -6,52 +6,22 @@ import math
 
 import pytest
 import torch
+from small_loop import small_loop
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector
-from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.outer.binding import bound_losses, object_images
-from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
-from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.settings import Outer, Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import HARD, RelaxedDraws, join
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
-
-SOLVER = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
-TINY = {
-    "num_classes": 2, "image_size": 32, "anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8,
-    "head_convs": 1,
-}  # fmt: skip
-MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48}
-PROXIMAL = 20.0  # past the negative curvature of an untrained detector
-NOTHING_WILL_DO = Trust(max_stationarity=0.0)
-
-
-def _module(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
-    generator = torch.Generator().manual_seed(0)
-    detector = Detector(**(TINY | (detector or {})))
-    psi = torch.zeros(2, 4) if psi is None else psi
-    validation = join(scene.training_set(psi, 3, generator))
-    settings = Outer(
-        Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer
-    )
-    inner = InnerLoop(
-        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
-    )
-    return SimulatorModule(inner, psi, estimator, solver)
-
 
 ESTIMATORS = [
     PathwiseEstimator(),
@@ -63,7 +33,7 @@ ESTIMATORS = [
 
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__ + getattr(e, "mode", ""))
 def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
-    module = _module(scene, estimator)
+    module = small_loop(scene, estimator)
     learned = learn_psi(module, progress=False)
     assert len(learned.records) == 2
     first = learned.records[0]
@@ -79,7 +49,7 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
 @pytest.mark.parametrize("start", ["fresh", "previous"])
 @pytest.mark.parametrize("train_first", [False, True])
 def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_first(scene, start, train_first):
-    module = _module(scene, StratifiedEstimator(probes_per_bin=2), start=start, train_first=train_first)
+    module = small_loop(scene, StratifiedEstimator(probes_per_bin=2), start=start, train_first=train_first)
     at_warm_start = module.inner.validation_loss()
     first, second = learn_psi(module, progress=False).records
     batches = 12 // 4
@@ -89,12 +59,12 @@ def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_fir
 
 
 def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
-    runs = [learn_psi(_module(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
+    runs = [learn_psi(small_loop(scene, StratifiedEstimator(probes_per_bin=2)), False).last for _ in range(2)]
     assert torch.equal(*runs)
 
 
 def test_the_backbone_stays_frozen(scene):
-    module = _module(scene, ReinforceEstimator())
+    module = small_loop(scene, ReinforceEstimator())
     before = {
         name: value.clone() for name, value in module.inner.detector.split(module.inner.theta)[0].items()
     }
@@ -186,7 +156,7 @@ def test_straight_through_images_are_those_of_hard_draws(scene):
 
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
     for mode, carried in (("forward", True), ("reverse", False)):
-        drawn = _module(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))
+        drawn = small_loop(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))
         assert all((part.tangents is not None) is carried for part in drawn)
 
 
@@ -213,7 +183,7 @@ def test_cached_losses_equal_losses_from_images(scene):
 def test_every_factor_of_a_product_is_learned(scene, estimator):
     joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
     scene = dataclasses.replace(scene, distribution=joint)
-    module = _module(scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2)
+    module = small_loop(scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2)
     module.settings = dataclasses.replace(module.settings, update=Mirror(shrink=False))
     learned = learn_psi(module, progress=False)
     assert set(learned.records[0].probabilities) == {"pose", "zoom"}
@@ -234,91 +204,3 @@ def test_the_pool_holds_every_combination_of_bins(scene):
     drawn = pool.draw(1, psi, 200, generator).draw
     assert torch.equal(joint.bins_of(drawn), drawn.bins)
     assert pool.probes(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
-
-
-@pytest.mark.parametrize("action", ["skip", "stop", "shrink", "keep"])
-def test_untrusted_steps_are_skipped_stop_the_loop_are_shrunk_or_kept(scene, action):
-    estimator = StratifiedEstimator(probes_per_bin=2)
-    learned = learn_psi(
-        _module(scene, estimator, 2, detector=MICRO, trust=NOTHING_WILL_DO, on_untrusted=action), False
-    )
-    assert all(record.certificate.doubts == ["stationarity"] for record in learned.records)
-    assert len(learned.records) == (1 if action == "stop" else 2)
-    if action not in ("shrink", "keep"):
-        assert not learned.last.any()
-        return
-    settings = {"trust": NOTHING_WILL_DO, "on_untrusted": action}
-    one = learn_psi(_module(scene, estimator, 1, detector=MICRO, **settings), False).last
-    free = learn_psi(_module(scene, estimator, 1, detector=MICRO, trust=Trust(level=None)), False).last
-    torch.testing.assert_close(one, (0.25 if action == "shrink" else 1.0) * free)
-
-
-@dataclasses.dataclass(frozen=True)
-class Told:
-    """A derivative with p-values made up: object a has a signal in the poses, b in the zooms of the first iteration."""
-
-    draws = HARD
-    probes_per_bin = 0
-
-    def estimate(self, losses, params, vector, images, probes):
-        value = torch.tensor([1.0, -1.0, 0.0, 0.5, -0.5])
-        first = int(images.index[0]) == 0
-        return MixedDerivative(
-            value, 0.1 * value.abs(), {"pose": 0.01 if first else 0.5, "zoom": 0.5 if first else 0.01}
-        )
-
-
-@pytest.mark.parametrize(("on_untrusted", "part"), [("shrink", 0.25), ("skip", 0.0), ("stop", 0.0)])
-def test_a_step_without_signal_is_cut_for_its_object_and_factor_alone(scene, on_untrusted, part):
-    scene = dataclasses.replace(scene, distribution=SceneDistribution.of([Pose(bins=3), Zoom(bins=2)]))
-    psi = torch.zeros(2, 5)
-    free, cut = (
-        learn_psi(_module(scene, Told(), 2, detector=MICRO, psi=psi, **settings), False)
-        for settings in ({"trust": Trust(level=None)}, {"on_untrusted": on_untrusted})
-    )
-    assert [record.certificate.doubts for record in cut.records] == [[], []]
-    # The first step is free's, or a part of it; in the second psi, and with it the mirror's step, differ.
-    parts = torch.tensor([[1.0] * 3 + [part] * 2, [part] * 3 + [1.0] * 2], dtype=torch.float64)
-    assert bool((free.trajectory[1].abs().amax(0)[[0, 1, 3, 4]] > 0.0).all())
-    torch.testing.assert_close(cut.trajectory[1], parts * free.trajectory[1])
-    again = cut.trajectory[2] - cut.trajectory[1]
-    assert bool(again.abs()[parts == 1.0].amax() > 0.0) and (part > 0.0 or not again[parts == 0.0].any())
-
-
-@pytest.mark.parametrize(
-    "estimator",
-    [StratifiedEstimator(probes_per_bin=2), pytest.param(ReinforceEstimator(), marks=pytest.mark.slow)],
-    ids=lambda e: type(e).__name__,
-)
-def test_a_step_is_certified_by_retraining_without_changing_the_run(scene, estimator):
-    plain, certified = (
-        learn_psi(_module(scene, estimator, 2, detector=MICRO, certify_every=every), False)
-        for every in (0, 2)
-    )
-    first, second = (record.certificate for record in certified.records)
-    assert math.isnan(first.cosine) and -1.0 <= second.cosine <= 1.0
-    assert certified.records[1].seconds["certify"] > 0.0
-    assert plain.records[1].probabilities == certified.records[1].probabilities
-    assert plain.records[1].certificate.solver_residual == second.solver_residual
-
-
-@pytest.mark.parametrize(
-    "damping", [GaussNewtonDamping(1.0, lanczos_steps=4), FixedDamping(0.0)], ids=lambda d: d.curvature
-)
-def test_gauss_newton_and_the_proximal_problem_run_in_the_loop(scene, damping):
-    solver = AdjointSolver(ConjugateGradient(), damping, sensitivity=True)
-    module = _module(
-        scene,
-        StratifiedEstimator(probes_per_bin=2),
-        1,
-        solver,
-        {**MICRO, "proximal": PROXIMAL},
-        learning_rate=0.0,
-    )
-    certificate = learn_psi(module, False).records[0].certificate
-    assert certificate.solver_status == "CONVERGED" and certificate.damping == damping.value
-    assert (certificate.sensitivity > 0.0) == (damping.value > 0.0)
-    if (
-        damping.curvature == "gauss_newton"
-    ):  # the proximal term's own curvature, below which a near-convex loss adds none
-        assert PROXIMAL - 1e-2 <= certificate.curvature_min < certificate.curvature_max
