@@ -1,6 +1,7 @@
 """What becomes of a psi step by its certificate, in a loop that runs."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
