@@ -245,27 +245,22 @@ def few(
 
 def responses(world: World, label: int, seeds: int, part: float) -> dict[str, Any]:
     """Changes of the validation loss by bin, and the ways to foretell them, a row for each seed."""
-    shares, share = centred_shares(world.p[label]), part / len(world.p)
+    p = world.p[label]
+    shares, share = torch.eye(len(p)) - p, part / len(world.p)  # row b: what moving to bin b changes
     true, told = [], {}
     for seed in range(seeds):
         run = walked(world, label, seed)
         base = world.loss(run.trained)
         moved = [world.train(world.rows(seed, label, b, part), seed)[0] for b in range(len(shares))]
         true.append(torch.tensor([world.loss(trained) - base for trained in moved]))
-        ways = {"unrolled": run.bins(replace(ALL, probes_per_step=4, score_every=2))}
-        ways |= {
-            f"unrolled, the last {p:.0%}": run.bins(replace(ALL, probes_per_step=4), p) for p in PARTS[1:]
-        }
+        scored = run.scores()
+        ways = {"unrolled": bin_means(scored)}
+        ways |= {f"unrolled, the last {late:.0%} of the steps": bin_means(scored, late) for late in PARTS[1:]}
         generator = torch.Generator().manual_seed(seed)
         ways |= {"implicit": run.implicit(generator), "dL_val/dtheta alone": run.implicit(generator, False)}
         for name, means in ways.items():
             told.setdefault(name, []).append(share * (shares @ means))
     return {"response": true, "foretold": told}
-
-
-def centred_shares(p: Float[Tensor, "k"]) -> Float[Tensor, "k k"]:
-    """Row b: what moving all images to bin b changes in the bins' shares."""
-    return torch.eye(len(p)) - p
 
 
 def main() -> None:
@@ -283,9 +278,8 @@ def main() -> None:
     world = World.of(arguments.overrides)
     labels = {name: world.context.graph.names.index(name) for name in arguments.objects}
     spent = costs(world, arguments.repeats)
-    print(json.dumps(spent, indent=1), flush=True)
     wrong = errors(walked(world, labels[arguments.objects[0]], 0))
-    print(json.dumps(wrong, indent=1), flush=True)
+    print(json.dumps({"costs": spent, "errors": wrong}, indent=1), flush=True)
     found = {}
     for name, label in labels.items():
         found[name] = responses(world, label, arguments.seeds, arguments.part)
@@ -299,9 +293,8 @@ def main() -> None:
         for name, held in found.items()
     }
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
-    arguments.json.write_text(
-        json.dumps({"machine": machine(), "costs": spent, "errors": wrong, "objects": rows}, indent=1)
-    )
+    document = {"machine": machine(), "costs": spent, "errors": wrong, "objects": rows}
+    arguments.json.write_text(json.dumps(document, indent=1))
     replace_section(arguments.docs, "Unrolled", text)
 
 
