@@ -1,9 +1,7 @@
 """The derivative of the training that was run: what it costs, what each saving adds in error, and what it foretells.
 
-`python benchmarks/unrolled.py` writes docs/numerics.md. One iteration of the psi loop on `+experiment=pose_gap` at
-64 px from uniform poses, where no bin is unseen: a training, and for every bin of an object the same training again
-with a part of that object's images drawn from that bin instead. Their validation losses are the response that a
-hypergradient should foretell.
+`python benchmarks/unrolled.py` writes docs/numerics.md, from one iteration of the psi loop on `+experiment=pose_gap` at
+64 px: a training, and for every bin of an object the same training with a part of its images drawn from that bin.
 """
 
 from __future__ import annotations
