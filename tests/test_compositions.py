@@ -11,7 +11,6 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
 from neural_sim.outer.inner import pooled
-from neural_sim.parameter.light_update import PlainProjectedGradient
 from neural_sim.parameter.update import SGD, Mirror
 from neural_sim.stages.graph import Graph
 from neural_sim.synthesis.scene import HardDraws
@@ -124,19 +123,19 @@ def test_the_papers_method_is_what_the_paper_says_at_every_scale(scale):
         factor.floor == 0.0 and factor.bin_mean == "linear" for factor in made.imaging.distribution.binned
     )
     assert all(factor.temperature == 0.1 for factor in made.imaging.distribution.binned)
-    assert made.imaging.distribution.light.constraint == "affine"
+    assert made.imaging.distribution.factor("illumination").constraint == "affine"
     outer = made.loop.outer
     assert (outer.epochs, outer.start, outer.train_first, outer.final_step) == (2, "previous", True, 1.0)
     assert (outer.curvature_images, outer.pool_per_bin, outer.on_untrusted) == (0, 0, "keep")
     assert outer.images_per_object == (6 if scale == "smoke" else 50)
-    assert isinstance(outer.update, SGD) and (outer.update.momentum, outer.update.max_step) == (0.9, None)
-    assert isinstance(outer.light_update, PlainProjectedGradient) and outer.light_update.momentum == 0.9
+    for update in (outer.update, outer.light_update):
+        assert isinstance(update, SGD) and (update.momentum, update.max_step) == (0.9, None)
 
 
-@pytest.mark.parametrize("key", ["max_step", "shrink"])
-def test_the_plain_step_of_lights_knows_no_other_keys(key):
-    with pytest.raises(UserError, match=f"outer.light_update.{key}: unknown key"):
-        experiment("baseline=neural_sim_paper", f"+outer.light_update.{key}=1")
+@pytest.mark.parametrize("key", ["update", "light_update"])
+def test_a_bad_step_is_refused_with_its_place(key):
+    with pytest.raises(UserError, match=f"outer.{key}: learning_rate must be positive, got 0"):
+        experiment(f"outer.{key}.learning_rate=0")
 
 
 def test_lights_are_explored_where_a_method_scores_its_draws_alone():

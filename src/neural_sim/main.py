@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 import typing
 import warnings
@@ -133,10 +134,10 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     except ValueError as error:
         raise UserError(_first_line(error)) from error
     rig = parts["views"].rig
-    if made.light is not None and (rig is None or rig.anchors != made.light.anchors):
+    if made.lights and (rig is None or rig.anchors != made.lights):
         lights = "one fixed light" if rig is None else f"{rig.anchors} anchor lights"
         raise UserError(
-            f"parameter.illumination: want renderer=nerf_w with {made.light.anchors} anchors, got {lights}"
+            f"parameter.illumination: want renderer=nerf_w with {made.lights} anchors, got {lights}"
         )
     return made
 
@@ -180,6 +181,8 @@ def _instantiate(node: Any, where: str) -> Any:
         return hydra.utils.instantiate(dict(node), _convert_="all")
     except Exception as error:  # Hydra wraps whatever the constructor raised
         cause = error.__cause__ or error
+        inner = re.search(r"^full_key: (\S+)", str(error), re.MULTILINE)
+        where = f"{where}.{inner[1]}" if inner else where
         if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
             raise UserError(f"{where}: {_first_line(cause)}") from error
         raise

@@ -18,7 +18,6 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.illumination import Illumination
-from neural_sim.parameter.light_update import ProjectedGradient
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
@@ -145,7 +144,7 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
     detector = Detector(2, 32, **DETECTOR)
     validation = join(scene.training_set(start.float(), 3, generator, HARD))
-    light_update = ProjectedGradient(shrink=False)
+    light_update = Mirror(0.6, max_step=1.0, shrink=False)
     settings = Outer(
         Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update,
         train_first=adjoint == "unrolled", adjoint=adjoint,

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution, Unlearned
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.types import SceneDraw
 

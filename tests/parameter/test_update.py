@@ -168,5 +168,5 @@ def test_mirror_goes_on_after_a_cliff():
                                   lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0),
                                   lambda: SGD(max_step=0.0)])  # fmt: skip
 def test_bad_settings_are_refused(make):
-    with pytest.raises(ValueError, match=r"outer\.update"):
+    with pytest.raises(ValueError, match=r"^(learning_rate|beta1|momentum|max_step) must "):
         make()

@@ -11,7 +11,8 @@ from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import normalise
 from neural_sim.objects.procedural import Procedural
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution, Unlearned
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.target.symmetry import equivalent_bins

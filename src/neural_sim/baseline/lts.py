@@ -88,11 +88,9 @@ class Policy:
         # A sum of n scores has a spread of sqrt(n): taken out, so that the rate is in logits.
         size = max(len(draws[0]), 1) ** 0.5
         step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)
-        moved = {name: bound(part, self._settings.max_step) for name, part in step.items()}
-        light = self._distribution.light
-        if light is not None:
-            # A Gaussian's score is in units of one over its deviation, and a step of that size is one of exploration.
-            moved[light.name] = bound(light.deviation**2 * step[light.name], light.deviation)
+        moved = {
+            f.name: bound(*f.reach(step[f.name], self._settings.max_step)) for f in self._distribution.factors
+        }
         self._psi = self._distribution.constrained(self._psi + self._distribution.join(moved))
 
     def _advantage(self, reward: float) -> float:

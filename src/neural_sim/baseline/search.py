@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.baseline.base import Draws, positive
-from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
 
 
@@ -75,7 +74,7 @@ class _Random(Incumbent):
             empty = torch.empty(len(self.psi), factor.size, dtype=torch.float64)
             spacings = empty.exponential_(generator=self._generator)
             p = spacings / spacings.sum(-1, keepdim=True)
-            parts[factor.name] = factor.logits(p) if isinstance(factor, BinnedFactor) else p
+            parts[factor.name] = factor.psi_of(p)
         return self._distribution.join(parts).to(self.psi)
 
 

@@ -17,10 +17,8 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
-from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.parameter.product import Factor, SceneDistribution
+from neural_sim.parameter.factor import Factor
 from neural_sim.synthesis.scene import HardDraws
-from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class ReinforceEstimator:
         def log_prob(psi: Tensor) -> Tensor:
             return images.distribution.log_prob(psi, images.draw)
 
-        drawn = _drawn(images.distribution, images.draw)
+        drawn = images.distribution.statistics(images.draw)
         p_values = {name: no_association(along, values) for name, values in drawn.items()}
         return replace(reinforce(along, log_prob, images.psi, share), p_values=p_values)
 
@@ -141,19 +139,9 @@ class ReinforceEstimator:
 def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
     """p-value of the null that all bins, or all lights, have one mean score; the same scenes are seen under one light
     after the other."""
-    if isinstance(factor, BinnedFactor):
-        return no_association(scores, one_hot(strata, factor.size))
-    return no_difference(scores.view(factor.size, -1).T)
-
-
-def _drawn(distribution: SceneDistribution, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
-    """What each factor drew, as the sufficient statistics of its psi: the bin as a row of zeros and a one, or the light
-    as it was before its projection, apart from what the constraint takes back."""
-    found = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(distribution.binned)}
-    light, explored = distribution.light, draw.explored
-    if light is not None and explored is not None:
-        found[light.name] = explored - explored.mean(-1, keepdim=True)
-    return found
+    if factor.same_scenes:
+        return no_difference(scores.view(factor.size, -1).T)
+    return no_association(scores, one_hot(strata, factor.size))
 
 
 Estimator = PathwiseEstimator | StratifiedEstimator | ReinforceEstimator

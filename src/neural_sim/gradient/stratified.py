@@ -16,8 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import MixedDerivative
-from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.parameter.product import Factor
+from neural_sim.parameter.factor import Factor
 
 logger = logging.getLogger(__name__)
 LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
@@ -97,9 +96,9 @@ def by_strata(
 ) -> MixedDerivative:
     """The derivative by one factor's psi from the scores of its probes, by :func:`stratified`; for lights what stands
     for it, :func:`across_lights`."""
-    if isinstance(factor, BinnedFactor):
-        return stratified(scores, strata, psi, factor.log_probabilities, share)
-    return across_lights(scores, factor.size, share)
+    if factor.same_scenes:
+        return across_lights(scores, factor.size, share)
+    return stratified(scores, strata, psi, factor.log_probabilities, share)
 
 
 def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -> MixedDerivative:

@@ -34,7 +34,7 @@ def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterat
 
 def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
     """Whether images come from a pool: where none is differentiated and the light does not move."""
-    return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and distribution.light is None
+    return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
 class InnerLoop:

@@ -20,9 +20,8 @@ from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.retrained import Check, as_double, binned_problem, check
 from neural_sim.outer.unrolling import through_training
-from neural_sim.parameter.illumination import Illumination
-from neural_sim.parameter.product import Factor
-from neural_sim.parameter.update import UpdateState
+from neural_sim.parameter.factor import Factor
+from neural_sim.parameter.update import Update, UpdateState
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
@@ -108,10 +107,10 @@ class SimulatorModule(OuterLoop):
     def _step(
         self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """One factor's step: in logits of bins, or in weights of lights."""
-        if isinstance(factor, Illumination):
-            return self.settings.light_update.step(psi, slope, noise, state, factor.project)
-        return self.settings.update.step(psi, factor.log_probabilities(psi), slope, noise, state)
+        """One factor's step: in logits of bins, or in weights of lights, which stay on their constraint."""
+        update: Update = getattr(self.settings, factor.update)
+        moved, after = update.step(psi, factor.log_probabilities(psi), slope, noise, state)
+        return factor.project(moved), after
 
     def _hypergradient(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import Detector, Parameters
 from neural_sim.gradient.base import Probes
-from neural_sim.parameter.product import Factor, SceneDistribution
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RenderedObject, Scene, join
-from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,7 @@ class ProbeSet:
             for factor in scene.distribution.factors:
                 part = source.probes(label, factor.name, per_bin, psi[label], generator)
                 index = torch.arange(first, first + len(part.images))
-                probes[label][factor.name] = Probes(
-                    index, _strata(scene.distribution, factor, part.draw, per_bin)
-                )
+                probes[label][factor.name] = Probes(index, factor.stratum_of(part.draw))
                 first += len(index)
                 drawn.append(part)
         return ProbeSet(probes, CachedSet.of(detector, backbone, join(drawn)), per_bin)
@@ -77,12 +73,3 @@ class ProbeSet:
                 sources.append(new[name].index)
         cached = self.cached.replaced(torch.cat(targets), fresh.cached.select(torch.cat(sources)))
         return ProbeSet(probes, cached, self.per_bin)
-
-
-def _strata(
-    distribution: SceneDistribution, factor: Factor, draw: SceneDraw, per_bin: int
-) -> Int[Tensor, "n"]:
-    """The bins of a factor that its probes lie in; of an illumination, the lights that they are under."""
-    if factor not in distribution.binned:
-        return torch.arange(factor.size).repeat_interleave(per_bin)
-    return distribution.bins_of(draw)[:, distribution.binned.index(factor)]

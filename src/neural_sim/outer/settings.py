@@ -8,8 +8,7 @@ from typing import Literal, get_args
 from neural_sim.checks import at_least
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.significance import SMALLEST
-from neural_sim.parameter.light_update import LightUpdate, ProjectedGradient
-from neural_sim.parameter.update import Update
+from neural_sim.parameter.update import Mirror, Update
 from neural_sim.renderer.nerf import Quality
 
 Start = Literal["previous", "warm", "fresh"]
@@ -98,7 +97,7 @@ class Outer:
     trust: Trust = field(default_factory=Trust)
     on_untrusted: OnUntrusted = "shrink"
     learned: tuple[str, ...] | None = None
-    light_update: LightUpdate = field(default_factory=ProjectedGradient)
+    light_update: Update = field(default_factory=lambda: Mirror(learning_rate=0.6, max_step=1.0))
     certify_every: int = 0
     certify_per_bin: int = 1
 

@@ -18,8 +18,7 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.stratified import by_strata
 from neural_sim.outer.binding import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
-from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.parameter.product import Factor
+from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.flatten import unflatten
 from neural_sim.synthesis.scene import Scene, join
@@ -81,9 +80,9 @@ class StillLoop:
     @property
     def bins(self) -> BinnedFactor:
         """The only factor, which must have bins. Raises ``ValueError`` for another."""
-        if not isinstance(self.factor, BinnedFactor):
+        if (self.factor,) != self.scene.distribution.binned:
             raise ValueError(f"parameter: want one parameter with bins, got {self.factor.name}")
-        return self.factor
+        return self.scene.distribution.binned[0]
 
     def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
         """``per_bin`` images of every bin of every object."""

@@ -1,19 +1,21 @@
-"""One factor of p_psi: log p over equal bins of one number of the scene, uniform within each bin."""
+"""Factors of p_psi: what all have in common, and log p over equal bins of one number of the scene."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
+COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
 """The numbers of a :class:`SceneDraw` that images depend on smoothly."""
 Gap = Literal["disjoint", "uniform", "same"]
 Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
@@ -55,6 +57,43 @@ class Beliefs:
         return own.get(which, self.initial if which == "initial" else self.target)
 
 
+class Factor(Protocol):
+    """One factor of p_psi: its part of psi, and what the loop, the estimators and the methods ask of it.
+
+    Its strata, as many as numbers of psi (``size``), are its bins or the lights that it weighs. ``update`` is the
+    setting of the psi loop that steps it. ``lights`` is how many anchor lights it weighs: where there are any, images
+    themselves change with psi, not only how often each is drawn. ``same_scenes``: the probes of all strata see the same
+    scenes. ``drawn`` is what hard draws of given ``p`` depend on.
+
+    ``psi`` is the configured ``initial`` or ``target`` psi of an object, in float64; ``psi_of`` the one that gives
+    probabilities of bins or weights of lights, and ``p_of`` its inverse. ``log_probabilities`` are 0 where psi is what
+    is rendered, and steps are Euclidean; ``project`` gives the nearest psi that meets the factor's constraint.
+    ``stratum_of`` are the strata that probes lie in. ``reach`` gives a score in the units of psi's steps, and the
+    largest step, to a method that steps by ``step`` logits.
+    """
+
+    update: ClassVar[str]
+    same_scenes: ClassVar[bool]
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def lights(self) -> int: ...
+    @property
+    def beliefs(self) -> Beliefs: ...
+    @property
+    def drawn(self) -> dict[str, Any]: ...
+    def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]: ...
+    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
+    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
+
+
 @dataclass(frozen=True)
 class BinnedFactor:
     """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
@@ -73,6 +112,8 @@ class BinnedFactor:
         ValueError: any of these out of its range, with the key and the value.
     """
 
+    update: ClassVar[str] = "update"
+    same_scenes: ClassVar[bool] = False
     name: str
     coordinate: Coordinate
     bins: int
@@ -116,6 +157,11 @@ class BinnedFactor:
         """How many numbers of psi an object has here."""
         return self.bins
 
+    @property
+    def lights(self) -> int:
+        """None: images are under one fixed light as far as this factor goes."""
+        return 0
+
     def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The configured ``initial`` or ``target`` distribution of one object."""
         where = f"parameter.{self.name}.{which} of {object_name}"
@@ -123,15 +169,31 @@ class BinnedFactor:
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The logits that give :meth:`probabilities`."""
-        return self.logits(self.probabilities(which, object_name))
+        return self.psi_of(self.probabilities(which, object_name))
 
-    def logits(self, probabilities: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """psi that gives ``probabilities``."""
-        return binned.logits(probabilities, self.floor)
+    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """The logits that give the probabilities ``p``."""
+        return binned.logits(p, self.floor)
+
+    def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """The probabilities of the bins."""
+        return self.log_probabilities(psi).exp()
 
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """log p over the bins, floored."""
         return binned.log_probabilities(psi, self.floor)
+
+    def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """psi itself: all logits are allowed."""
+        return psi
+
+    def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
+        """The bin that each draw lies in, whatever bin it was drawn for."""
+        return self.bin_of(getattr(draw, self.coordinate))
+
+    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
+        """The score itself, by ``step`` logits at most."""
+        return score, step
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
         """Exact samples of the bins by the Gumbel-max trick; no derivative reaches psi."""

@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.parameter.distributions import Specification, distribution
 from neural_sim.parameter.factor import Beliefs, Gap
 from neural_sim.parameter.simplex import project_simplex, project_sum
+from neural_sim.types import SceneDraw
 
 Constraint = Literal["simplex", "affine"]
 
@@ -47,6 +48,8 @@ class Illumination:
         ValueError: any of these out of its range, with the key and the value.
     """
 
+    update: ClassVar[str] = "light_update"
+    same_scenes: ClassVar[bool] = True
     anchors: int = 6
     constraint: Constraint = "simplex"
     deviation: float = 0.1
@@ -67,8 +70,8 @@ class Illumination:
         if self.gap not in get_args(Gap):
             raise ValueError(f"parameter.illumination.gap must be one of {get_args(Gap)}, got {self.gap!r}")
         for name in ("", *(self.biased or {})):  # what is wrong with a specification is said before any stage
-            self.weights("initial", name)
-            self.weights("target", name)
+            self.psi("initial", name)
+            self.psi("target", name)
 
     @property
     def name(self) -> str:
@@ -83,6 +86,11 @@ class Illumination:
     @property
     def size(self) -> int:
         """How many numbers of psi an object has here."""
+        return self.anchors
+
+    @property
+    def lights(self) -> int:
+        """The anchor lights that psi weighs."""
         return self.anchors
 
     @property
@@ -101,11 +109,7 @@ class Illumination:
         return Beliefs(self.initial, self.target, self.biased, self.gap)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """psi are the weights themselves."""
-        return self.weights(which, object_name)
-
-    def weights(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """The configured ``initial`` or ``target`` weights of one object, float64. They are psi itself."""
+        """The configured ``initial`` or ``target`` weights of one object, float64: they are psi itself."""
         specification = self.beliefs.of(which, object_name)
         where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
         numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
@@ -113,9 +117,31 @@ class Illumination:
             return _affine_numbers(specification, self.anchors, where)
         return distribution(specification, self.anchors, where)
 
-    def project(self, values: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """The weights themselves."""
+        return p
+
+    def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """psi itself."""
+        return psi
+
+    def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """0: nothing is drawn, and the metric of a step is the Euclidean one."""
+        return torch.zeros_like(psi)
+
+    def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
-        return project_simplex(values) if self.constraint == "simplex" else project_sum(values)
+        return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
+
+    def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
+        """The anchor light of the largest weight. Raises ``ValueError`` for draws under the fixed light."""
+        if draw.weights is None:
+            raise ValueError("parameter.illumination: want draws under weighed lights, got the fixed one")
+        return draw.weights.argmax(-1)
+
+    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
+        """A Gaussian's score is in units of one over its deviation; a step of that size is one of exploration."""
+        return self.deviation**2 * score, self.deviation
 
     def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
         """Every image's weights: psi itself, nothing is random. Differentiable in psi."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -10,18 +9,14 @@ from typing import Any, Protocol
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
-from neural_sim.parameter.factor import BinnedFactor, BinNoise, Coordinate, Relaxation
+from neural_sim.parameter.factor import COORDINATES, BinnedFactor, BinNoise, Factor, Relaxation
 from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.types import SceneDraw
-
-COORDINATES: tuple[Coordinate, ...] = ("phi", "rho", "distance", "magnification")
-"""The numbers of a :class:`SceneDraw` that images depend on smoothly."""
-
-
-Factor = BinnedFactor | Illumination
 
 
 class Parameter(Protocol):
@@ -32,33 +27,6 @@ class Parameter(Protocol):
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]: ...
-
-
-@dataclass(frozen=True)
-class Unlearned:
-    """Ranges of numbers that no parameter of a run draws: angles in degrees, the distance in object radii.
-
-    Raises:
-        ValueError: a range that is not ordered, a distance within the object.
-    """
-
-    phi_deg: tuple[float, float] = (0.0, 360.0)
-    rho_deg: tuple[float, float] = (-45.0, 45.0)
-    distance: tuple[float, float] = (2.4, 4.0)
-
-    def __post_init__(self) -> None:
-        for name in ("phi_deg", "rho_deg", "distance"):
-            low, high = getattr(self, name)
-            if not low <= high:
-                raise ValueError(f"unlearned.{name} must be ordered, got {[low, high]}")
-        if not self.distance[0] > 1.0:
-            raise ValueError(f"unlearned.distance must be above 1 radius, got {list(self.distance)}")
-
-    @property
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """By coordinate, in radians and radii."""
-        phi, rho = ((math.radians(r[0]), math.radians(r[1])) for r in (self.phi_deg, self.rho_deg))
-        return {"phi": phi, "rho": rho, "distance": self.distance, "magnification": (1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -112,9 +80,17 @@ class SceneDistribution:
         return tuple(factor for factor in self.factors if isinstance(factor, BinnedFactor))
 
     @property
-    def light(self) -> Illumination | None:
-        """The factor that weighs lights, if there is one."""
+    def lights(self) -> int:
+        """How many anchor lights psi weighs; 0 where images are under one fixed light."""
+        return sum(factor.lights for factor in self.factors)
+
+    @property
+    def _light(self) -> Illumination | None:
         return next((factor for factor in self.factors if isinstance(factor, Illumination)), None)
+
+    def factor(self, name: str) -> Factor:
+        """A factor by its name."""
+        return self.factors[self.names.index(name)]
 
     @property
     def drawn(self) -> dict[str, Any]:
@@ -151,7 +127,7 @@ class SceneDistribution:
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
         """Every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
-        return parts | {f.name: f.log_probabilities(parts[f.name]).exp() for f in self.binned}
+        return {f.name: f.p_of(parts[f.name]) for f in self.factors}
 
     def digest_of(self, psi: Float[Tensor, "objects K"]) -> str:
         """Digest of the probabilities and weights that psi gives, to 12 digits after the point."""
@@ -159,11 +135,9 @@ class SceneDistribution:
         return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
     def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
-        """psi with the weights of lights brought back to their constraint."""
-        if self.light is None:
-            return psi
+        """psi with every factor's part brought back to its constraint."""
         parts = self.split(psi)
-        return self.join(parts | {self.light.name: self.light.project(parts[self.light.name])})
+        return self.join({f.name: f.project(parts[f.name]) for f in self.factors})
 
     @property
     def biased(self) -> tuple[str, ...]:
@@ -188,15 +162,16 @@ class SceneDistribution:
         ``ValueError`` for an odd number of antithetic draws.
         """
         gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.binned}
-        drawn = [c for c in COORDINATES if c != "magnification" or self._binned(c)]
+        learned = {f.coordinate for f in self.binned}
+        drawn = [c for c in COORDINATES if c != "magnification" or c in learned]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
         noise = {
             f.name: BinNoise(gumbel[f.name], _exponential(n, conditional, f.bins, generator, dtype))
             for f in self.binned
         }
         light = None
-        if explore and self.light is not None:
-            light = torch.randn((n, self.light.size), generator=generator, dtype=torch.float64).to(dtype)
+        if explore and self.lights:
+            light = torch.randn((n, self.lights), generator=generator, dtype=torch.float64).to(dtype)
         return SceneNoise(noise, dict(zip(drawn, uniform, strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
@@ -214,12 +189,12 @@ class SceneDistribution:
         self, draw: SceneDraw, psi: Float[Tensor, "K"], noise: Float[Tensor, "n k"] | None = None
     ) -> SceneDraw:
         """``draw`` under psi's light, differentiable in psi; with ``noise`` under lights around it, which are not."""
-        if self.light is None:
+        if self._light is None:
             return draw
-        weights = self.split(psi)[self.light.name]
+        weights = self.split(psi)[self._light.name]
         if noise is None:
-            return replace(draw, weights=self.light.draw(weights, len(draw)))
-        drawn = self.light.explore(weights, noise)
+            return replace(draw, weights=self._light.draw(weights, len(draw)))
+        drawn = self._light.explore(weights, noise)
         return replace(draw, weights=drawn.weights, explored=drawn.unprojected)
 
     def relaxed(
@@ -233,6 +208,20 @@ class SceneDistribution:
                 parts[f.name], noise.bins[f.name], within, relaxation
             )
         return self.lit(self._draw(placed, bins, noise), psi)
+
+    def probes(
+        self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
+    ) -> tuple[SceneDraw, Int[Tensor, "n"]]:
+        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi; and the number of
+        each draw's scene, which strata may share."""
+        factor = self.factor(name)
+        strata = torch.arange(factor.size).repeat_interleave(each)
+        if not factor.same_scenes:
+            scenes = torch.arange(len(strata))
+            return self.stratum(name, strata, psi, self.draw_noise(len(strata), generator, dtype)), scenes
+        scenes = torch.arange(each).repeat(factor.size)
+        draw = self.hard(psi, self.draw_noise(each, generator, dtype)).select(scenes)
+        return replace(draw, weights=torch.eye(factor.size, dtype=psi.dtype)[strata]), scenes
 
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise
@@ -250,23 +239,28 @@ class SceneDistribution:
         """
         parts = self.split(psi)
         logs = [f.log_probabilities(parts[f.name])[draw.bins[:, i]] for i, f in enumerate(self.binned)]
-        if self.light is not None:
+        if self._light is not None:
             if draw.explored is None:
                 raise ValueError("parameter.illumination: these lights were not drawn, they have no density")
-            logs.append(self.light.log_prob(parts[self.light.name], draw.explored))
+            logs.append(self._light.log_prob(parts[self._light.name], draw.explored))
         return torch.stack(logs).sum(0)
+
+    def statistics(self, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
+        """What each factor drew, as the sufficient statistics of its psi: the bin as a row of zeros and a one, or the
+        light as it was before its projection, apart from what the constraint takes back; none of a light not drawn."""
+        found = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
+        if self._light is not None and draw.explored is not None:
+            found[self._light.name] = draw.explored - draw.explored.mean(-1, keepdim=True)
+        return found
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
         """The bins that each draw lies in, whatever bins it was drawn for; a column for each binned factor."""
-        return _columns([f.bin_of(getattr(draw, f.coordinate)) for f in self.binned], draw.phi)
+        return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
     def label_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The first binned factor's bin, for reports; -1 where nothing is binned."""
         found = self.bins_of(draw)
         return found[:, 0] if found.shape[1] else torch.full((len(draw),), -1)
-
-    def _binned(self, coordinate: Coordinate) -> bool:
-        return any(f.coordinate == coordinate for f in self.binned)
 
     def _draw(
         self,

@@ -1,4 +1,9 @@
-"""Steps of psi from a hypergradient in logits, bounded so that one noisy gradient cannot collapse p."""
+"""Steps of psi from a hypergradient, bounded so that one noisy gradient cannot collapse p.
+
+Of bins psi are logits and ``log_p`` their log probabilities. Of lights psi are weights and ``log_p`` is 0: the metric
+of each step is then the Euclidean one, ``learning_rate`` and ``max_step`` are in weights, and the factor's ``project``
+brings what a step gives back to the constraint (projected gradient descent, paper, Sec. 3.2).
+"""
 
 from __future__ import annotations
 
@@ -33,17 +38,15 @@ class UpdateState:
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
-def check_rates(
-    learning_rate: float, max_step: float | None, where: str = "outer.update", **rates: float
-) -> None:
-    """Raises ``ValueError`` for a setting out of its range, with its key in the node ``where``."""
+def check_rates(learning_rate: float, max_step: float | None, **rates: float) -> None:
+    """Raises ``ValueError`` for a setting out of its range, with its key."""
     if not learning_rate > 0.0:
-        raise ValueError(f"{where}.learning_rate must be positive, got {learning_rate}")
+        raise ValueError(f"learning_rate must be positive, got {learning_rate}")
     if max_step is not None and not max_step > 0.0:
-        raise ValueError(f"{where}.max_step must be positive, got {max_step}")
+        raise ValueError(f"max_step must be positive, got {max_step}")
     for name, rate in rates.items():
         if not 0.0 <= rate < 1.0:
-            raise ValueError(f"{where}.{name} must lie in [0, 1), got {rate}")
+            raise ValueError(f"{name} must lie in [0, 1), got {rate}")
 
 
 def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:

@@ -33,7 +33,7 @@ def _fields(x: Experiment) -> Iterator[Omission]:
                 "view-dependent colour",
                 "one fixed light on matt surfaces looks the same from all sides",
             )
-    if x.imaging.distribution.light is None:
+    if not x.imaging.distribution.lights:
         yield Omission("field", "appearance codes", "no parameter moves the light")
 
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from neural_sim import cameras
 from neural_sim.field.grid import GridField
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution, SceneNoise, Unlearned
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stress.cases import Check, Checks, Scope, case, eps
 from neural_sim.stress.rendering import EXACT, SINGLE, block, chord, opacity_of, raw_density

@@ -64,7 +64,7 @@ def one_hot(scope: Scope) -> Checks:
         leaf = psi.clone().requires_grad_()
         (slope,) = torch.autograd.grad(pose.log_probabilities(leaf).exp().square().sum(), leaf)
         yield Check(f"dp/dpsi, {_name(dtype)}", float(slope.abs().max()), 8 * eps(dtype))
-    back = pose.log_probabilities(pose.logits(torch.eye(8, dtype=torch.float64)[2])).exp()
+    back = pose.log_probabilities(pose.psi_of(torch.eye(8, dtype=torch.float64)[2])).exp()
     # logits() raises zeros to 1e-6, which the normalisation shares out
     yield Check("logits of a one-hot p", float((back - torch.eye(8)[2]).abs().max()), 7.1e-6)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim import cameras
-from neural_sim.parameter.product import COORDINATES
+from neural_sim.parameter.factor import COORDINATES
 from neural_sim.types import SceneDraw
 
 RIGID = ("phi", "rho", "distance")

@@ -52,7 +52,7 @@ class ImagePool:
         """
         if per_bin < 1:
             raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
-        if scene.distribution.light is not None:
+        if scene.distribution.lights:
             raise ValueError("outer.pool_per_bin: images under a light that moves are no pool's, want 0")
         factors = scene.distribution.binned
         cells, per_cell = pool_cells(factors, per_bin)
@@ -79,8 +79,7 @@ class ImagePool:
     ) -> RenderedObject:
         """``per_bin`` images of every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
         distribution = self.scene.distribution
-        size = next(f.bins for f in distribution.binned if f.name == factor)
-        bins = torch.arange(size).repeat_interleave(per_bin)
+        bins = torch.arange(distribution.factor(factor).size).repeat_interleave(per_bin)
         if len(distribution.binned) == 1:
             return self._compose(label, bins[:, None], generator)
         noise = distribution.draw_noise(len(bins), generator)

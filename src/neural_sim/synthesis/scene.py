@@ -201,9 +201,9 @@ class Scene:
         with torch.no_grad():
             draw = replay(logits)
         names = moved_by(replay, logits) if relaxed.tangents else ()
-        lit = self.distribution.light is not None
+        moving = names or draw.weights is not None
         maps, tangents = (
-            self._maps_with_tangents(label, draw, names) if names or lit else (self._maps(label, draw), None)
+            self._maps_with_tangents(label, draw, names) if moving else (self._maps(label, draw), None)
         )
         shared = 2 if relaxed.common_backgrounds else 1
         nuisance = self._nuisance(label, count // shared, generator)
@@ -230,23 +230,9 @@ class Scene:
         Of an illumination the anchor lights take the place of bins, and the same ``per_bin`` poses and backgrounds are
         seen under each.
         """
-        light, logits = self.distribution.light, psi.detach().to(self.dtype(label))
-        if light is not None and factor == light.name:
-            return self._under_each_light(label, light.size, per_bin, logits, generator)
-        size = next(f.size for f in self.distribution.factors if f.name == factor)
-        bins = torch.arange(size).repeat_interleave(per_bin)
-        noise = self.distribution.draw_noise(len(bins), generator, self.dtype(label))
-        return self.render(label, self.distribution.stratum(factor, bins, logits, noise), noise, generator)
-
-    def _under_each_light(
-        self, label: int, lights: int, count: int, logits: Tensor, generator: torch.Generator
-    ) -> RenderedObject:
-        noise = self.distribution.draw_noise(count, generator, self.dtype(label))
-        again = torch.arange(count).repeat(lights)
-        draw = self.distribution.hard(logits, noise).select(again)
-        alone = torch.eye(lights, dtype=logits.dtype).repeat_interleave(count, 0)
-        draw = replace(draw, weights=alone)
-        nuisance = self._nuisance(label, count, generator).select(again)
+        dtype = self.dtype(label)
+        draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
+        nuisance = self._nuisance(label, int(scenes.max()) + 1, generator).select(scenes)
         return self._compose(label, draw, None, self._maps(label, draw), nuisance)
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from neural_sim.cameras import orbit
 from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.parameter.factor import BinNoise
-from neural_sim.parameter.product import COORDINATES, SceneDistribution, SceneNoise
+from neural_sim.parameter.factor import COORDINATES, BinNoise
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.types import PinholeCamera, SceneDraw
 
