@@ -28,7 +28,7 @@ from torch.profiler import ProfilerActivity, profile
 from neural_sim import cameras
 from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
-from neural_sim.field.training import load_field, save_field
+from neural_sim.field.training import field_from_state, field_state
 from neural_sim.gradient.pathwise import contract, patch_rays
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import RIGID, pose_rates
@@ -190,9 +190,9 @@ def main() -> None:
         item = load_objects(arguments.root, arguments.names)[0]
         fitted, _ = fit(training_views(item, 128, 100), arguments.steps, 0, arguments.device)
         if arguments.field is not None:
-            save_field(fitted, arguments.field)
+            torch.save(field_state(fitted), arguments.field)
     else:
-        fitted = load_field(arguments.field)
+        fitted = field_from_state(torch.load(arguments.field, weights_only=True))
     renderer = NerfRenderer(arguments.quality)
     asked = [(size, 1) for size in arguments.sizes]
     asked += [
