@@ -28,8 +28,8 @@ from torch.profiler import ProfilerActivity, profile
 from neural_sim import cameras
 from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
-from neural_sim.field.training import load_field, save_field
-from neural_sim.gradient.pathwise import contract, patch_rays
+from neural_sim.field.training import field_from_state, field_state
+from neural_sim.gradient.pathwise import contract
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -87,7 +87,7 @@ def reverse(of: Case, patch: int) -> Tensor:
     for pixels in torch.arange(len(opacity), device=of.pose.device).split(patch):
         numbers = torch.zeros_like(total, requires_grad=True)
         pose = of.pose + torch.einsum("m,mnij->nij", numbers, of.rates)
-        rays = patch_rays(of.camera, pose, pixels)
+        rays = cameras.pixel_rays(of.camera, pose, pixels)
         # Most of these matrices are no rotations; the renderer's tangents keep directions of unit length.
         rays = Rays(rays.origins, torch.nn.functional.normalize(rays.directions, dim=-1))
         rendered = of.renderer.render_rays(of.field, rays)
@@ -190,9 +190,9 @@ def main() -> None:
         item = load_objects(arguments.root, arguments.names)[0]
         fitted, _ = fit(training_views(item, 128, 100), arguments.steps, 0, arguments.device)
         if arguments.field is not None:
-            save_field(fitted, arguments.field)
+            torch.save(field_state(fitted), arguments.field)
     else:
-        fitted = load_field(arguments.field)
+        fitted = field_from_state(torch.load(arguments.field, weights_only=True))
     renderer = NerfRenderer(arguments.quality)
     asked = [(size, 1) for size in arguments.sizes]
     asked += [

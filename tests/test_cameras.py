@@ -57,6 +57,20 @@ def test_corner_ray_has_half_the_field_of_view():
     assert math.atan(32 / focal) == pytest.approx(math.radians(20.0))
 
 
+def test_rays_of_single_pixels_by_hand():
+    """Column 2, row 0 of the second view, at one and a half times the focal length; a rotation of the pixel's ray."""
+    camera = PinholeCamera(5, 4, math.radians(50.0))
+    poses = torch.stack([_pose(0.4), _pose(1.1, rho=0.2, distance=2.0)])
+    found = cameras.pixel_rays(camera, poses, torch.tensor([4 * 5 + 2, 3]), torch.tensor([1.0, 1.5]))
+    focal = 1.5 * 2.0 / math.tan(math.radians(25.0))
+    local = torch.tensor([0.0, 1.5 / focal, -1.0], dtype=torch.float64)
+    expected = poses[1, :3, :3] @ (local / local.norm())
+    torch.testing.assert_close(found.directions[0], expected, atol=1e-15, rtol=0.0)
+    assert torch.equal(found.origins[0], poses[1, :3, 3])
+    own = cameras.rays(cameras.magnified(camera, 1.0), poses[0])
+    torch.testing.assert_close(found.directions[1], own.directions[0, 3], atol=1e-15, rtol=0.0)
+
+
 def test_sphere_span_hits_misses_and_starts_inside():
     camera = PinholeCamera(33, 33, math.radians(60.0))
     bundle = cameras.rays(camera, _pose(0.3))

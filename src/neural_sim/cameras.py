@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.types import PinholeCamera, Rays
@@ -44,24 +44,61 @@ def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
     )
 
 
-def pixel_directions(
-    camera: PinholeCamera, *, dtype: torch.dtype, device: torch.device
-) -> Float[Tensor, "height width 3"]:
-    """Unit directions of the pixel centres in the camera's own frame; row 0 is the top of the image."""
-    focal = focal_length(camera)
-    x = (torch.arange(camera.width, dtype=dtype, device=device) + 0.5 - 0.5 * camera.width) / focal
-    y = (torch.arange(camera.height, dtype=dtype, device=device) + 0.5 - 0.5 * camera.height) / focal
-    rows, columns = torch.meshgrid(-y, x, indexing="ij")
-    directions = torch.stack([columns, rows, -torch.ones_like(rows)], -1)
-    return directions / directions.norm(dim=-1, keepdim=True)
+def cameras_of(
+    camera: PinholeCamera, magnification: Float[Tensor, "n"] | None
+) -> list[tuple[PinholeCamera, slice]]:
+    """Cameras and the images each takes: one takes all, but every focal length (in units of the camera's own) is a
+    camera of its own."""
+    if magnification is None:
+        return [(camera, slice(None))]
+    return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(magnification.tolist())]
+
+
+def pixel_rays(
+    camera: PinholeCamera,
+    camera_to_world: Float[Tensor, "*m views 4 4"],
+    pixel: Int[Tensor, "rays"],
+    magnification: Float[Tensor, "views"] | None = None,
+) -> Rays:
+    """Rays (*m, rays, 3) through the centres of the pixels with the given flat indices into [views, height, width].
+
+    Row 0 is the top of the image. Linear in the poses, and differentiable in the views' focal lengths in units of the
+    camera's own. Values and derivatives are of one arithmetic: a sample that lands in another cell has another
+    derivative.
+    """
+    per_view, focal = camera.height * camera.width, focal_length(camera)
+    inside, view = pixel % per_view, torch.div(pixel, per_view, rounding_mode="floor")
+    row = torch.div(inside, camera.width, rounding_mode="floor")
+    x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
+    y = (row.to(camera_to_world.dtype) + 0.5 - 0.5 * camera.height) / focal
+    if magnification is not None:
+        x, y = x / magnification[view], y / magnification[view]
+    local = torch.stack([x, -y, -torch.ones_like(x)], -1)
+    local = local / local.norm(dim=-1, keepdim=True)
+    pose = camera_to_world.index_select(-3, view)
+    return Rays(pose[..., :3, 3], torch.einsum("...rij,rj->...ri", pose[..., :3, :3], local))
 
 
 def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Rays:
     """Rays through every pixel centre: shapes (*n, height, width, 3), differentiable in the pose."""
-    local = pixel_directions(camera, dtype=camera_to_world.dtype, device=camera_to_world.device)
-    rotation, position = camera_to_world[..., :3, :3], camera_to_world[..., :3, 3]
-    directions = torch.einsum("...ij,hwj->...hwi", rotation, local)
-    return Rays(position[..., None, None, :].expand_as(directions), directions)
+    poses = camera_to_world.reshape(-1, 4, 4)
+    count = len(poses) * camera.height * camera.width
+    bundle = pixel_rays(camera, poses, torch.arange(count, device=poses.device))
+    shape = (*camera_to_world.shape[:-2], camera.height, camera.width, 3)
+    return Rays(bundle.origins.view(shape), bundle.directions.view(shape))
+
+
+def ray_rates(
+    camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
+) -> Rays:
+    """Rates (*m, rays, 3) of these pixels' rays where the camera-to-world matrices move at ``rates``.
+
+    Directions stay of unit length: what a rate has along them is taken out (rounding for a camera that turns; for one
+    whose focal length changes it is the derivative of the normalisation).
+    """
+    moved = pixel_rays(camera, rates, pixel)
+    along = (moved.directions * rays.directions).sum(-1, keepdim=True)
+    return Rays(moved.origins, moved.directions - along * rays.directions)
 
 
 def unit_sphere_span(

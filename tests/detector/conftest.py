@@ -58,6 +58,13 @@ def noisy(params: dict[str, torch.Tensor], generator: torch.Generator) -> dict[s
     }
 
 
+@torch.no_grad()
+def mean_loss(detector: Detector, params: dict[str, torch.Tensor], images: LabelledImages) -> float:
+    backbone, trainable = detector.split(params)
+    targets = detector.assign(images.boxes, images.labels)
+    return float(detector.loss(trainable, detector.features(backbone, images.images), targets))
+
+
 @pytest.fixture
 def tools():
     """The helpers above; with importlib mode tests cannot import their conftest."""
@@ -67,5 +74,6 @@ def tools():
         images = staticmethod(make_images)
         double = staticmethod(as_double)
         noisy = staticmethod(noisy)
+        mean_loss = staticmethod(mean_loss)
 
     return Tools

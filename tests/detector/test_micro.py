@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.training import mean_loss, train_detector
+from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
 from neural_sim.solver.gauss_newton import GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator
@@ -33,7 +33,7 @@ def test_it_has_at_most_5000_parameters_and_learns(micro, tools, generator, size
     trained, _ = train_detector(
         detector, start, images, generator, epochs=60, batch_size=4, learning_rate=1e-2
     )
-    assert mean_loss(detector, trained, images) < 0.5 * mean_loss(detector, start, images)
+    assert tools.mean_loss(detector, trained, images) < 0.5 * tools.mean_loss(detector, start, images)
 
 
 def test_curvature_of_its_loss_is_smooth_and_split_at_the_outputs(micro, tools, generator, images):

@@ -6,7 +6,7 @@ from torchvision.models import resnet18
 
 from neural_sim.detector.cached import CachedSet, cached_features
 from neural_sim.detector.module import DetectorModule
-from neural_sim.detector.training import mean_loss, train_detector
+from neural_sim.detector.training import train_detector
 from neural_sim.types import LabelledImages
 
 
@@ -66,17 +66,8 @@ def test_training_overfits_a_few_images(tools, generator):
     images = tools.images(4, dtype=torch.float32)
     start = detector.init(generator)
     trained, history = train(detector, start, images, epochs=60, batch_size=4)
-    assert mean_loss(detector, trained, images) < 0.1 * mean_loss(detector, start, images)
+    assert tools.mean_loss(detector, trained, images) < 0.1 * tools.mean_loss(detector, start, images)
     assert history.losses[-1] < 0.2 * history.losses[0]
-
-
-def test_mean_loss_is_the_mean_over_images(tools, generator):
-    detector, images = tools.detector(), tools.images(5)
-    params = tools.noisy(detector.init(generator), generator)
-    backbone, trainable = detector.split(params)
-    targets = detector.assign(images.boxes, images.labels)
-    whole = detector.loss(trainable, detector.features(backbone, images.images), targets)
-    assert mean_loss(detector, params, images, batch_size=2) == pytest.approx(float(whole), rel=1e-10)
 
 
 def test_one_image_and_no_boxes_at_all(tools, generator, images):
@@ -98,8 +89,6 @@ def test_nothing_to_train_on_is_refused(tools, generator, images):
         train(detector, start, images.select(slice(0, 0)))
     with pytest.raises(ValueError, match="train_detector"):
         train(detector, start, images, epochs=0)
-    with pytest.raises(ValueError, match="mean_loss"):
-        mean_loss(detector, start, images.select(slice(0, 0)))
     with pytest.raises(ValueError, match="no images"):
         CachedSet.of(detector, detector.split(start)[0], images.select(slice(0, 0)))
     assert detector.predict(start, images.images[:0]) == []

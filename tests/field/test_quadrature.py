@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neural_sim.field.quadrature import alpha_from_sigma, composite, render_weights, sum_rays, transmittance
+from neural_sim.field.quadrature import alpha_from_sigma, composite, sum_rays, transmittance
 from neural_sim.field.samples import PackedSamples
 
 
@@ -42,27 +42,6 @@ def test_packed_rays_equal_a_loop_over_each_ray(generator: torch.Generator) -> N
         place += count
         torch.testing.assert_close(colour[ray], seen, atol=1e-12, rtol=0.0)
         assert opacity[ray].item() == pytest.approx(1.0 - light, abs=1e-12)
-
-
-def test_float32_keeps_late_rays_exact_behind_many_opaque_ones() -> None:
-    samples = pack([50] * 4000)
-    samples = PackedSamples(samples.ray, samples.distance.float(), samples.width.float(), samples.starts)
-    sigma = torch.full((len(samples),), 1e4)
-    sigma[-50:] = 0.01
-    weights = render_weights(sigma, samples)
-    assert weights[-50:].sum().item() == pytest.approx(1.0 - math.exp(-0.01 * 50 * 0.1), rel=1e-5)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_faint_ray_loses_nothing_to_rays_of_any_density_before_it(dtype: torch.dtype) -> None:
-    samples = pack([20] * 1001, width=0.0625)
-    samples = PackedSamples(samples.ray, samples.distance.to(dtype), samples.width.to(dtype), samples.starts)
-    sigma = torch.full((len(samples),), 1e8, dtype=dtype)
-    sigma[-20:] = 0.5
-    _, opacity = composite(sigma, torch.zeros(len(samples), 3, dtype=dtype), samples)
-    # N eps times the counted depth, at most 50 a sample, and the ray's own 20 samples
-    bound = len(samples) ** 2 * 50 * torch.finfo(torch.float64).eps + 28 * torch.finfo(dtype).eps
-    assert opacity[-1].item() == pytest.approx(1.0 - math.exp(-0.5 * 20 * 0.0625), abs=bound)
 
 
 def test_tiny_optical_depth_is_not_rounded_away() -> None:

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from neural_sim import cameras
+from neural_sim.cameras import pixel_rays
 from neural_sim.field.grid import GridField
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.pixels import pixel_rays, seen_pixels
+from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.rendering import render_packed, render_views
 from neural_sim.field.screen import coarse_centres, screen_span
 from neural_sim.types import PinholeCamera, Rays
@@ -121,12 +122,6 @@ def test_strips_know_as_much_as_the_whole_image(generator: torch.Generator) -> N
     inside = whole.near <= whole.far
     near, far = (torch.cat([getattr(strip, name) for strip in strips]) for name in ("near", "far"))
     assert torch.equal(near[inside], whole.near[inside]) and torch.equal(far[inside], whole.far[inside])
-
-
-def test_rays_of_pixels_are_those_of_the_camera() -> None:
-    expected = cameras.rays(CAMERA, poses())
-    torch.testing.assert_close(bundle().directions, expected.directions.reshape(-1, 3), atol=1e-15, rtol=0.0)
-    torch.testing.assert_close(bundle().origins, expected.origins.reshape(-1, 3), atol=0.0, rtol=0.0)
 
 
 def test_a_longer_step_takes_fewer_samples_of_the_same_field(generator: torch.Generator) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neural_sim.gradient.mixed import image_cotangent, scores
+from neural_sim.gradient.mixed import input_cotangents, scores
 
 DOUBLE = torch.float64
 
@@ -67,15 +67,15 @@ def test_differenced_scores_are_within_their_order_whatever_the_vectors_size(set
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 @pytest.mark.parametrize("chunk_size", [1, 2, 100])
-def test_image_cotangent_equals_autograd(setting, mode, chunk_size):
+def test_an_images_cotangent_equals_autograd(setting, mode, chunk_size):
     loss_of, params, vector, images, weights = setting
     leaf = images.clone().requires_grad_()
     (reference,) = torch.autograd.grad(single_scores(loss_of, params, vector, leaf) @ weights, leaf)
-    ours = image_cotangent(loss_of, params, vector, images, torch.arange(5), weights, chunk_size, mode)
+    (ours,) = input_cotangents(loss_of, params, vector, (images,), torch.arange(5), weights, chunk_size, mode)
     torch.testing.assert_close(ours, reference)
 
 
-def test_image_cotangent_equals_a_central_difference(setting, generator):
+def test_an_images_cotangent_equals_a_central_difference(setting, generator):
     loss_of, params, vector, images, weights = setting
     direction = torch.randn(images.shape, generator=generator, dtype=DOUBLE)
 
@@ -85,7 +85,7 @@ def test_image_cotangent_equals_a_central_difference(setting, generator):
         )
 
     difference = (total(images + 1e-5 * direction) - total(images - 1e-5 * direction)) / 2e-5
-    ours = image_cotangent(loss_of, params, vector, images, torch.arange(5), weights)
+    (ours,) = input_cotangents(loss_of, params, vector, (images,), torch.arange(5), weights)
     assert float((ours * direction).sum()) == pytest.approx(difference, rel=1e-7)
 
 
@@ -93,7 +93,8 @@ def test_no_images_no_scores(setting):
     loss_of, params, vector, images, _ = setting
     empty = torch.zeros(0, dtype=torch.long)
     assert scores(lambda p, rows: loss_of(p, images[rows], rows), params, vector, empty).shape == (0,)
-    assert image_cotangent(loss_of, params, vector, images[:0], empty, torch.zeros(0)).shape == (0, 3, 4, 4)
+    (nothing,) = input_cotangents(loss_of, params, vector, (images[:0],), empty, torch.zeros(0))
+    assert nothing.shape == (0, 3, 4, 4)
 
 
 def test_unknown_modes_are_refused(setting):
@@ -101,4 +102,4 @@ def test_unknown_modes_are_refused(setting):
     with pytest.raises(ValueError, match="mode"):
         scores(lambda p, rows: loss_of(p, images[rows], rows), params, vector, torch.arange(5), 2, "sideways")
     with pytest.raises(ValueError, match="chunk_size"):
-        image_cotangent(loss_of, params, vector, images, torch.arange(5), weights, 0)
+        input_cotangents(loss_of, params, vector, (images,), torch.arange(5), weights, 0)

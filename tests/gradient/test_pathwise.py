@@ -7,14 +7,12 @@ import dataclasses
 import pytest
 import torch
 
-from neural_sim import cameras
 from neural_sim.gradient.base import from_contributions, group_sums
 from neural_sim.gradient.pathwise import (
     PathwiseEstimator,
     contract,
     draw_cotangents,
     map_cotangents,
-    patch_rays,
     psi_contributions,
 )
 from neural_sim.synthesis.motion import moved_by
@@ -39,16 +37,6 @@ def test_sum_over_patches_equals_the_whole_image(problem, maps, patch_size):
     patches = draw_cotangents(batch.path.render_rays, batch.path.camera, batch.draw, maps, patch_size)
     for name in whole:
         assert float((whole[name] - patches[name]).abs().max()) < 1e-10
-
-
-def test_patch_rays_are_the_cameras_rays(problem):
-    batch = problem.object_images()
-    poses = cameras.orbit(batch.draw.phi, batch.draw.rho, batch.draw.distance)
-    whole = cameras.rays(batch.path.camera, poses)
-    pixels = torch.tensor([0, 5, 6, 13, 41])
-    part = patch_rays(batch.path.camera, poses, pixels)
-    torch.testing.assert_close(part.origins, whole.origins.reshape(-1, 3)[pixels])
-    torch.testing.assert_close(part.directions, whole.directions.reshape(-1, 3)[pixels])
 
 
 @pytest.mark.parametrize("theta_mode", ["forward", "reverse"])

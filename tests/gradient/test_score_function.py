@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.stratified import allocate, importance_weights, stratified
+from neural_sim.gradient.stratified import importance_weights, stratified
 
 DOUBLE = torch.float64
 PSI = torch.tensor([0.3, -1.0, 0.8], dtype=DOUBLE)
@@ -77,29 +77,6 @@ def test_a_bin_without_images_says_nothing():
     assert bool(found.standard_error.isinf().all())
 
 
-@pytest.mark.parametrize("peak", [40.0, 800.0])
-def test_one_hot_p_gives_zero_and_no_nan(peak):
-    psi = torch.tensor([peak, 0.0, -peak], dtype=DOUBLE)
-    found = stratified(SCORES, torch.tensor([0, 1, 2]), psi, log_softmax)
-    assert bool(torch.isfinite(found.value).all()) and float(found.value.abs().max()) < 1e-15
-    assert not bool(found.standard_error.isnan().any())
-
-
-@pytest.mark.parametrize("value", [0.1, -1e8, 1e100])
-def test_equal_scores_give_exactly_zero(value):
-    """Their rounding, of zero standard error, would pass for a certain gradient."""
-    scores, bins = torch.full((24,), value, dtype=torch.float64), torch.arange(8).repeat(3)
-    psi = torch.linspace(-1, 2, 8, dtype=torch.float64)
-    assert not stratified(scores, bins, psi, lambda x: torch.log_softmax(x, -1)).value.any()
-
-
-def test_one_hot_p_on_a_bin_without_images_is_no_nan():
-    scores, bins = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64), torch.tensor([0, 1, 2])
-    psi = torch.tensor([0.0, 0.0, 0.0, 1000.0], dtype=torch.float64)
-    estimate = stratified(scores, bins, psi, lambda x: torch.log_softmax(x, -1))
-    assert estimate.value.abs().max() == 0.0
-
-
 def test_one_bin_has_no_derivative():
     found = stratified(SCORES, torch.zeros(3, dtype=torch.long), torch.zeros(1, dtype=DOUBLE), log_softmax)
     assert found.value.tolist() == [0.0] and found.standard_error.tolist() == [0.0]
@@ -117,21 +94,6 @@ def test_one_bin_has_no_derivative():
 def test_stratified_refuses_nonsense(scores, bins):
     with pytest.raises(ValueError, match="stratified"):
         stratified(scores, bins, PSI, log_softmax)
-
-
-@pytest.mark.parametrize(("total", "minimum"), [(3, 1), (10, 1), (10, 0), (17, 2), (100, 5)])
-def test_allocation_sums_and_follows_p(total, minimum):
-    p = torch.tensor([0.9, 0.02, 0.08], dtype=DOUBLE)
-    counts = allocate(p, total, minimum)
-    assert int(counts.sum()) == total and int(counts.min()) >= minimum
-    assert bool(((counts - minimum - p * (total - 3 * minimum)).abs() < 1.0).all())
-
-
-def test_allocation_refuses_nonsense():
-    with pytest.raises(ValueError, match="total"):
-        allocate(torch.full((4,), 0.25), 3)
-    with pytest.raises(ValueError, match="sum to 1"):
-        allocate(torch.tensor([0.5, 0.6]), 10)
 
 
 def test_importance_weights_restore_p():

@@ -8,14 +8,6 @@ import torch
 from neural_sim.parameter import bins as binned
 
 
-def test_floor_bounds_every_probability_and_keeps_the_sum():
-    psi = torch.tensor([0.0, 800.0, -800.0, 3.0], dtype=torch.float64)
-    p = binned.log_probabilities(psi, floor=0.01).exp()
-    assert p.min() >= 0.01 * (1 - 1e-12)
-    assert p.sum().item() == pytest.approx(1.0, abs=1e-12)
-    assert torch.isfinite(binned.log_probabilities(psi, 0.01)).all()
-
-
 def test_logits_invert_log_probabilities():
     p = torch.tensor([0.86, 0.02, 0.05, 0.07], dtype=torch.float64)
     for floor in (0.0, 0.005):
@@ -26,23 +18,6 @@ def test_logits_invert_log_probabilities():
 def test_floor_out_of_range_is_refused():
     with pytest.raises(ValueError, match="floor"):
         binned.log_probabilities(torch.zeros(4), 0.25)
-
-
-def test_argmax_of_relaxed_draws_follows_p(generator):
-    p = torch.tensor([0.5, 0.3, 0.15, 0.05], dtype=torch.float64)
-    noise = binned.gumbel((40_000, 4), generator, torch.float64)
-    drawn = binned.gumbel_softmax(p.log(), noise, 0.7).argmax(-1).bincount(minlength=4) / 40_000
-    # four standard errors of a binomial share
-    bound = 4 * (p * (1 - p) / 40_000).sqrt()
-    assert ((drawn - p).abs() < bound).all()
-
-
-@pytest.mark.parametrize("temperature", [1e-4, 0.1, 1.0, 1e3])
-def test_gumbel_softmax_stays_finite_and_normalised(temperature, generator):
-    noise = binned.gumbel((200, 8), generator, torch.float32)
-    y = binned.gumbel_softmax(torch.full((8,), 1 / 8).log(), noise, temperature)
-    assert torch.isfinite(y).all()
-    torch.testing.assert_close(y.sum(-1), torch.ones(200))
 
 
 def test_linear_mean_of_opposite_wrap_bins_lands_on_the_far_side():
@@ -64,7 +39,7 @@ def test_circular_mean_is_shift_equivariant(generator):
 def test_circular_mean_derivative_against_central_differences(generator):
     centre = binned.centres(5, 0.0, 2 * math.pi, torch.zeros(1, dtype=torch.float64))
     y = torch.softmax(2 * torch.randn(5, generator=generator, dtype=torch.float64), -1).requires_grad_()
-    assert binned.resultant_length(y, centre) > 0.1
+    assert torch.hypot(y @ centre.sin(), y @ centre.cos()) > 0.1
     (gradient,) = torch.autograd.grad(binned.circular_mean(y, centre), y)
     step = 1e-6
     for i in range(5):
@@ -72,18 +47,6 @@ def test_circular_mean_derivative_against_central_differences(generator):
         e[i] = step
         slope = (binned.circular_mean(y + e, centre) - binned.circular_mean(y - e, centre)) / (2 * step)
         assert gradient[i].item() == pytest.approx(slope.item(), rel=1e-7)
-
-
-def test_circular_mean_derivative_is_capped_where_the_resultant_vanishes():
-    centre = binned.centres(8, 0.0, 2 * math.pi, torch.zeros(1, dtype=torch.float64))
-    y = torch.zeros(8, dtype=torch.float64)
-    y[0], y[4] = 0.5 + 1e-9, 0.5 - 1e-9
-    y.requires_grad_()
-    (gradient,) = torch.autograd.grad(binned.circular_mean(y, centre), y)
-    assert torch.isfinite(gradient).all()
-    # |d angle| <= |y| r / cap^2 with r <= 1e-8: the cap makes the derivative vanish, not explode
-    assert gradient.abs().max() < 1e-5
-    assert binned.resultant_length(y, centre) < 0.1
 
 
 def test_one_bin_always_wins(generator):

@@ -1,5 +1,7 @@
 """Steps of psi: closed forms, bounds, and descent on a known function."""
 
+import math
+
 import pytest
 import torch
 
@@ -81,20 +83,6 @@ def test_each_finds_the_best_bin(update):
 
 
 @pytest.mark.parametrize(
-    "update", [SGD(learning_rate=1e3), Adam(learning_rate=1e3), Mirror(learning_rate=1e3)]
-)
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e30])
-def test_steps_are_finite_and_bounded_whatever_the_scale(update, scale):
-    psi = torch.zeros(1, 4, dtype=torch.float64)
-    gradient = scale * torch.tensor([[1.0, -2.0, 0.5, 0.5]], dtype=torch.float64)
-    moved, _ = update.step(
-        psi, torch.log_softmax(psi, -1), gradient, torch.zeros_like(psi), UpdateState.zeros(psi)
-    )
-    assert torch.isfinite(moved).all()
-    assert moved.abs().max() <= update.max_step * (1 + 1e-12)
-
-
-@pytest.mark.parametrize(
     "update", [SGD(learning_rate=1e3), SGD(learning_rate=1e3, max_step=None), Adam(), Mirror()]
 )
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e308])
@@ -111,10 +99,11 @@ def test_a_gradient_that_is_not_finite_is_refused_and_forgotten(update, bad):
     assert torch.equal(after, expected)
 
 
-def test_an_unknown_noise_shrinks_nothing_and_is_forgotten():
+@pytest.mark.parametrize("size", [math.inf, math.nan, 1e200])
+def test_an_unknown_noise_shrinks_nothing_and_is_forgotten(size):
     update, psi = Mirror(), torch.zeros(1, 3, dtype=torch.float64)
     log_p, gradient = torch.log_softmax(psi, -1), torch.tensor([[0.2, -0.3, 0.1]], dtype=torch.float64)
-    unknown = torch.full_like(psi, torch.inf)
+    unknown = torch.full_like(psi, size)
     moved, state = update.step(psi, log_p, gradient, unknown, UpdateState.zeros(psi))
     unshrunk, _ = update.step(psi, log_p, gradient, torch.zeros_like(psi), UpdateState.zeros(psi))
     assert torch.equal(moved, unshrunk)

@@ -1,4 +1,5 @@
-"""Linear solvers against dense references: condition numbers, indefinite, singular and extreme systems."""
+"""What each linear solver does beside solving: reports, warm starts, references of other libraries. Condition numbers,
+indefinite, singular and extreme systems are the stress suite's (``neural_sim/stress/linear.py``)."""
 
 from __future__ import annotations
 
@@ -10,7 +11,6 @@ import scipy.sparse.linalg
 import torch
 
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.exact import Exact
 from neural_sim.solver.identity import Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.neumann import Neumann
@@ -24,33 +24,6 @@ SIZE = 24
 
 def name(solver) -> str:
     return repr(solver)
-
-
-@pytest.mark.parametrize("condition", [1.0, 1e2, 1e4, 1e6, 1e8])
-@pytest.mark.parametrize(
-    "solver", [ConjugateGradient(), MinimumResidual(), Exact(), Exact(method="cholesky")], ids=name
-)
-def test_positive_definite_systems(solver, condition, symmetric, right_hand_side, spread):
-    matrix, b = symmetric(spread(condition)), right_hand_side()
-    # Rounding x alone leaves a residual of eps |A| |x|, which for a general b is of the order of eps condition |b|.
-    rtol = max(1e-9, SIZE * torch.finfo(DOUBLE).eps * condition)
-    solution = solver.solve(lambda v: matrix @ v, b, rtol=rtol, max_steps=2000)
-    assert solution.status is Status.CONVERGED
-    residual = float((b - matrix @ solution.value).norm() / b.norm())
-    assert solution.residual == pytest.approx(residual, rel=1e-6, abs=1e-15)
-    assert residual <= rtol
-    reference = torch.linalg.solve(matrix, b)
-    # |x - x*| / |x*| <= condition * residual (Golub and Van Loan, Sec. 2.6), with room for the reference's rounding
-    assert (solution.value - reference).norm() <= (condition * rtol + 1e-15 * condition**2) * reference.norm()
-
-
-@pytest.mark.parametrize("condition", [1.0, 1e1, 1e2])
-def test_neumann_converges_at_its_own_rate(condition, symmetric, right_hand_side, spread):
-    matrix, b = symmetric(spread(condition)), right_hand_side()
-    steps = math.ceil(1.5 * condition * math.log(1e6)) + 1
-    solution = Neumann(lanczos_steps=SIZE).solve(lambda v: matrix @ v, b, rtol=1e-6, max_steps=steps)
-    assert solution.status is Status.CONVERGED
-    assert torch.allclose(matrix @ solution.value, b, rtol=0, atol=1e-6 * float(b.norm()))
 
 
 @pytest.mark.parametrize("sketch", ["columns", "gaussian"])
@@ -88,23 +61,6 @@ def test_identity_reports_an_honest_residual(symmetric, right_hand_side, spread)
     assert solution.residual == pytest.approx(float((b - 2.0 * matrix @ b).norm() / b.norm()))
 
 
-@pytest.mark.parametrize("negative", [-1e-3, -0.3, -1.0])
-def test_indefinite_systems(negative, symmetric, right_hand_side, spread):
-    eigenvalues = spread(1e2)
-    eigenvalues[5] = negative
-    matrix, b = symmetric(eigenvalues), right_hand_side()
-    reference = torch.linalg.solve(matrix, b)
-    for solver in (MinimumResidual(), Exact()):
-        solution = solver.solve(lambda v: matrix @ v, b, rtol=1e-10, max_steps=500)
-        assert solution.status is Status.CONVERGED, solver
-        torch.testing.assert_close(solution.value, reference, rtol=1e-5, atol=1e-6)
-    assert Exact().solve(lambda v: matrix @ v, b).curvature[0] == pytest.approx(negative)
-    for solver in (ConjugateGradient(), Exact(method="cholesky"), Neumann(lanczos_steps=SIZE)):
-        solution = solver.solve(lambda v: matrix @ v, b, rtol=1e-10, max_steps=500)
-        assert solution.status is Status.NEGATIVE_CURVATURE, solver
-        assert torch.isfinite(solution.value).all() and solution.residual <= 1.0
-
-
 def test_conjugate_gradients_name_the_negative_curvature_seen():
     matrix = torch.diag(torch.tensor([2.0, -1.0], dtype=DOUBLE))
     solution = ConjugateGradient().solve(lambda v: matrix @ v, torch.tensor([0.5, 2.0], dtype=DOUBLE))
@@ -120,33 +76,6 @@ def test_minres_matches_scipy_step_by_step(symmetric, right_hand_side, spread):
         ours = MinimumResidual().solve(lambda v: matrix @ v, b, rtol=0.0, max_steps=steps)
         theirs, _ = scipy.sparse.linalg.minres(matrix.numpy(), b.numpy(), rtol=1e-30, maxiter=steps)
         numpy.testing.assert_allclose(ours.value.numpy(), theirs, rtol=1e-8, atol=1e-10)
-
-
-@pytest.mark.parametrize("solver", [ConjugateGradient(), MinimumResidual(), Exact()], ids=name)
-def test_singular_consistent_systems_give_the_minimum_norm_solution(
-    solver, symmetric, right_hand_side, spread
-):
-    eigenvalues = spread(1e2)
-    eigenvalues[:3] = 0.0
-    matrix = symmetric(eigenvalues)
-    b = matrix @ right_hand_side()
-    solution = solver.solve(lambda v: matrix @ v, b, rtol=1e-10, max_steps=500)
-    assert solution.status in (Status.CONVERGED, Status.SINGULAR)
-    reference = torch.linalg.pinv(matrix, hermitian=True) @ b
-    torch.testing.assert_close(solution.value, reference, rtol=1e-6, atol=1e-7)
-
-
-def test_singular_inconsistent_systems_are_named(symmetric, right_hand_side, spread):
-    eigenvalues = spread(1e2)
-    eigenvalues[:3] = 0.0
-    matrix, b = symmetric(eigenvalues), right_hand_side()
-    least = float((b - matrix @ torch.linalg.pinv(matrix, hermitian=True) @ b).norm() / b.norm())
-    for solver in (MinimumResidual(), Exact()):
-        solution = solver.solve(lambda v: matrix @ v, b, rtol=1e-8, max_steps=500)
-        assert solution.status is Status.LEAST_SQUARES, solver
-        assert solution.residual == pytest.approx(least, rel=1e-6)
-    stopped = ConjugateGradient().solve(lambda v: matrix @ v, b, rtol=1e-8, max_steps=500)
-    assert not stopped.status.trusted and stopped.residual <= 1.0
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -191,5 +120,5 @@ def test_convergence_is_claimed_from_the_true_residual(symmetric, right_hand_sid
     matrix, b = symmetric(spread(1e8)).float(), right_hand_side().float()
     solution = ConjugateGradient().solve(lambda v: matrix @ v, b, rtol=1e-5, max_steps=2000)
     true = float((b.double() - matrix.double() @ solution.value.double()).norm() / b.norm())
-    assert solution.status.trusted == (solution.residual <= 1e-5)
+    assert (solution.status is Status.CONVERGED) == (solution.residual <= 1e-5)
     assert true == pytest.approx(solution.residual, rel=0.05, abs=1e-6)

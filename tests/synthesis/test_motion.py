@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.field.pixels import pixel_rays, ray_rates
+from neural_sim.cameras import pixel_rays, ray_rates
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.motion import RIGID, moved_by, pose_rates

@@ -41,9 +41,6 @@ class Sphere:
         inside = (centre[:, None] ** 2 + centre**2).sqrt() < radius[:, None, None]
         return torch.stack([0.5 * torch.ones_like(inside, dtype=torch.float32)] * 3 + [0.75 * inside], -1)
 
-    def close(self) -> None:
-        pass
-
 
 @pytest.fixture(scope="module")
 def meshes() -> dict[str, ObjectMesh]:

@@ -139,22 +139,3 @@ def _fit(module: DetectorModule, batches: Batches, epochs: int, progress: bool, 
             trainer_on(device, epochs, progress).fit(module, batches)
     finally:
         talker.setLevel(level)
-
-
-@torch.no_grad()
-def mean_loss(detector: Detector, params: Parameters, images: LabelledImages, batch_size: int = 64) -> float:
-    """Mean of the per-image loss over a set.
-
-    Raises:
-        ValueError: for an empty set, whose mean does not exist.
-    """
-    if len(images) == 0:
-        raise ValueError("mean_loss: got no images, want at least one")
-    backbone, trainable = detector.split(params)
-    total = 0.0
-    for index in torch.arange(len(images)).split(batch_size):
-        part = images.select(index)
-        features = detector.features(backbone, part.images)
-        targets = detector.assign(part.boxes, part.labels)
-        total += float(detector.per_image_loss(trainable, features, targets).sum())
-    return total / len(images)

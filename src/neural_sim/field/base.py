@@ -90,4 +90,4 @@ class RadianceField(nn.Module, ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, object]:
-        """The constructor's arguments, for ``save_field``."""
+        """The constructor's arguments, for ``field_state``."""

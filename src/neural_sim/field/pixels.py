@@ -1,4 +1,4 @@
-"""The pixels of a batch of views that may see a field, chunk by chunk, and their rays."""
+"""The pixels of a batch of views that may see a field, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.cameras import focal_length
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.samples import Span
-from neural_sim.types import PinholeCamera, Rays
+from neural_sim.types import PinholeCamera
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
 """Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one.
@@ -48,36 +47,6 @@ def seen_pixels(
                 yield from whole
                 waiting = [rest]
     yield from _split(_join(waiting), rays_per_chunk)
-
-
-def pixel_rays(
-    camera: PinholeCamera, camera_to_world: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
-) -> Rays:
-    """Rays (*m, rays, 3) of the pixels with the given flat indices: those of ``cameras.rays``, linear in the pose like
-    them."""
-    per_view = camera.height * camera.width
-    inside, focal = pixel % per_view, focal_length(camera)
-    x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
-    row = torch.div(inside, camera.width, rounding_mode="floor")
-    y = (row.to(camera_to_world.dtype) + 0.5 - 0.5 * camera.height) / focal
-    local = torch.stack([x, -y, -torch.ones_like(x)], -1)
-    local = local / local.norm(dim=-1, keepdim=True)
-    pose = camera_to_world.index_select(-3, torch.div(pixel, per_view, rounding_mode="floor"))
-    # The arithmetic of the estimators' rays: a sample that lands in another cell has another derivative.
-    return Rays(pose[..., :3, 3], torch.einsum("...rij,rj->...ri", pose[..., :3, :3], local))
-
-
-def ray_rates(
-    camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
-) -> Rays:
-    """Rates (*m, rays, 3) of these pixels' rays where the camera-to-world matrices move at ``rates``.
-
-    Directions stay of unit length: what a rate has along them is taken out (rounding for a camera that turns; for one
-    whose focal length changes it is the derivative of the normalisation).
-    """
-    moved = pixel_rays(camera, rates, pixel)
-    along = (moved.directions * rays.directions).sum(-1, keepdim=True)
-    return Rays(moved.origins, moved.directions - along * rays.directions)
 
 
 def _strip(

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neural_sim import cameras
+from neural_sim.cameras import pixel_rays
 from neural_sim.types import PosedViews, Rays
 
 
@@ -52,9 +52,7 @@ def build_pool(views: PosedViews, border: int | None, generator: torch.Generator
     index = index[order.to(index.device)]
     phase = torch.rand(len(index), generator=generator, device=generator.device).to(alpha)
     pixels = views.images.reshape(-1, 4).index_select(0, index)
-    local = cameras.pixel_directions(views.camera, dtype=alpha.dtype, device=alpha.device).reshape(-1, 3)
-    view, pixel = index // len(local), index % len(local)
-    pose = views.camera_to_world.to(alpha).index_select(0, view)
-    directions = torch.bmm(pose[:, :3, :3], local.index_select(0, pixel)[..., None])[..., 0]
+    rays = pixel_rays(views.camera, views.camera_to_world.to(alpha), index)
     premultiplied = torch.cat([pixels[:, :3] * pixels[:, 3:], pixels[:, 3:]], -1)
-    return RayPool(Rays(pose[:, :3, 3].contiguous(), directions), premultiplied, phase, view)
+    view = index // (views.camera.height * views.camera.width)
+    return RayPool(Rays(rays.origins.contiguous(), rays.directions), premultiplied, phase, view)

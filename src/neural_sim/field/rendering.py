@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.cameras import pixel_rays
 from neural_sim.field.base import RadianceField
-from neural_sim.field.pixels import pixel_rays, seen_pixels
+from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
 from neural_sim.field.samples import PackedSamples
 from neural_sim.types import PinholeCamera, Rays

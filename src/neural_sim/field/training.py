@@ -1,9 +1,8 @@
-"""Fit a field to posed views in one call; save and load it."""
+"""Fit a field to posed views in one call; take a field apart to be stored."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -76,16 +75,3 @@ def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
     field = KINDS[saved["kind"]](**saved["settings"])
     field.load_state_dict(saved["state"])
     return field.eval().requires_grad_(False)
-
-
-def save_field(field: RadianceField, path: Path | str) -> None:
-    """Write :func:`field_state` to one file."""
-    torch.save(field_state(field), path)
-
-
-def load_field(path: Path | str, device: torch.device | str = "cpu") -> RadianceField:
-    """Read what ``save_field`` wrote, in evaluation mode. Raises ValueError when the file holds something else."""
-    saved = torch.load(path, map_location=device, weights_only=True)
-    if not isinstance(saved, dict) or saved.get("kind") not in KINDS:
-        raise ValueError(f"load_field: {path} holds no field of a kind among {sorted(KINDS)}")
-    return field_from_state(saved).to(device)

@@ -45,24 +45,6 @@ def scores(
     return torch.cat(parts).detach()
 
 
-def image_cotangent(
-    loss_of: ImageLoss,
-    params: Params,
-    vector: Params,
-    images: Float[Tensor, "n 3 h w"],
-    index: Int[Tensor, "n"],
-    weights: Float[Tensor, "n"],
-    chunk_size: int = 16,
-    mode: ThetaMode = "forward",
-) -> Float[Tensor, "n 3 h w"]:
-    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``, the cotangent of every image (left factor of Eq. 3 times v).
-
-    ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the images, is always
-    reverse.
-    """
-    return input_cotangents(loss_of, params, vector, (images,), index, weights, chunk_size, mode)[0]
-
-
 def input_cotangents(
     loss_of: ImageLoss,
     params: Params,
@@ -73,7 +55,11 @@ def input_cotangents(
     chunk_size: int = 16,
     mode: ThetaMode = "forward",
 ) -> tuple[Tensor, ...]:
-    """``image_cotangent`` of images and, where ``inputs`` has them too, boxes."""
+    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the cotangents (left factor of Eq. 3 times v) of images (n, 3, h, w) and,
+    where ``inputs`` has them too, boxes.
+
+    ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the inputs, is always reverse.
+    """
     _check(mode, chunk_size)
     along = _ALONG[mode]
     if not len(index):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim import cameras
@@ -167,24 +167,6 @@ def map_cotangents(
     return Maps(*torch.autograd.grad(made, (rgb, opacity), pulled, materialize_grads=True))
 
 
-def patch_rays(
-    camera: PinholeCamera,
-    camera_to_world: Float[Tensor, "n 4 4"],
-    pixels: Int[Tensor, "r"],
-    magnification: Float[Tensor, "n"] | None = None,
-) -> Rays:
-    """Rays of the pixels with the given flat indices into [n, height, width]; differentiable in the poses, and in the
-    images' focal lengths in units of the camera's own."""
-    local = cameras.pixel_directions(camera, dtype=camera_to_world.dtype, device=camera_to_world.device)
-    per_image = camera.height * camera.width
-    image, local = pixels // per_image, local.reshape(-1, 3)[pixels % per_image]
-    if magnification is not None:
-        narrowed = torch.cat([local[:, :2] / magnification[image, None], local[:, 2:]], -1)
-        local = narrowed / narrowed.norm(dim=-1, keepdim=True)
-    poses = camera_to_world[image]
-    return Rays(poses[:, :3, 3], torch.einsum("rij,rj->ri", poses[:, :3, :3], local))
-
-
 def draw_cotangents(
     render_rays: RenderRays, camera: PinholeCamera, draw: SceneDraw, maps: Maps, patch_size: int
 ) -> dict[str, Float[Tensor, "n"]]:
@@ -203,7 +185,7 @@ def draw_cotangents(
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}
         with torch.enable_grad():
             poses = cameras.orbit(*(leaves[name] for name in RIGID))
-            rendered = render_rays(patch_rays(camera, poses, pixels, leaves.get("magnification")))
+            rendered = render_rays(cameras.pixel_rays(camera, poses, pixels, leaves.get("magnification")))
         parts = torch.autograd.grad(
             rendered, list(leaves.values()), (rgb[pixels], opacity[pixels]), materialize_grads=True
         )

@@ -22,27 +22,6 @@ logger = logging.getLogger(__name__)
 LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
 
-def allocate(probabilities: Float[Tensor, "k"], total: int, minimum: int = 1) -> Int[Tensor, "k"]:
-    """Images per bin: ``minimum`` for every bin, the rest by largest remainder of p; sums to ``total``.
-
-    Raises ``ValueError`` if ``total`` cannot hold the minimum, or p is not a distribution.
-    """
-    bins = probabilities.numel()
-    if minimum < 0 or total < bins * minimum:
-        raise ValueError(
-            f"allocate: got total {total} and minimum {minimum} for {bins} bins, want total >= their product"
-        )
-    if bool((probabilities < 0.0).any()) or abs(float(probabilities.sum()) - 1.0) > 1e-4:
-        raise ValueError(
-            f"allocate: probabilities must be non-negative and sum to 1, got {probabilities.tolist()}"
-        )
-    shares = probabilities.double() * (total - bins * minimum)
-    counts = shares.floor().long()
-    left = total - bins * minimum - int(counts.sum())
-    counts[(shares - counts).argsort(descending=True, stable=True)[:left]] += 1
-    return counts + minimum
-
-
 def importance_weights(
     probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], share: float = 1.0
 ) -> Float[Tensor, "n"]:

@@ -103,19 +103,13 @@ def circular_mean(
     """The direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
 
     Its derivative grows as one over the resultant's length, without bound where opposite bins mix in equal
-    parts; below ``smallest_resultant`` the length in the derivative is held there (see
-    :func:`resultant_length` for the status). The value is not touched.
+    parts; below ``smallest_resultant`` the length in the derivative is held there. The value is not touched.
     """
     sine, cosine = weights @ bin_centres.sin(), weights @ bin_centres.cos()
     squared = (sine.square() + cosine.square()).detach().clamp_min(smallest_resultant**2)
     value = torch.atan2(sine, cosine).detach() % (2.0 * math.pi)
     slope = (cosine.detach() * sine - sine.detach() * cosine) / squared
     return value + (slope - slope.detach())
-
-
-def resultant_length(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
-    """|sum_i y_i exp(i B_i)|: 1 for a single bin, 0 where the circular mean is undefined."""
-    return torch.hypot(weights @ bin_centres.sin(), weights @ bin_centres.cos())
 
 
 def nearest_bin(angle: Float[Tensor, "*n"], bins: int, low: float, high: float) -> Int[Tensor, "*n"]:

@@ -36,7 +36,3 @@ class MeshRenderer(ABC):
 
         ``lighting`` is that of these views; None: the renderer's own.
         """
-
-    def close(self) -> None:
-        """Free what the renderer holds; a later ``render`` makes it anew."""
-        return

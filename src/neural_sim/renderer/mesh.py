@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import weakref
 
 import numpy as np
 import pyrender
@@ -34,8 +33,7 @@ class PyrenderRenderer(MeshRenderer):
 
     pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each pixel
     averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views and all
-    renderers of the process; the last ``close`` frees it (so does the interpreter's exit). Needs PYOPENGL_PLATFORM set
-    before this module is imported.
+    renderers of the process. Needs PYOPENGL_PLATFORM set before this module is imported.
     """
 
     name = "pyrender"
@@ -53,7 +51,7 @@ class PyrenderRenderer(MeshRenderer):
         eye = scene.add(lens, pose=np.eye(4))
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
         width, height = camera.width * self.supersample, camera.height * self.supersample
-        context = _shared_context(self, width, height)
+        context = _shared_context(width, height)
         images = []
         for pose in camera_to_world.detach().cpu().double().numpy():
             scene.set_pose(eye, pose)
@@ -63,12 +61,6 @@ class PyrenderRenderer(MeshRenderer):
         if not images:
             return torch.zeros(0, camera.height, camera.width, 4)
         return torch.from_numpy(np.stack(images))
-
-    def close(self) -> None:
-        """Free the OpenGL context unless another renderer uses it; a later ``render`` makes a new one."""
-        _users.discard(self)
-        if not _users:
-            _free_context()
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
@@ -102,12 +94,10 @@ def _primitives(surface: Surface) -> pyrender.Mesh:
 
 # One context a process: freeing one of two EGL contexts ends the display they share, and with it the other.
 _context: pyrender.OffscreenRenderer | None = None
-_users: weakref.WeakSet[PyrenderRenderer] = weakref.WeakSet()
 
 
-def _shared_context(user: PyrenderRenderer, width: int, height: int) -> pyrender.OffscreenRenderer:
+def _shared_context(width: int, height: int) -> pyrender.OffscreenRenderer:
     global _context
-    _users.add(user)
     if _context is None:
         _context = pyrender.OffscreenRenderer(width, height)
     _context.viewport_width, _context.viewport_height = width, height
@@ -117,7 +107,5 @@ def _shared_context(user: PyrenderRenderer, width: int, height: int) -> pyrender
 # PyOpenGL's modules are gone by the time the garbage collector would get here.
 @atexit.register
 def _free_context() -> None:
-    global _context
     if _context is not None:
         _context.delete()
-        _context = None

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.cameras import pixel_rays, ray_rates
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
-from neural_sim.field.pixels import pixel_rays, ray_rates, seen_pixels
+from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.rendering import (
     SAMPLES_AT_ONCE,
     render_packed,

@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.report import tracking
-from neural_sim.stress.cases import Result
+from neural_sim.stress.cases import Check
 
 
-def by_case(results: Sequence[Result]) -> dict[str, list[Result]]:
+def by_case(results: Sequence[Check]) -> dict[str, list[Check]]:
     """Results of each case, in the order they came."""
-    cases: dict[str, list[Result]] = {}
+    cases: dict[str, list[Check]] = {}
     for result in results:
         cases.setdefault(result.case, []).append(result)
     return cases
 
 
-def failures(results: Sequence[Result]) -> list[Result]:
+def failures(results: Sequence[Check]) -> list[Check]:
     """The checks that failed."""
     return [result for result in results if not result.passed]
 
 
-def table(results: Sequence[Result]) -> str:
+def table(results: Sequence[Check]) -> str:
     """One line a case: its checks, the largest part of a tolerance that was used up, its seconds; then what failed."""
     head = f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"
     lines = [head]
@@ -43,7 +43,7 @@ def table(results: Sequence[Result]) -> str:
     return "\n".join(lines)
 
 
-def markdown(results: Sequence[Result]) -> str:
+def markdown(results: Sequence[Check]) -> str:
     """Every check as a table, case by case."""
     parts = ["# Stress suite", f"{len(results)} checks, {len(failures(results))} failed."]
     for name, held in by_case(results).items():
@@ -57,7 +57,7 @@ def markdown(results: Sequence[Result]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def write(results: Sequence[Result], folder: Path) -> Path:
+def write(results: Sequence[Check], folder: Path) -> Path:
     """stress.json (numbers that do not exist are null) and stress.md in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "stress.md").write_text(markdown(results), encoding="utf-8")
@@ -67,7 +67,7 @@ def write(results: Sequence[Result], folder: Path) -> Path:
 
 
 def track(
-    results: Sequence[Result], config: Mapping[str, Any], uri: str, folder: Path, begun: float | None = None
+    results: Sequence[Check], config: Mapping[str, Any], uri: str, folder: Path, begun: float | None = None
 ) -> tracking.Run:
     """The suite as a run in MLflow that began at ``begun`` (seconds since 1970), with ``folder`` as its artifacts."""
     metrics = {"checks": float(len(results)), "failed": float(len(failures(results)))}
@@ -83,7 +83,7 @@ def track(
     return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder, begun)
 
 
-def report(results: Sequence[Result], config: Mapping[str, Any], folder: Path, begun: float) -> int:
+def report(results: Sequence[Check], config: Mapping[str, Any], folder: Path, begun: float) -> int:
     """Write, log and print; returns the number of checks that failed. ``begun``: when, in seconds since 1970."""
     path = write(results, folder)
     uri = tracking.tracking_uri(config["paths"]["mlflow"])

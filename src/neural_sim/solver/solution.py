@@ -23,11 +23,6 @@ class Status(enum.Enum):
     UNROLLED = "no system was solved: the derivative is that of the training that was run"
     NON_FINITE = "operator, right-hand side or solution is not finite"
 
-    @property
-    def trusted(self) -> bool:
-        """Whether the solve reached what it was asked for."""
-        return self is Status.CONVERGED
-
 
 @dataclass(frozen=True)
 class Solution:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from neural_sim.report.stress import report
 from neural_sim.stages.context import Context, StageFailure
-from neural_sim.stress.suite import Suite
+from neural_sim.stress.cases import Suite
 
 
 @dataclass(frozen=True)

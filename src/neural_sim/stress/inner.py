@@ -4,7 +4,7 @@ is known."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,12 +22,12 @@ from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.solution import Status
-from neural_sim.stress.cases import Check, Checks, Scope, case, eps
-from neural_sim.stress.linear import CONVERGED, UNTRUSTED, logarithmic, system
+from neural_sim.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite, worst
+from neural_sim.stress.linear import UNTRUSTED, ended, logarithmic, relative, system
 from neural_sim.types import LabelledImages
 
-DOUBLE = torch.float64
 ROWS, SIZE, PSI = 12, 6, 3
+TRIED: dict[str, LinearSolver] = {"cg": ConjugateGradient(), "minres": MinimumResidual(), "exact": Exact()}
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Quadratic:
     unit: float = 1.0
 
     @staticmethod
-    def random(generator: torch.Generator) -> Quadratic:
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=DOUBLE)
-
-        return Quadratic(normal(ROWS, SIZE), normal(ROWS), normal(ROWS, PSI), normal(4, SIZE), normal(4))
+    def random(scope: Scope) -> Quadratic:
+        a, c, d, b, t = scope.normal(ROWS * (SIZE + 1 + PSI) + 4 * (SIZE + 1)).split(
+            [ROWS * SIZE, ROWS, ROWS * PSI, 4 * SIZE, 4]
+        )
+        return Quadratic(a.view(ROWS, SIZE), c, d.view(ROWS, PSI), b.view(4, SIZE), t)
 
     @property
     def hessian(self) -> Tensor:
@@ -93,101 +93,63 @@ def far_from_stationary(scope: Scope) -> Checks:
 
     Rounding: N eps of the terms summed; the solve's rtol and n^2 eps through |H^-1| onto the gradient.
     """
-    problem = Quadratic.random(scope.generator())
-    towards = torch.randn(SIZE, generator=scope.generator(), dtype=DOUBLE)
-    towards = towards / towards.norm()
+    problem = Quadratic.random(scope)
+    towards = torch.nn.functional.normalize(scope.normal(SIZE), dim=0)
     best, hessian = problem.minimiser, problem.hessian
     truth = problem.implicit(best)
     rtol = SIZE**2 * eps(DOUBLE)
+    lifted = float((problem.d.T @ problem.a).norm() / ROWS * torch.linalg.inv(hessian).norm())
     for distance in (0.0, 1e-6, 1.0, 1e3, 1e6):
         theta = best + distance * towards
-        stated = float((problem.implicit(theta) - truth).norm() / truth.norm())
-        for name, solver in (("exact", Exact()), ("cg", ConjugateGradient()), ("minres", MinimumResidual())):
+        exact = problem.implicit(theta)
+        size = float(hessian.norm() * theta.norm() + (problem.a.T @ problem.c).norm() / ROWS)
+        slope = float((problem.b.T @ (problem.b @ theta - problem.t)).norm())
+        bound = lifted * slope * (rtol + 2 * SIZE**2 * eps(DOUBLE)) * float(torch.linalg.cond(hessian))
+        for name, solver in TRIED.items():
             found = problem.solved(theta, solver, rtol)
             label = f"{name}, |delta| = {distance:g}"
-            size = (
-                float(hessian.norm()) * float(theta.norm()) + float((problem.a.T @ problem.c).norm()) / ROWS
-            )
             error = abs(found.stationarity - float((hessian @ (theta - best)).norm()))
-            status = found.solution.status.name
-            yield Check(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, status, (CONVERGED,))
-            lifted = float((problem.d.T @ problem.a).norm() / ROWS * torch.linalg.inv(hessian).norm())
-            slope = float((problem.b.T @ (problem.b @ theta - problem.t)).norm())
-            bound = lifted * slope * (rtol + 2 * SIZE**2 * eps(DOUBLE)) * float(torch.linalg.cond(hessian))
-            value = float((found.psi_gradients["x"] - problem.implicit(theta)).norm())
-            yield Check(f"gradient ({stated:.1e} off the truth): {label}", value, bound, status, (CONVERGED,))
-
-
-@case
-def implicit_against_retraining(scope: Scope) -> Checks:
-    """At theta* the implicit gradient is the derivative of the retrained problem. That is quadratic in psi,
-    so the central difference of any step is exact but for rounding, 4 eps L_val / step: here with steps of 1.
-    """
-    problem = Quadratic.random(scope.generator())
-
-    def retrained(psi: Tensor) -> Tensor:
-        theta = torch.linalg.solve(problem.hessian, problem.a.T @ (problem.c + problem.d @ psi) / ROWS)
-        return 0.5 * (problem.b @ theta - problem.t).square().sum()
-
-    steps = torch.eye(PSI, dtype=DOUBLE)
-    ends = torch.stack([torch.stack([retrained(e), retrained(-e)]) for e in steps])
-    truth = 0.5 * (ends[:, 0] - ends[:, 1])
-    found = problem.solved(problem.minimiser, Exact(), 1e-12)
-    bound = 4 * SIZE**2 * eps(DOUBLE) * float(ends.max() * torch.linalg.cond(problem.hessian))
-    error = float((found.psi_gradients["x"] - truth).abs().max())
-    yield Check("against differences of size 1", error, bound, found.solution.status.name, (CONVERGED,))
+            yield ended(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, found.solution)
+            value = float((found.psi_gradients["x"] - exact).norm())
+            off = f"{relative(exact, truth):.1e} off the truth"
+            yield ended(f"gradient ({off}): {label}", value, bound, found.solution)
 
 
 @case
 def units(scope: Scope) -> Checks:
     """L_train in another unit leaves dL_val/dpsi as it is; powers of two change no digit."""
-    problem = Quadratic.random(scope.generator())
+    problem = Quadratic.random(scope)
     plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
     for power in (-200, -60, 60, 200):
-        scaled = Quadratic(problem.a, problem.c, problem.d, problem.b, problem.t, unit=2.0**power)
+        scaled = replace(problem, unit=2.0**power)
         found = scaled.solved(problem.minimiser, ConjugateGradient(), 1e-10)
-        change = float((found.psi_gradients["x"] - plain.psi_gradients["x"]).abs().max())
-        yield Check(f"change by a unit of 2^{power}", change, 0.0, found.solution.status.name, (CONVERGED,))
+        change = worst(found.psi_gradients["x"] - plain.psi_gradients["x"])
+        yield ended(f"change by a unit of 2^{power}", change, 0.0, found.solution)
 
 
 @case
 def degenerate(scope: Scope) -> Checks:
     """A flat inner problem without damping has no inverse: v = 0 and a status; with lambda, v = b / lambda. A loss that
-    is NaN or overflows has a status and v = 0. One parameter: v = b / (h + lambda).
+    is NaN or overflows has a status and v = 0.
     """
-    b = torch.randn(SIZE, generator=scope.generator(), dtype=DOUBLE)
+    b = scope.normal(SIZE)
     params = {"x": torch.ones(SIZE, dtype=DOUBLE)}
     flat = {"linear": lambda p: p["x"].sum(), "constant": lambda p: 0.0 * p["x"].square().sum()}
-    for name, solver in (("cg", ConjugateGradient()), ("minres", MinimumResidual()), ("exact", Exact())):
+    bad = {
+        "NaN": lambda p: (p["x"] * math.nan).square().sum(),
+        "overflow": lambda p: (p["x"] * 1e200).square().sum().square(),
+    }
+    for name, solver in TRIED.items():
         for label, term in flat.items():
             found = AdjointSolver(solver, FixedDamping(0.0)).solve([term], params, b, None, torch.Generator())
-            status = found.solution.status.name
-            yield Check(f"|v|: {name}, {label}", float(found.vector.norm()), 0.0, status, UNTRUSTED)
-            found = AdjointSolver(solver, FixedDamping(1e-3)).solve(
-                [term], params, b, None, torch.Generator()
-            )
-            error = float((found.vector * 1e-3 - b).norm() / b.norm())
-            status = found.solution.status.name
-            yield Check(
-                f"v with damping: {name}, {label}", error, SIZE**2 * eps(DOUBLE), status, (CONVERGED,)
-            )
-        bad = {
-            "NaN": lambda p: (p["x"] * math.nan).square().sum(),
-            "overflow": lambda p: (p["x"] * 1e200).square().sum().square(),
-        }
+            yield ended(f"|v|: {name}, {label}", worst(found.vector), 0.0, found.solution, *UNTRUSTED)
+            damped = AdjointSolver(solver, FixedDamping(1e-3))
+            found = damped.solve([term], params, b, None, torch.Generator())
+            error = relative(found.vector * 1e-3, b)
+            yield ended(f"v with damping: {name}, {label}", error, SIZE**2 * eps(DOUBLE), found.solution)
         for label, term in bad.items():
             found = AdjointSolver(solver, LanczosDamping()).solve([term], params, b, None, torch.Generator())
-            status = found.solution.status.name
-            value = float(found.vector.norm())
-            yield Check(f"|v|: {name}, {label}", value, 0.0, status, (Status.NON_FINITE.name,))
-        one = {"x": torch.tensor([2.0], dtype=DOUBLE)}
-        found = AdjointSolver(solver, FixedDamping(0.5)).solve(
-            [lambda p: 1.5 * p["x"].square().sum()], one, b[:1], None, torch.Generator()
-        )
-        error = abs(float(found.vector) * 3.5 / float(b[0]) - 1.0)
-        yield Check(
-            f"one parameter: {name}", error, 8 * eps(DOUBLE), found.solution.status.name, (CONVERGED,)
-        )
+            yield ended(f"|v|: {name}, {label}", worst(found.vector), 0.0, found.solution, Status.NON_FINITE)
 
 
 @case
@@ -205,26 +167,21 @@ def indefinite_hessians(scope: Scope) -> Checks:
         "zero": torch.zeros(24, dtype=DOUBLE),
     }
     damping = LanczosDamping(lanczos_steps=24)
+    params = {"x": torch.zeros(24, dtype=DOUBLE)}
     for label, values in spectra.items():
         problem = system(values, scope.generator())
-        params = {"x": torch.zeros(24, dtype=DOUBLE)}
         terms = [lambda p, matrix=problem.matrix: 0.5 * p["x"] @ (matrix @ p["x"])]
-        rhs = problem.x
-        for name, solver in (("cg", ConjugateGradient()), ("minres", MinimumResidual())):
-            adjoint = AdjointSolver(solver, damping, rtol=1e-10, max_steps=400)
-            found = adjoint.solve(terms, params, rhs, None, scope.generator())
-            status, chosen = found.solution.status.name, found.damping.value
-            rounding = 24 * eps(DOUBLE) * float(values.abs().max())
-            least = 1.25 * max(0.0, -float(values.min()))
-            yield Check(
-                f"lambda short of its margin: {name}, {label}", max(0.0, least - chosen), 4 * rounding
-            )
-            damped = problem.matrix + chosen * torch.eye(24, dtype=DOUBLE)
-            truth = torch.linalg.solve(damped, rhs)
+        least, rounding = 1.25 * max(0.0, -float(values.min())), 24 * eps(DOUBLE) * worst(values)
+        for name in ("cg", "minres"):
+            adjoint = AdjointSolver(TRIED[name], damping, rtol=1e-10, max_steps=400)
+            found = adjoint.solve(terms, params, problem.x, None, scope.generator())
+            chosen = found.damping.value
+            short = max(0.0, least - chosen)
+            yield Check(f"lambda short of its margin: {name}, {label}", short, 4 * rounding)
+            truth = torch.linalg.solve(problem.matrix + chosen * torch.eye(24, dtype=DOUBLE), problem.x)
             condition = float((values + chosen).abs().max() / (values + chosen).abs().min())
-            error = float((found.vector - truth).norm() / truth.norm())
             bound = condition * (1e-10 + 2 * 24**2 * eps(DOUBLE))
-            yield Check(f"v: {name}, {label}", error, bound, status, (CONVERGED,))
+            yield ended(f"v: {name}, {label}", relative(found.vector, truth), bound, found.solution)
 
 
 @case
@@ -240,32 +197,23 @@ def untrained_detector(scope: Scope) -> Checks:
     boxes = torch.tensor([[4.0, 4, 15, 14], [8, 9, 26, 27], [12, 2, 30, 18]], dtype=DOUBLE)[:, None]
     images = LabelledImages(pixels, boxes, torch.tensor([[0], [1], [0]]), torch.full((3,), -1))
     cached = CachedSet.of(detector, backbone, images)
+    adjoint = AdjointSolver(ConjugateGradient(), LanczosDamping())
     for factor in (1.0, 10.0, 100.0):
         params = {name: factor * value for name, value in head.items()}
         inner = InnerProblem(params, cached.losses, torch.full((3,), 1.0 / 3.0, dtype=DOUBLE))
-        slope = gradient(inner.terms(), params)
-        along, point = slope / slope.norm(), flatten(params)
-        problem = hypergradient(inner, cached.mean_terms(), {}, _default(), scope.generator())
+        along = torch.nn.functional.normalize(gradient(inner.terms(), params), dim=0)
+        found = hypergradient(inner, cached.mean_terms(), {}, adjoint, scope.generator())
 
-        def loss(
-            step: float, inner: InnerProblem = inner, point: Tensor = point, along: Tensor = along
-        ) -> float:
-            moved = unflatten(point + step * along, inner.params)
+        def loss(step: float, inner: InnerProblem = inner, along: Tensor = along) -> float:
+            moved = unflatten(flatten(inner.params) + step * along, inner.params)
             with torch.no_grad():
                 return float(sum(term(moved) for term in inner.terms()))
 
-        step = 1e-4 * float(point.norm()) / len(point) ** 0.5
+        step = 1e-4 * float(flatten(params).norm()) / len(along) ** 0.5
         coarse, fine = ((loss(h) - loss(-h)) / (2 * h) for h in (step, 0.5 * step))
         truth = fine + (fine - coarse) / 3.0
-        tolerance = abs(truth - fine) + 64 * eps(DOUBLE) * abs(loss(0.0)) / step
-        status = problem.solution.status.name
-        quantity = f"stationarity, {problem.stationarity:.1e}: {factor:g} times the start"
-        yield Check(quantity, abs(problem.stationarity - truth), tolerance, status)
-        yield Check(
-            f"numbers not finite: {factor:g} times the start",
-            float((~torch.isfinite(problem.solution.value)).sum()), 0.0, status,
-        )  # fmt: skip
-
-
-def _default() -> AdjointSolver:
-    return AdjointSolver(ConjugateGradient(), LanczosDamping())
+        bound = abs(truth - fine) + 64 * eps(DOUBLE) * abs(loss(0.0)) / step
+        quantity = f"stationarity, {found.stationarity:.1e}: {factor:g} times the start"
+        yield Check(quantity, abs(found.stationarity - truth), bound)
+        wrong = not_finite(found.solution.value)
+        yield Check(f"numbers not finite: {factor:g} times the start", wrong, 0.0)

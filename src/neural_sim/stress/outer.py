@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -22,14 +22,13 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.stress.cases import Check, Checks, Scope, case, eps
+from neural_sim.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
 from neural_sim.stress.rendering import block
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import HardDraws, Scene, join
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
-DOUBLE = torch.float64
 FLOOR, MAX_STEP = 0.005, 0.5
 UPDATES: dict[str, Callable[[float], Update]] = {
     "sgd": lambda rate: SGD(learning_rate=rate, max_step=MAX_STEP),
@@ -48,7 +47,7 @@ class Worst:
     off_simplex: float = 0.0
 
     def see(self, before: Tensor, after: Tensor) -> None:
-        self.not_finite += float((~torch.isfinite(after)).sum())
+        self.not_finite += not_finite(after)
         # psi + step and its difference round by eps |psi| each.
         excess = (after - before).abs() - MAX_STEP - 2 * eps(DOUBLE) * after.abs()
         self.excess = max(self.excess, float(excess.max()))
@@ -56,8 +55,8 @@ class Worst:
         below = float((FLOOR - p).max())
         self.off_simplex = max(self.off_simplex, below, float((p.sum(-1) - 1.0).abs().max()))
 
-    def checks(self, label: str) -> Checks:
-        yield Check(f"psi not finite: {label}", self.not_finite, 0.0)
+    def checks(self, label: str, status: str = "", wanted: tuple[str, ...] = ()) -> Checks:
+        yield Check(f"psi not finite: {label}", self.not_finite, 0.0, status, wanted)
         yield Check(f"step beyond max_step: {label}", self.excess, 8 * eps(DOUBLE) * MAX_STEP)
         # log p carries eps |psi| of the softmax part (at most 30 nats of it show beside the floor) and k roundings.
         yield Check(f"p off its simplex: {label}", self.off_simplex, (8 + 30) * 8 * eps(DOUBLE))
@@ -70,10 +69,18 @@ def slope(psi: Tensor, costs: Tensor) -> Tensor:
     return torch.autograd.grad(mean, leaf)[0]
 
 
-def step(
-    update: Update, psi: Tensor, gradient: Tensor, error: Tensor, state: UpdateState
-) -> tuple[Tensor, UpdateState]:
-    return update.step(psi, binned.log_probabilities(psi, FLOOR), gradient, error, state)
+def run(
+    update: Update, psi: Tensor, gradients: Iterable[Callable[[Tensor], Tensor]], error: float, worst: Worst
+) -> UpdateState:
+    """Steps along gradients that depend on psi, with standard errors of a part ``error`` of them."""
+    state = UpdateState.zeros(psi)
+    for of in gradients:
+        gradient = of(psi)
+        log_p = binned.log_probabilities(psi, FLOOR)
+        moved, state = update.step(psi, log_p, gradient, gradient.abs() * error, state)
+        worst.see(psi, moved)
+        psi = moved
+    return state
 
 
 @case
@@ -83,38 +90,32 @@ def learning_rates(scope: Scope) -> Checks:
     which ``bound`` promises.
     """
     steps = 300 if scope.full else 40
-    costs = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
-    costs = costs * torch.tensor([[1e-6], [1.0], [1e6]], dtype=DOUBLE)
+    costs = scope.normal(3, 8) * torch.tensor([[1e-6], [1.0], [1e6]], dtype=DOUBLE)
+    noisy = [
+        lambda psi, noise=noise: slope(psi, costs * (1.0 + noise)) for noise in scope.normal(steps, 3, 8)
+    ]
     deep = torch.zeros(3, 8, dtype=DOUBLE)
     deep[:, ::2] = -1000.0
     for name, make in UPDATES.items():
         for rate in RATES:
             for where, start in (("uniform", torch.zeros_like(deep)), ("bins at the floor", deep)):
-                generator, update, psi, state = scope.generator(), make(rate), start, UpdateState.zeros(start)
                 worst = Worst()
-                for _ in range(steps):
-                    noise = torch.randn(3, 8, generator=generator, dtype=DOUBLE)
-                    gradient = slope(psi, costs * (1.0 + noise))
-                    moved, state = step(update, psi, gradient, gradient.abs() * 0.1, state)
-                    worst.see(psi, moved)
-                    psi = moved
+                run(make(rate), start, noisy, 0.1, worst)
                 yield from worst.checks(f"{name}, rate {rate:g}, {where}")
 
 
 @case
 def flat_loss(scope: Scope) -> Checks:
     """A gradient of exactly zero moves nothing, by any update at any rate, from any psi: no digit changes."""
-    far = 100.0 * torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
     for name, make in UPDATES.items():
         for rate in RATES:
             moved = 0.0
-            for psi in (torch.zeros_like(far), far):
+            for psi in (torch.zeros(3, 8, dtype=DOUBLE), 100.0 * scope.normal(3, 8)):
                 for error in (0.0, 1.0, math.inf):
-                    state = UpdateState.zeros(psi)
+                    state, log_p = UpdateState.zeros(psi), binned.log_probabilities(psi, FLOOR)
                     for _ in range(3):
-                        after, state = step(
-                            make(rate), psi, torch.zeros_like(psi), torch.full_like(psi, error), state
-                        )
+                        none, unknown = torch.zeros_like(psi), torch.full_like(psi, error)
+                        after, state = make(rate).step(psi, log_p, none, unknown, state)
                         moved = max(moved, float((after - psi).abs().max()))
             yield Check(f"change of psi: {name}, rate {rate:g}", moved, 0.0)
 
@@ -125,54 +126,24 @@ def cliff(scope: Scope) -> Checks:
     and counted, and psi stays finite and bounded in the 30 steps after it. Up to 1e100 every square is finite
     and the step is taken; inf and NaN are refused; between, where squares overflow, either is right.
     """
-    costs = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
-    shape = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
+    costs, shape = scope.normal(3, 8), scope.normal(3, 8)
     for name, make in UPDATES.items():
         for size in (1e-300, 1e30, 1e100, 1e160, 1e300, math.inf, math.nan):
-            worst, refused = Worst(), 0
-            for rate in RATES:
-                psi = torch.zeros(3, 8, dtype=DOUBLE)
-                state = UpdateState.zeros(psi)
-                for index in range(35):
-                    gradient = slope(psi, costs)
-                    if index == 4:
-                        gradient = (
-                            torch.where(shape > 1.0, size, gradient) if not size < 1e200 else size * shape
-                        )
-                    moved, state = step(make(rate), psi, gradient, torch.zeros_like(psi), state)
-                    worst.see(psi, moved)
-                    psi = moved
-                refused += state.refused
+
+            def edge(psi: Tensor, size: float = size) -> Tensor:
+                return size * shape if size < 1e200 else torch.where(shape > 1.0, size, slope(psi, costs))
+
+            def usual(psi: Tensor) -> Tensor:
+                return slope(psi, costs)
+
+            worst, gradients = Worst(), [usual] * 4 + [edge] + [usual] * 30
+            zero = torch.zeros(3, 8, dtype=DOUBLE)
+            refused = sum(run(make(rate), zero, gradients, 0.0, worst).refused for rate in RATES)
             status = "REFUSED" if refused == len(RATES) else "BOUNDED" if refused == 0 else "BOTH"
             wanted = ("BOUNDED",) if size <= 1e100 else ("REFUSED", "BOUNDED", "BOTH")
             if not math.isfinite(size):
                 wanted = ("REFUSED",)
-            yield Check(f"psi not finite: {name}, gradient {size:g}", worst.not_finite, 0.0, status, wanted)
-            yield Check(
-                f"step beyond max_step: {name}, gradient {size:g}", worst.excess, 8 * eps(DOUBLE) * MAX_STEP
-            )
-
-
-@case
-def standard_errors(scope: Scope) -> Checks:
-    """Standard errors of any size, infinite or NaN beside a sound gradient: a bounded step; where they are
-    not known they shrink nothing, and are forgotten: the next step is what it would be had they been zero.
-    Noise far above the gradient holds psi where it is, exactly.
-    """
-    gradient = torch.randn(3, 8, generator=scope.generator(), dtype=DOUBLE)
-    psi = torch.zeros(3, 8, dtype=DOUBLE)
-    update = Mirror(max_step=MAX_STEP)
-    none = torch.zeros_like(psi)
-    first, known = step(update, psi, gradient, none, UpdateState.zeros(psi))
-    second, _ = step(update, first, gradient, none, known)
-    for size in (math.inf, math.nan, 1e200):
-        moved, state = step(update, psi, gradient, torch.full_like(psi, size), UpdateState.zeros(psi))
-        after, _ = step(update, moved, gradient, none, state)
-        yield Check(f"step: standard error {size:g}", float((moved - first).abs().max()), 0.0)
-        yield Check(f"next step: standard error {size:g}", float((after - second).abs().max()), 0.0)
-    for size in (1e6, 1e100):
-        moved, _ = step(update, psi, gradient, torch.full_like(psi, size), UpdateState.zeros(psi))
-        yield Check(f"step: standard error {size:g}", float(moved.abs().max()), 0.0)
+            yield from worst.checks(f"{name}, gradient {size:g}", status, wanted)
 
 
 @dataclass(frozen=True)

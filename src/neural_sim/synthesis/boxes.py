@@ -2,27 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 SMALLEST_SLOPE = 0.05
 """Change of opacity per pixel below which an edge's derivative, which is one over it, is held."""
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Sub-pixel positions (x0, y0, x1, y1) of boxes in pixels, and where their derivative is not to be had.
-
-    ``clipped``: the edge is the frame's; its derivative is 0. ``flat``: opacity rises by less than ``SMALLEST_SLOPE``
-    per pixel there, so that the edge has no definite place; its derivative is capped.
-    """
-
-    position: Float[Tensor, "n 4"]
-    clipped: Bool[Tensor, "n 4"]
-    flat: Bool[Tensor, "n 4"]
 
 
 def boxes_from_opacity(
@@ -45,20 +30,22 @@ def boxes_from_opacity(
     y0, y1 = _span(mask.any(2))
     boxes = torch.stack([x0, y0, x1, y1], -1).to(opacity.dtype) * present[:, None]
     if differentiable:
-        moving = torch.where(present[:, None], subpixel_edges(opacity, threshold).position, 0.0)
+        moving = torch.where(present[:, None], subpixel_edges(opacity, threshold), 0.0)
         boxes = boxes + (moving - moving.detach())
     return boxes[:, None], present
 
 
-def subpixel_edges(opacity: Float[Tensor, "n h w"], threshold: float = 0.5) -> Edges:
-    """Where opacity, linear between pixel centres along rows and columns, first and last reaches ``threshold``.
+def subpixel_edges(opacity: Float[Tensor, "n h w"], threshold: float = 0.5) -> Float[Tensor, "n 4"]:
+    """Sub-pixel (x0, y0, x1, y1) of boxes in pixels: where opacity, linear between pixel centres along rows and
+    columns, first and last reaches ``threshold``.
 
     The derivative is the implicit function theorem's at the outermost crossing: where o(x, V) = threshold,
     dx/dV = -(do/dV) / (do/dx). It is exact for the outermost row's (column's) own crossing; the outline between rows
     is not seen, which for an outline of radius R pixels leaves out at most 0.5 / R of the motion along the edge, and
     an outline much sharper than a pixel is followed on average over its places within a pixel only. It is undefined
     where the outermost pixel changes (a corner that turns, a part that appears): there it is the present pixel's, one
-    side's. See :class:`Edges` for the other two cases.
+    side's. An edge that the frame clips is the frame's and does not move; where opacity rises by less than
+    ``SMALLEST_SLOPE`` per pixel the edge has no definite place, and its derivative is capped.
 
     Images without a pixel above the threshold have edges at 0 that do not move.
     """
@@ -67,17 +54,15 @@ def subpixel_edges(opacity: Float[Tensor, "n h w"], threshold: float = 0.5) -> E
     left, right = _first_crossing(opacity, threshold), _first_crossing(opacity.flip(-1), threshold)
     top, bottom = _first_crossing(across, threshold), _first_crossing(across.flip(-1), threshold)
     some = (opacity.detach() > threshold).any(-1).any(-1)
-    position = torch.stack([left[0], top[0], width - right[0], height - bottom[0]], -1)
-    clipped, flat = (torch.stack([left[i], top[i], right[i], bottom[i]], -1) for i in (1, 2))
-    return Edges(torch.where(some[:, None], position, 0.0), clipped, flat & some[:, None])
+    position = torch.stack([left, top, width - right, height - bottom], -1)
+    return torch.where(some[:, None], position, 0.0)
 
 
-def _first_crossing(opacity: Float[Tensor, "n h w"], threshold: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Smallest x at which any row reaches the threshold, whether the frame clips it, whether opacity is flat there."""
+def _first_crossing(opacity: Float[Tensor, "n h w"], threshold: float) -> Float[Tensor, "n"]:
+    """Smallest x at which any row reaches the threshold."""
     values = opacity.detach()
     images = torch.arange(len(values), device=values.device)
     column = (values > threshold).any(1).int().argmax(-1)
-    clipped = column == 0
     before = (column - 1).clamp_min(0)
     within, outside = values[images, :, column], values[images, :, before]
     rise = within - outside
@@ -88,7 +73,7 @@ def _first_crossing(opacity: Float[Tensor, "n h w"], threshold: float) -> tuple[
     inner, outer = opacity[images, row, column], opacity[images, row, before]
     along = -((1.0 - share) * inner + share * outer) / slope.clamp_min(SMALLEST_SLOPE)
     edge = column + 0.5 - share + (along - along.detach())
-    return torch.where(clipped, 0.0, edge), clipped, ~clipped & (slope < SMALLEST_SLOPE)
+    return torch.where(column == 0, 0.0, edge)
 
 
 def _span(occupied: Bool[Tensor, "n s"]) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.cameras import magnified, orbit
+from neural_sim.cameras import cameras_of, orbit
 from neural_sim.field.base import RadianceField
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
@@ -111,14 +111,9 @@ class Scene:
                 return self.renderer.render(field, camera, poses[rows])
             return self.lit_renderer.render(field, camera, poses[rows], weights=draw.weights[rows])
 
-        return _joined([Maps(*made(camera, rows)) for camera, rows in self._cameras(draw)])
-
-    def _cameras(self, draw: SceneDraw) -> list[tuple[PinholeCamera, slice]]:
-        """Cameras and the images each takes: one takes all, but every drawn focal length is a camera of its own."""
-        if draw.magnification is None:
-            return [(self.camera, slice(None))]
-        every = enumerate(draw.magnification.tolist())
-        return [(magnified(self.camera, size), slice(i, i + 1)) for i, size in every]
+        return _joined(
+            [Maps(*made(camera, rows)) for camera, rows in cameras_of(self.camera, draw.magnification)]
+        )
 
     @property
     def lit_renderer(self) -> NerfWRenderer:
@@ -186,7 +181,7 @@ class Scene:
                 )  # fmt: skip
             return [maps, *moved]
 
-        each = [made(camera, rows) for camera, rows in self._cameras(draw)]
+        each = [made(camera, rows) for camera, rows in cameras_of(self.camera, draw.magnification)]
         maps, *moved = (_joined(parts) for parts in zip(*each, strict=True))
         return maps, dict(zip((*names, *light_names(lights)), moved, strict=True))
 

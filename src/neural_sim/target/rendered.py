@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.cameras import magnified, orbit
+from neural_sim.cameras import cameras_of, orbit
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
@@ -79,10 +79,6 @@ def _premultiplied(
     with torch.no_grad():
         poses = orbit(draw.phi, draw.rho, draw.distance)
         lighting = _lighting(draw, rig)
-        if draw.magnification is None:
-            rgba = renderer.render(item.mesh, camera, poses, lighting)
-        else:  # every image has a camera of its own
-            cameras = [magnified(camera, m) for m in draw.magnification.tolist()]
-            pairs = zip(cameras, poses, strict=True)
-            rgba = torch.cat([renderer.render(item.mesh, own, pose[None], lighting) for own, pose in pairs])
+        taken = cameras_of(camera, draw.magnification)
+        rgba = torch.cat([renderer.render(item.mesh, own, poses[rows], lighting) for own, rows in taken])
     return rgba[..., :3] * rgba[..., 3:], rgba[..., 3]
