@@ -14,7 +14,10 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.metrics import evaluate
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.module import Optimisation
+from neural_sim.detector.protocol import Parameters
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.targets import BACKGROUND
 from neural_sim.detector.training import mean_loss, train_detector
 from neural_sim.gradient.base import from_contributions
@@ -30,8 +33,8 @@ SIDE, CLASSES = 32, ("can", "mug", "drill")
 DOUBLE = torch.float64
 
 
-def detector() -> Detector:
-    return Detector(3, SIDE, anchor_sizes=((10,), (18,)), anchor_reference=SIDE, channels=8, head_convs=1)
+def detector() -> RetinaNet:
+    return RetinaNet(3, SIDE, anchors=Anchors(sizes=((10,), (18,)), reference=SIDE), head=Head(8, 1))
 
 
 def images_of(
@@ -90,7 +93,7 @@ def empty_target_set(scope: Scope) -> Checks:
     nothing = empty(generator)
     yield refusal("target set under the backbone", lambda: CachedSet.of(network, backbone, nothing))
     yield refusal("validation and test from no images", lambda: split(range(len(nothing)), 0.5, generator))
-    yield refusal("training", lambda: train_detector(network, params, nothing, generator, epochs=1))
+    yield refusal("training", lambda: train_detector(network, params, nothing, generator, Optimisation(1)))
     yield refusal("mean loss", lambda: mean_loss(network, params, nothing))
     yield refusal("AP", lambda: evaluate([], nothing, CLASSES))
     yield refusal("joining no sets", lambda: LabelledImages.concatenate([]))
@@ -130,7 +133,7 @@ def images_without_boxes(scope: Scope) -> Checks:
     )
     single = images_of(generator, [[[0.0] * 4]] * 3, [[-1]] * 3, torch.float32)
     start = network.init(scope.generator())
-    trained, _ = train_detector(network, start, single, generator, epochs=3, batch_size=2)
+    trained, _ = train_detector(network, start, single, generator, Optimisation(3, batch_size=2))
     gain = mean_loss(network, trained, single) - mean_loss(network, start, single)
     yield Check("loss gained by training", max(0.0, gain), 0.0)
     wrong = sum(
@@ -200,7 +203,7 @@ def batch_of_one(scope: Scope) -> Checks:
     start = network.init(scope.generator())
     for count in (1, 3):
         chosen = some(scope.generator(), torch.float32).select(slice(0, count))
-        trained, history = train_detector(network, start, chosen, generator, epochs=2, batch_size=1)
+        trained, history = train_detector(network, start, chosen, generator, Optimisation(2, batch_size=1))
         wrong = int(
             (~torch.isfinite(flatten({k: v for k, v in trained.items() if v.is_floating_point()}))).sum()
         )
