@@ -39,10 +39,7 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
     warm_start, validation = results(graph.warm_start).params, results(graph.targets).val
     for seed in range(seeds):
         generator = torch.Generator().manual_seed(seed)
-        inner = InnerLoop(
-            scene, detector, warm_start, validation, x.loop.outer, x.training.batch_size, x.training.weight_decay,
-            generator,
-        )  # fmt: skip
+        inner = InnerLoop(scene, detector, warm_start, validation, x.loop.outer, x.training, generator)
         images = join(inner.draw(psi))
         inner.train(CachedSet.of(detector, inner.backbone, images))
         loop = StillLoop.at(

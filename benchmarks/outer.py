@@ -60,7 +60,7 @@ def loop(context: Context, count: int, images: int) -> SimulatorModule:
     )
     inner = InnerLoop(
         scene, detector, placed(detector.init(generator), context.graph.device), validation, settings,
-        training.batch_size, training.weight_decay, generator, context.experiment.loop.gradient.draws,
+        training, generator, context.experiment.loop.gradient.draws,
     )  # fmt: skip
     return SimulatorModule(inner, psi, context.experiment.loop.gradient, context.experiment.loop.solver)
 

@@ -19,14 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from machine import machine
-from omegaconf import OmegaConf
 from section import replace_section
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.module import Optimisation
+from neural_sim.detector.protocol import Detector
 from neural_sim.detector.training import train_detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Probes
@@ -95,9 +96,9 @@ def small_scene() -> Scene:
 
 
 def detector_of(name: str, classes: int, size: int) -> Detector:
-    return instantiate(OmegaConf.load(conf_directory() / "detector" / f"{name}.yaml"))(
-        num_classes=classes, image_size=size
-    )
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        chosen = compose("config", [f"detector={name}"]).detector
+    return instantiate(chosen)(num_classes=classes, image_size=size)
 
 
 def trained_problem() -> tuple[BinnedProblem, list[Term]]:
@@ -108,8 +109,9 @@ def trained_problem() -> tuple[BinnedProblem, list[Term]]:
     validation = join(scene.training_set(PSI.flip(-1), 8, generator))
     probes = join([scene.probes(label, 1, generator) for label in range(2)])
     params, _ = train_detector(
-        detector, detector.init(generator), images, generator, epochs=40, batch_size=16, learning_rate=1e-2
-    )
+        detector, detector.init(generator), images, generator,
+        Optimisation(40, batch_size=16, learning_rate=1e-2, weight_decay=1e-2),
+    )  # fmt: skip
     backbone, warm = detector.split(params)
     held = CachedSet.of(detector, backbone, probes).double()
     bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]

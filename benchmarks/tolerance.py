@@ -74,8 +74,8 @@ def state(context: Context, which: str, seed: int) -> State:
         join(context.results(context.graph.scene).training_set(psi, outer.images_per_object, generator)),
     )
     theta, _ = train_detector(
-        detector, {**detector.init(generator), **backbone}, cached, generator, epochs=outer.epochs,
-        batch_size=training.batch_size, learning_rate=outer.learning_rate, weight_decay=training.weight_decay,
+        detector, {**detector.init(generator), **backbone}, cached, generator,
+        replace(training.of(outer.epochs), learning_rate=outer.learning_rate),
     )  # fmt: skip
     trainable = detector.split(theta)[1]
     validation = CachedSet.of(detector, backbone, context.results(context.graph.targets).val)

@@ -26,7 +26,7 @@ from unrolled_report import centred, report, table
 from worlds import SMALL
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Parameters
+from neural_sim.detector.protocol import Parameters
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, places, standing
@@ -99,9 +99,9 @@ class World:
         x = self.context.experiment
         detector, generator = self.context.graph.warm_start.build(), torch.Generator().manual_seed(seed)
         theta, history = train_detector(
-            detector, self.start, self.pool.select(rows), generator, epochs=x.loop.outer.epochs,
-            batch_size=x.training.batch_size, learning_rate=x.loop.outer.learning_rate,
-            weight_decay=x.training.weight_decay, recording=recording,
+            detector, self.start, self.pool.select(rows), generator,
+            replace(x.training.of(x.loop.outer.epochs), learning_rate=x.loop.outer.learning_rate),
+            recording=recording,
         )  # fmt: skip
         return detector.split(theta)[1], history
 

@@ -6,7 +6,8 @@ import torch
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.optimiser import SGD, AdamW
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.unrolled import Examples
@@ -29,8 +30,8 @@ class Micro:
 
     def __init__(self, proximal: float = 0.0) -> None:
         generator = torch.Generator().manual_seed(3)
-        detector = Detector(
-            3, 32, "micro", anchor_sizes=((14,), (28,)), anchor_reference=48, channels=8, head_convs=1
+        detector = RetinaNet(
+            3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
         )
         params = {
             name: value.double() + 0.05 * torch.randn(value.shape, generator=generator, dtype=DOUBLE)

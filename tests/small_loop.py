@@ -2,7 +2,9 @@
 
 import torch
 
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.training import Training
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
@@ -14,21 +16,27 @@ from neural_sim.synthesis.scene import join
 
 SOLVER = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
 TINY = {
-    "num_classes": 2, "image_size": 32, "anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8,
-    "head_convs": 1,
+    "num_classes": 2, "image_size": 32, "anchors": Anchors(sizes=((10,), (18,)), reference=32), "head": Head(8, 1),
 }  # fmt: skip
-MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48}
+MICRO = {"backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)), reference=48)}
 
 
 def small_loop(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(**(TINY | (detector or {})))
+    detector = RetinaNet(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
     validation = join(scene.training_set(psi, 3, generator))
     settings = Outer(
         Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **outer
     )
     inner = InnerLoop(
-        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
+        scene,
+        detector,
+        detector.init(generator),
+        validation,
+        settings,
+        Training(batch_size=4, weight_decay=0.0),
+        generator,
+        estimator.draws,
     )
     return SimulatorModule(inner, psi, estimator, solver)

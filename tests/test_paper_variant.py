@@ -43,12 +43,12 @@ PAPER = [
         EVERY,
         "l. 342: conjugate gradients",
     ),
-    ("detector.architecture", "resnet50", EVERY, "l. 684: RetinaNet (Lin et al. 2017)"),
-    ("detector.strides", [8, 16, 32, 64, 128], EVERY, "l. 684: RetinaNet"),
-    ("detector.aspect_ratios", [0.5, 1.0, 2.0], EVERY, "l. 684: RetinaNet"),
+    ("detector.backbone.architecture", "resnet50", EVERY, "l. 684: RetinaNet (Lin et al. 2017)"),
+    ("detector.anchors.strides", [8, 16, 32, 64, 128], EVERY, "l. 684: RetinaNet"),
+    ("detector.anchors.ratios", [0.5, 1.0, 2.0], EVERY, "l. 684: RetinaNet"),
     ("detector.activation", "relu", EVERY, "l. 684: RetinaNet"),
-    ("detector.box_loss", "l1", EVERY, "l. 684: RetinaNet, as in Detectron2"),
-    ("detector.normalisation", "none", EVERY, "l. 684: RetinaNet"),
+    ("detector.losses.box", "l1", EVERY, "l. 684: RetinaNet, as in Detectron2"),
+    ("detector.head.normalisation", "none", EVERY, "l. 684: RetinaNet"),
     ("outer.images_per_object", 50, EVERY, 'l. 686: "we render 50 images for each object class"'),
     ("outer.epochs", 2, EVERY, 'l. 686: "and train RetinaNet for two epochs"'),
     ("outer.start", "previous", EVERY, "l. 686: two epochs an iteration, so it goes on"),
@@ -99,10 +99,10 @@ def test_views_cover_every_distance_that_is_rendered(experiments, name):
 
 def test_anchors_have_three_scales_an_octave_from_32_to_512_pixels(experiments):
     detector = experiments["pose_gap"]["detector"]
-    sizes = [size for level in detector["anchor_sizes"] for size in level]
+    sizes = [size for level in detector["anchors"]["sizes"] for size in level]
     # torchvision takes the whole part.
     assert sizes == [int(32 * 2**level * 2 ** (third / 3)) for level in range(5) for third in range(3)]
-    assert detector["anchor_reference"] is None
+    assert detector["anchors"]["reference"] is None
 
 
 def _differences(one, other, where=""):
@@ -151,5 +151,5 @@ def test_another_method_gets_everything_but_the_method(name, baseline):
 def test_what_the_command_line_names_is_taken():
     made = build(composed("+variant=paper", "field=grid", "detector=tiny", "unlearned.rho_deg=[-45,45]"))
     assert made.config["field"]["field"]["_target_"].endswith("GridField")
-    assert made.config["detector"]["architecture"] == "tiny"
+    assert made.config["detector"]["backbone"]["architecture"] == "tiny"
     assert made.imaging.distribution.ranges["rho"][1] == pytest.approx(0.7853981633974483)

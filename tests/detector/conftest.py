@@ -2,24 +2,26 @@
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head, Losses
+from neural_sim.main import conf_directory
 from neural_sim.types import LabelledImages
 
 CLASSES = 3
 SIZE = 32
 
 
-def make_detector(**changes) -> Detector:
-    settings = {
-        "num_classes": CLASSES,
-        "image_size": SIZE,
-        "anchor_sizes": ((8, 12), (16, 24)),
-        "anchor_reference": SIZE,
-        "channels": 8,
-        "head_convs": 1,
+def make_detector(backbone=(), head=(), anchors=(), losses=(), **others) -> RetinaNet:
+    parts = {
+        "backbone": Backbone(**dict(backbone)),
+        "head": Head(**{"channels": 8, "convs": 1, **dict(head)}),
+        "anchors": Anchors(**{"sizes": ((8, 12), (16, 24)), "reference": SIZE, **dict(anchors)}),
+        "losses": Losses(**dict(losses)),
     }
-    return Detector(**(settings | changes))
+    return RetinaNet(**{"num_classes": CLASSES, "image_size": SIZE, **parts, **others})
 
 
 def make_images(n: int = 4, seed: int = 0, dtype: torch.dtype = torch.float64) -> LabelledImages:
@@ -59,10 +61,16 @@ def noisy(params: dict[str, torch.Tensor], generator: torch.Generator) -> dict[s
 
 
 @torch.no_grad()
-def mean_loss(detector: Detector, params: dict[str, torch.Tensor], images: LabelledImages) -> float:
+def mean_loss(detector: RetinaNet, params: dict[str, torch.Tensor], images: LabelledImages) -> float:
     backbone, trainable = detector.split(params)
     targets = detector.assign(images.boxes, images.labels)
-    return float(detector.loss(trainable, detector.features(backbone, images.images), targets))
+    return float(detector.per_image_loss(trainable, detector.features(backbone, images.images), targets).mean())
+
+
+def configured(name: str):
+    """A choice of ``detector=...``, still without classes and image size."""
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return instantiate(compose("config", [f"detector={name}"]).detector)
 
 
 @pytest.fixture
@@ -71,6 +79,7 @@ def tools():
 
     class Tools:
         detector = staticmethod(make_detector)
+        configured = staticmethod(configured)
         images = staticmethod(make_images)
         double = staticmethod(as_double)
         noisy = staticmethod(noisy)

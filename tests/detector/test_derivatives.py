@@ -5,9 +5,8 @@ import torch
 from torch.func import grad, jvp, vjp
 
 COARSER = {
-    "strides": (8, 16, 32, 64),
-    "anchor_sizes": ((8, 12), (16, 24), (32, 40), (64, 80)),
-    "normalisation": "none",
+    "anchors": {"strides": (8, 16, 32, 64), "sizes": ((8, 12), (16, 24), (32, 40), (64, 80))},
+    "head": {"normalisation": "none"},
 }
 
 
@@ -63,19 +62,19 @@ def test_hessian_is_symmetric_and_the_same_in_both_modes(problem):
 
 
 def test_both_modes_pass_relu_and_l1(tools, generator, images):
-    check_modes(make_problem(tools, generator, images, **COARSER, activation="relu", box_loss="l1"))
+    check_modes(make_problem(tools, generator, images, **COARSER, activation="relu", losses={"box": "l1"}))
 
 
 def check_modes(problem):
     detector, _, trainable, features, targets = problem
-    gradient = grad(lambda p: detector.loss(p, features, targets))
+    gradient = grad(lambda p: detector.per_image_loss(p, features, targets).mean())
     u, v = direction(trainable, 2), direction(trainable, 3)
     _, forward_v = jvp(gradient, (trainable,), (v,))
     _, forward_u = jvp(gradient, (trainable,), (u,))
     torch.testing.assert_close(dot(u, forward_v), dot(v, forward_u), rtol=1e-9, atol=0)
     leaves = {name: value.clone().requires_grad_() for name, value in trainable.items()}
     first = torch.autograd.grad(
-        detector.loss(leaves, features, targets), list(leaves.values()), create_graph=True
+        detector.per_image_loss(leaves, features, targets).mean(), list(leaves.values()), create_graph=True
     )
     product = sum((g * v[name]).sum() for g, name in zip(first, leaves, strict=True))
     second = torch.autograd.grad(product, list(leaves.values()))
@@ -85,7 +84,7 @@ def check_modes(problem):
 
 def test_hessian_is_the_central_difference_of_gradients(problem):
     detector, _, trainable, features, targets = problem
-    gradient = grad(lambda p: detector.loss(p, features, targets))
+    gradient = grad(lambda p: detector.per_image_loss(p, features, targets).mean())
     v = direction(trainable, 4)
     _, product = jvp(gradient, (trainable,), (v,))
     step = 1e-6
@@ -102,7 +101,7 @@ def test_mixed_derivative_in_the_images(problem, images):
 
     def slope(x):
         features = detector.features(backbone, x)
-        return jvp(lambda p: detector.loss(p, features, targets), (trainable,), (v,))[1]
+        return jvp(lambda p: detector.per_image_loss(p, features, targets).mean(), (trainable,), (v,))[1]
 
     cotangent = grad(slope)(images.images)
     along = torch.randn(images.images.shape, generator=torch.Generator().manual_seed(6), dtype=torch.float64)

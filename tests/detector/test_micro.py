@@ -1,24 +1,19 @@
 """The detector whose Hessian fits in memory whole, as its own configuration makes it."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.module import Optimisation
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
 from neural_sim.solver.gauss_newton import GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator
 
-CONF = Path(__file__).parents[2] / "conf" / "detector" / "micro.yaml"
-
 
 @pytest.fixture
-def micro():
-    return instantiate(OmegaConf.load(CONF))
+def micro(tools):
+    return tools.configured("micro")
 
 
 @pytest.mark.parametrize("size", [32, 48])
@@ -30,9 +25,8 @@ def test_it_has_at_most_5000_parameters_and_learns(micro, tools, generator, size
     images = tools.images(4, dtype=torch.float32)
     if size != 32:
         return
-    trained, _ = train_detector(
-        detector, start, images, generator, epochs=60, batch_size=4, learning_rate=1e-2
-    )
+    how = Optimisation(60, batch_size=4, learning_rate=1e-2, weight_decay=1e-2)
+    trained, _ = train_detector(detector, start, images, generator, how)
     assert tools.mean_loss(detector, trained, images) < 0.5 * tools.mean_loss(detector, start, images)
 
 

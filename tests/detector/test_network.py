@@ -1,11 +1,7 @@
 """The published RetinaNet against torchvision's own, whole."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from torchvision.models import resnet50
 from torchvision.models.detection.backbone_utils import _resnet_fpn_extractor
 from torchvision.models.detection.retinanet import RetinaNet, _default_anchorgen
@@ -13,13 +9,12 @@ from torchvision.ops.feature_pyramid_network import LastLevelP6P7
 
 from neural_sim.detector.backbones import group_norm
 
-CONF = Path(__file__).parents[2] / "conf" / "detector" / "retinanet_resnet50.yaml"
 CLASSES = 3
 
 
-@pytest.fixture(scope="module")
-def published():
-    return instantiate(OmegaConf.load(CONF))
+@pytest.fixture
+def published(tools):
+    return tools.configured("retinanet_resnet50")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +74,7 @@ def test_anchors_are_torchvisions(published, size):
 
 def test_levels_below_a_pixel_are_one_pixel(tools, generator):
     detector = tools.detector(
-        image_size=(24, 40), strides=(8, 16, 32, 64), anchor_sizes=((8,), (16,), (32,), (64,))
+        image_size=(24, 40), anchors={"strides": (8, 16, 32, 64), "sizes": ((8,), (16,), (32,), (64,))}
     )
     assert detector.anchors_per_level == [15, 6, 2, 1]
     found = detector.predict(detector.init(generator), torch.rand(2, 3, 24, 40, generator=generator))

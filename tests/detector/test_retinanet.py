@@ -5,8 +5,6 @@ from torchvision.models import resnet18
 from torchvision.models.detection import RetinaNet
 from torchvision.models.detection.anchor_utils import AnchorGenerator
 
-from neural_sim.detector.initialise import initialise
-
 
 class _Nothing(nn.Module):
     out_channels = 8
@@ -19,13 +17,13 @@ def reference(detector, sizes) -> RetinaNet:
         detector.num_classes,
         anchor_generator=AnchorGenerator(sizes, ((1.0,),) * len(sizes)),
         head=detector._predictor.head,
-        detections_per_img=detector.max_detections,
+        detections_per_img=detector._detections.limit,
     )
 
 
 def test_anchors_are_torchvisions(tools):
     sizes = ((8, 12), (16, 24))
-    detector = tools.detector(anchor_sizes=sizes)
+    detector = tools.detector(anchors={"sizes": sizes})
     model = reference(detector, sizes)
     maps = [torch.zeros(1, 8, 4, 4), torch.zeros(1, 8, 2, 2)]
     images = type("Images", (), {"tensors": torch.zeros(1, 3, 32, 32), "image_sizes": [(32, 32)]})()
@@ -41,7 +39,7 @@ def test_anchors_grow_with_the_image(tools):
 
 @pytest.mark.parametrize("activation", ["relu", "silu"])
 def test_loss_is_torchvisions(tools, generator, images, activation):
-    detector = tools.detector(box_loss="l1", activation=activation)
+    detector = tools.detector(losses={"box": "l1"}, activation=activation)
     params = tools.noisy(detector.init(generator), generator)
     backbone, trainable = detector.split(params)
     features = detector.features(backbone, images.images)
@@ -54,7 +52,7 @@ def test_loss_is_torchvisions(tools, generator, images, activation):
     wanted = reference(detector, ((8, 12), (16, 24))).compute_loss(
         truth, {"cls_logits": logits, "bbox_regression": deltas}, [detector.anchors.double()] * len(images)
     )
-    got = detector.loss(trainable, features, detector.assign(images.boxes, images.labels))
+    got = detector.per_image_loss(trainable, features, detector.assign(images.boxes, images.labels)).mean()
     torch.testing.assert_close(got, sum(wanted.values()), rtol=1e-12, atol=0)
 
 
@@ -71,7 +69,7 @@ def test_images_do_not_see_each_other(tools, generator, images):
 
 def test_predict_is_torchvisions(tools, generator, images):
     sizes = ((8, 12), (16, 24))
-    detector = tools.detector(prior_probability=0.2)
+    detector = tools.detector(head={"prior": 0.2})
     params = tools.noisy(detector.init(generator), generator)
     backbone, trainable = detector.split(params)
     logits, deltas = detector.outputs(trainable, detector.features(backbone, images.images))
@@ -91,7 +89,9 @@ def test_predict_is_torchvisions(tools, generator, images):
 @pytest.mark.parametrize("architecture", ["resnet18", "resnet50"])
 def test_resnets_run_on_odd_sizes(tools, generator, architecture):
     detector = tools.detector(
-        architecture=architecture, image_size=(40, 56), strides=(8, 16, 32), anchor_sizes=((8,), (16,), (32,))
+        {"architecture": architecture},
+        image_size=(40, 56),
+        anchors={"strides": (8, 16, 32), "sizes": ((8,), (16,), (32,))},
     )
     params = detector.init(generator)
     backbone, trainable = detector.split(params)
@@ -109,7 +109,7 @@ def test_weights_from_a_file_reach_the_features(tools, generator, tmp_path):
             module.running_mean.normal_(0, 0.1, generator=generator)
             module.running_var.uniform_(0.5, 2, generator=generator)
     torch.save(source.state_dict(), tmp_path / "resnet18.pth")
-    detector = tools.detector(architecture="resnet18", weights=str(tmp_path / "resnet18.pth"))
+    detector = tools.detector({"architecture": "resnet18", "weights": str(tmp_path / "resnet18.pth")})
     params = detector.init(generator)
     image = torch.rand(1, 3, 32, 32, generator=generator)
     maps = detector.features(detector.split(params)[0], image)
@@ -122,11 +122,11 @@ def test_weights_from_a_file_reach_the_features(tools, generator, tmp_path):
     assert all("bn" in name or "downsample.1" in name for name in frozen)
     torch.save({"conv1.weight": torch.zeros(1)}, tmp_path / "wrong.pth")
     with pytest.raises(ValueError, match="does not fit resnet18"):
-        tools.detector(architecture="resnet18", weights=str(tmp_path / "wrong.pth"))
+        tools.detector({"architecture": "resnet18", "weights": str(tmp_path / "wrong.pth")})
 
 
 def test_anchors_without_a_reference_are_pixels(tools):
-    small, large = tools.detector(), tools.detector(image_size=64, anchor_reference=None)
+    small, large = tools.detector(), tools.detector(image_size=64, anchors={"reference": None})
     assert torch.equal(small.anchors[:2], large.anchors[:2])
 
 
@@ -142,39 +142,38 @@ def test_init_depends_on_the_seed_alone(tools):
 
 
 def test_prior_probability_sets_the_first_scores(tools, generator):
-    detector = tools.detector(prior_probability=0.03)
-    state = initialise(detector._predictor, generator, 0.03)
-    bias = state["head.classification_head.cls_logits.bias"]
+    bias = tools.detector(head={"prior": 0.03}).init(generator)["head.classification_head.cls_logits.bias"]
     torch.testing.assert_close(bias.sigmoid(), torch.full_like(bias, 0.03))
 
 
 def test_default_tiny_is_small(generator):
-    from neural_sim.detector.retinanet import Detector
+    from neural_sim.detector.retinanet import RetinaNet
 
-    params = Detector(6).init(generator)
+    params = RetinaNet(6).init(generator)
     assert sum(value.numel() for value in params.values()) < 1_000_000
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"architecture": "vgg"}, "detector.architecture"),
+        ({"backbone": {"architecture": "vgg"}}, "detector.backbone.architecture"),
         ({"activation": "tanh"}, "detector.activation"),
-        ({"box_loss": "huber"}, "detector.box_loss"),
-        ({"strides": (8, 32)}, "detector.strides"),
-        ({"strides": (16, 8)}, "detector.strides"),
-        ({"strides": (8, 16, 64), "anchor_sizes": ((8,),) * 3}, "detector.strides"),
-        ({"strides": (32, 64), "architecture": "tiny"}, "detector.strides"),
-        ({"freeze_backbone": True}, "detector.freeze_backbone"),
-        ({"normalisation": "batch"}, "detector.normalisation"),
-        ({"anchor_reference": 0}, "detector.anchor_reference"),
-        ({"anchor_sizes": ((8,),)}, "detector.anchor_sizes"),
-        ({"anchor_sizes": ((8,), (16, 24))}, "detector.anchor_sizes"),
-        ({"weights": "DEFAULT"}, "detector.weights"),
-        ({"architecture": "resnet18", "weights": "nowhere.pth"}, "detector.weights"),
-        ({"foreground_iou": 0.3}, "detector.foreground_iou"),
-        ({"channels": 12}, "detector.channels"),
-        ({"head_convs": 5}, "detector.head_convs"),
+        ({"losses": {"box": "huber"}}, "detector.losses.box"),
+        ({"anchors": {"strides": (8, 32)}}, "detector.anchors.strides"),
+        ({"anchors": {"strides": (16, 8)}}, "detector.anchors.strides"),
+        ({"anchors": {"strides": (8, 16, 64), "sizes": ((8,),) * 3}}, "detector.anchors.strides"),
+        ({"anchors": {"strides": (32, 64)}}, "detector.anchors.strides"),
+        ({"backbone": {"freeze": True}}, "detector.backbone.freeze"),
+        ({"head": {"normalisation": "batch"}}, "detector.head.normalisation"),
+        ({"anchors": {"reference": 0}}, "detector.anchors.reference"),
+        ({"anchors": {"sizes": ((8,),)}}, "detector.anchors.sizes"),
+        ({"anchors": {"sizes": ((8,), (16, 24))}}, "detector.anchors.sizes"),
+        ({"backbone": {"weights": "DEFAULT"}}, "detector.backbone.weights"),
+        ({"backbone": {"architecture": "resnet18", "weights": "nowhere.pth"}}, "detector.backbone.weights"),
+        ({"anchors": {"foreground_iou": 0.3}}, "detector.anchors.foreground_iou"),
+        ({"head": {"channels": 12}}, "detector.head.channels"),
+        ({"head": {"convs": 5}}, "detector.head.convs"),
+        ({"head": {"prior": 1.0}}, "detector.head.prior"),
         ({"num_classes": 0}, "detector.num_classes"),
     ],
 )

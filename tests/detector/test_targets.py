@@ -7,7 +7,7 @@ from neural_sim.detector.targets import BACKGROUND
 
 
 def test_assign_is_torchvisions_matcher_image_by_image(tools):
-    detector = tools.detector(image_size=96, anchor_sizes=((16, 24), (40, 64)), anchor_reference=96)
+    detector = tools.detector(image_size=96, anchors={"sizes": ((16, 24), (40, 64)), "reference": 96})
     generator = torch.Generator().manual_seed(3)
     corner = torch.rand(40, 3, 2, generator=generator, dtype=torch.float64) * 60
     boxes = torch.cat([corner, corner + 5 + torch.rand(40, 3, 2, generator=generator).double() * 30], dim=-1)

@@ -5,14 +5,14 @@ import torch
 from torchvision.models import resnet18
 
 from neural_sim.detector.cached import CachedSet, cached_features
-from neural_sim.detector.module import DetectorModule
+from neural_sim.detector.module import DetectorModule, Optimisation
 from neural_sim.detector.training import train_detector
 from neural_sim.types import LabelledImages
 
 
-def train(detector, params, images, seed=5, **changes):
-    settings = {"epochs": 2, "batch_size": 3, "learning_rate": 1e-2} | changes
-    return train_detector(detector, params, images, torch.Generator().manual_seed(seed), **settings)
+def train(detector, params, images, seed=5, anchor=None, **changes):
+    how = Optimisation(**{"epochs": 2, "batch_size": 3, "learning_rate": 1e-2, **changes})
+    return train_detector(detector, params, images, torch.Generator().manual_seed(seed), how, anchor)
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_frozen_backbone_is_frozen_and_gives_the_same_loss(tools, generator, ima
 
 
 def test_training_overfits_a_few_images(tools, generator):
-    detector = tools.detector(channels=16)
+    detector = tools.detector(head={"channels": 16})
     images = tools.images(4, dtype=torch.float32)
     start = detector.init(generator)
     trained, history = train(detector, start, images, epochs=60, batch_size=4)
@@ -87,49 +87,49 @@ def test_nothing_to_train_on_is_refused(tools, generator, images):
     start = detector.init(generator)
     with pytest.raises(ValueError, match="train_detector"):
         train(detector, start, images.select(slice(0, 0)))
-    with pytest.raises(ValueError, match="train_detector"):
-        train(detector, start, images, epochs=0)
+    for bad in ("epochs", "batch_size"):
+        with pytest.raises(ValueError, match=f"training.{bad}"):
+            train(detector, start, images, **{bad: 0})
     with pytest.raises(ValueError, match="no images"):
         CachedSet.of(detector, detector.split(start)[0], images.select(slice(0, 0)))
     assert detector.predict(start, images.images[:0]) == []
 
 
 def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, generator, images):
-    detector = tools.detector()
+    detector = tools.detector(proximal=3.0)
     backbone, start = detector.split(detector.init(generator))
     anchor = {name: value + 0.1 for name, value in start.items()}
     targets = detector.assign(images.boxes, images.labels)
     features = cached_features(detector, backbone, images.images)
-    module = DetectorModule(detector, start, backbone, 1, 1e-2, 0.0, 0.1, 3.0, anchor)
+    module = DetectorModule(detector, start, backbone, Optimisation(1), 1, anchor)
     added = float(module.training_step((features, targets), 0).detach()) - float(
-        detector.loss(start, features, targets)
+        detector.per_image_loss(start, features, targets).mean()
     )
     assert added == pytest.approx(1.5 * sum(value.numel() for value in start.values()) * 0.01, rel=1e-4)
     module.on_train_epoch_end()
     module.on_train_end()
-    assert module.epoch_losses == [pytest.approx(float(detector.loss(start, features, targets)), rel=1e-6)]
+    assert module.epoch_losses == [
+        pytest.approx(float(detector.per_image_loss(start, features, targets).mean()), rel=1e-6)
+    ]
 
 
 def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
-    detector = tools.detector()
-    start = detector.init(generator)
-    features = CachedSet.of(detector, detector.split(start)[0], images)
+    start = tools.detector().init(generator)
 
     def distance(proximal):
-        settings = {"epochs": 40, "proximal": proximal, "anchor": start, "weight_decay": 0.0}
-        trained, _ = train(detector, start, features, **settings)
+        detector = tools.detector(proximal=proximal)
+        features = CachedSet.of(detector, detector.split(start)[0], images)
+        trained, _ = train(detector, start, features, anchor=start, epochs=40, weight_decay=0.0)
         return math.sqrt(sum(float((trained[n] - start[n]).square().sum()) for n in start))
 
     assert distance(100.0) < 0.1 * distance(1.0) < 0.1 * distance(0.0)
-    with pytest.raises(ValueError, match="anchor"):
-        train(detector, start, images, proximal=1.0)
 
 
 def test_a_detector_may_keep_its_weights_in_every_training(tools, generator, images, tmp_path):
     torch.manual_seed(0)
     torch.save(resnet18().state_dict(), tmp_path / "resnet18.pth")
     settings = {"architecture": "resnet18", "weights": str(tmp_path / "resnet18.pth")}
-    detector = tools.detector(**settings, freeze_backbone=True)
+    detector = tools.detector({**settings, "freeze": True})
     start = detector.init(generator)
     backbone, trainable = detector.split(start)
     assert set(detector.learnable(start)) == set(trainable)
@@ -138,5 +138,5 @@ def test_a_detector_may_keep_its_weights_in_every_training(tools, generator, ima
     assert not any(torch.equal(trained[name], value) for name, value in trainable.items())
     on_features, same = train(detector, start, CachedSet.of(detector, backbone, images))
     assert history == same and all(torch.equal(trained[name], on_features[name]) for name in start)
-    free = tools.detector(**settings)
+    free = tools.detector(settings)
     assert any("backbone" in name for name in free.learnable(start))

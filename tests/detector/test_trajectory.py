@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.module import DetectorModule
+from neural_sim.detector.module import DetectorModule, Optimisation
 from neural_sim.detector.optimiser import SGD, AdamW
 from neural_sim.detector.training import train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recorder, Recording, Trajectory, segment_length, train
@@ -16,17 +16,21 @@ DOUBLE = torch.float64
 
 @pytest.fixture
 def cached(tools, generator):
-    detector = tools.detector()
+    return _cached(tools, generator, 0.0)
+
+
+def _cached(tools, generator, proximal):
+    detector = tools.detector(proximal=proximal)
     params = tools.noisy(detector.init(generator), generator)
     backbone, _ = detector.split(params)
     return detector, params, CachedSet.of(detector, backbone, tools.images(8))
 
 
-def _recorded(cached, recording, **changes):
+def _recorded(cached, recording, anchor=None, **changes):
     detector, params, images = cached
     settings = {"epochs": 3, "batch_size": 3, "learning_rate": 1e-2, "weight_decay": 0.1} | changes
     generator = torch.Generator().manual_seed(5)
-    return train_detector(detector, params, images, generator, recording=recording, **settings)
+    return train_detector(detector, params, images, generator, Optimisation(**settings), anchor, recording)
 
 
 def _mean_gradient(cached, proximal=0.0, anchor=None):
@@ -47,12 +51,12 @@ def _mean_gradient(cached, proximal=0.0, anchor=None):
 
 
 @pytest.mark.parametrize("proximal", [0.0, 2.0])
-def test_a_recorded_training_is_the_one_that_was_run(cached, proximal):
-    detector, params, _ = cached
+def test_a_recorded_training_is_the_one_that_was_run(tools, generator, proximal):
+    cached = detector, params, _ = _cached(tools, generator, proximal)
     anchor = {name: value + 0.1 for name, value in detector.split(params)[1].items()}
     recording = Recording()
-    trained, history = _recorded(cached, recording, proximal=proximal, anchor=anchor)
-    plain, other = _recorded(cached, None, proximal=proximal, anchor=anchor)
+    trained, history = _recorded(cached, recording, anchor)
+    plain, other = _recorded(cached, None, anchor)
     assert all(torch.equal(trained[name], plain[name]) for name in trained) and history == other
     trajectory = history.trajectory
     assert other.trajectory is None and len(trajectory) == history.steps == 9
@@ -135,7 +139,7 @@ def test_what_was_not_recorded_or_has_no_gradient_is_refused(cached):
     detector, params, _ = cached
     backbone, learned = detector.split(params)
     silent, asked = (
-        DetectorModule(detector, learned, backbone, 3, 1e-2, 0.0, 0.1, recording=recording)
+        DetectorModule(detector, learned, backbone, Optimisation(3), 3, recording=recording)
         for recording in (None, Recording())
     )
     with pytest.raises(ValueError, match="want a recording"):

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem
@@ -166,7 +167,7 @@ class Rooms:
         self.noise = self.distribution.draw_noise(COUNT, generator, DOUBLE)
         self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
         self.nuisance = self.synthesizer.draw_nuisance(COUNT, ROOMS_CAMERA, generator)
-        self.detector = Detector(2, 32, anchor_sizes=((10,), (18,)), channels=8, head_convs=1)
+        self.detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,))), head=Head(8, 1))
         params = {name: value.double() for name, value in self.detector.init(generator).items()}
         self.backbone, self.trainable = self.detector.split(params)
         flat = flatten(self.trainable)

@@ -8,7 +8,9 @@ import torch
 from trips import counted
 
 from neural_sim import devices
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.training import Training
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.unrolled import Examples
@@ -27,14 +29,14 @@ from neural_sim.synthesis.scene import join
 from neural_sim.synthesis.training_set import Synthesizer
 
 TINY = {
-    "num_classes": 2, "image_size": 32, "anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8,
-    "head_convs": 1, "architecture": "micro",
+    "num_classes": 2, "image_size": 32, "anchors": Anchors(sizes=((10,), (18,)), reference=32), "head": Head(8, 1),
+    "backbone": Backbone("micro"),
 }  # fmt: skip
 
 
 def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
     generator = torch.Generator().manual_seed(0)
-    detector, psi = Detector(**TINY), torch.zeros(2, 4)
+    detector, psi = RetinaNet(**TINY), torch.zeros(2, 4)
     scene = dataclasses.replace(
         scene,
         fields=tuple(copy.deepcopy(field).to(device) for field in scene.fields),
@@ -51,7 +53,16 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
         **outer,
     )
     params = devices.placed(detector.init(generator), torch.device(device))
-    inner = InnerLoop(scene, detector, params, validation, settings, 4, 0.0, generator, estimator.draws)
+    inner = InnerLoop(
+        scene,
+        detector,
+        params,
+        validation,
+        settings,
+        Training(batch_size=4, weight_decay=0.0),
+        generator,
+        estimator.draws,
+    )
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=2), max_steps=3)
     return SimulatorModule(inner, psi, estimator, solver)
 

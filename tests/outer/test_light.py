@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
+from neural_sim.detector.training import Training
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.mixed import scores
@@ -29,7 +31,7 @@ from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
 ANCHORS, DOUBLE = 3, torch.float64
-DETECTOR = {"anchor_sizes": ((10,), (18,)), "anchor_reference": 32, "channels": 8, "head_convs": 1}
+DETECTOR = {"anchors": Anchors(sizes=((10,), (18,)), reference=32), "head": Head(8, 1)}
 
 
 def _field(seed, dtype=torch.float32):
@@ -54,7 +56,7 @@ def _scene(dtype=torch.float32, parameters=None):
 
 def test_the_derivative_by_weights_against_central_differences():
     scene, generator, estimator = _scene(DOUBLE), torch.Generator().manual_seed(0), PathwiseEstimator()
-    detector = Detector(2, 32, **DETECTOR)
+    detector = RetinaNet(2, 32, **DETECTOR)
     params = {name: value.double() for name, value in detector.init(generator).items()}
     backbone, trainable = detector.split(params)
     vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
@@ -105,7 +107,7 @@ def test_probes_are_the_same_scenes_under_one_light_after_the_other():
 def test_the_derivative_across_lights_is_that_of_a_mixture():
     """d/dw_i of sum_j w_j s_j, s_j the mean <dl/dtheta, v> of images under light j, against autograd of that sum."""
     scene, generator = _scene(DOUBLE), torch.Generator().manual_seed(0)
-    detector = Detector(2, 32, **DETECTOR)
+    detector = RetinaNet(2, 32, **DETECTOR)
     params = {name: value.double() for name, value in detector.init(generator).items()}
     backbone, trainable = detector.split(params)
     vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
@@ -142,7 +144,7 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
 def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estimator, adjoint):
     scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
-    detector = Detector(2, 32, **DETECTOR)
+    detector = RetinaNet(2, 32, **DETECTOR)
     validation = join(scene.training_set(start.float(), 3, generator, HARD))
     light_update = Mirror(0.6, max_step=1.0, shrink=False)
     settings = Outer(
@@ -150,7 +152,14 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
         train_first=adjoint == "unrolled", adjoint=adjoint,
     )  # fmt: skip
     inner = InnerLoop(
-        scene, detector, detector.init(generator), validation, settings, 4, 0.0, generator, estimator.draws
+        scene,
+        detector,
+        detector.init(generator),
+        validation,
+        settings,
+        Training(batch_size=4, weight_decay=0.0),
+        generator,
+        estimator.draws,
     )
     assert inner.pool is None  # a light that moves makes stored images stale
     learned = learn_psi(SimulatorModule(inner, start, estimator, AdjointSolver(max_steps=4)), progress=False)

@@ -9,7 +9,8 @@ import torch
 from small_loop import small_loop
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
@@ -102,7 +103,7 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
     synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
     wide = dataclasses.replace(scene, fields=fields, distribution=distribution, synthesizer=synthesizer)
     generator = torch.Generator().manual_seed(1)
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     params = {name: value.double() for name, value in detector.init(generator).items()}
     backbone, trainable = detector.split(params)
     vector = {
@@ -168,7 +169,7 @@ def test_probes_cover_every_bin_equally(scene):
 
 def test_cached_losses_equal_losses_from_images(scene):
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     backbone, trainable = detector.split(detector.init(generator))
     images = join(scene.training_set(torch.zeros(2, 4), 4, generator))
     cached = CachedSet.of(detector, backbone, images)

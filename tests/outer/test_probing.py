@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.targets import Targets
+from neural_sim.detector.training import Training
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
@@ -45,7 +47,7 @@ def _probes(per_bin: int, mark: int) -> ProbeSet:
         }
         for label in range(OBJECTS)
     ]
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     targets = Targets((mark + rows)[:, None], (mark + rows).float()[:, None, None].expand(-1, 1, 4))
     return ProbeSet(named, CachedSet(detector, ((mark + rows).float()[:, None],), targets), per_bin)
 
@@ -95,10 +97,18 @@ def scene():
 
 def test_the_loop_draws_a_part_of_its_probes_anew(scene):
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(1, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = join(scene.training_set(torch.zeros(1, 4), 2, generator))
     settings = Outer(Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2)
-    inner = InnerLoop(scene, detector, detector.init(generator), validation, settings, 2, 0.0, generator)
+    inner = InnerLoop(
+        scene,
+        detector,
+        detector.init(generator),
+        validation,
+        settings,
+        Training(batch_size=2, weight_decay=0.0),
+        generator,
+    )
     module = SimulatorModule(
         inner, torch.zeros(1, 4), StratifiedEstimator(probes_per_bin=4), AdjointSolver(max_steps=2)
     )
@@ -115,10 +125,18 @@ def test_the_loop_draws_a_part_of_its_probes_anew(scene):
 def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
     two = dataclasses.replace(scene, names=("a", "b"), fields=scene.fields * 2)
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = join(two.training_set(psi, 2, generator))
     settings = Outer(Mirror(shrink=False), 2, 2, epochs=1, curvature_images=2, pool_per_bin=2, learned=("b",))
-    inner = InnerLoop(two, detector, detector.init(generator), validation, settings, 2, 0.0, generator)
+    inner = InnerLoop(
+        two,
+        detector,
+        detector.init(generator),
+        validation,
+        settings,
+        Training(batch_size=2, weight_decay=0.0),
+        generator,
+    )
     module = SimulatorModule(inner, psi, StratifiedEstimator(probes_per_bin=2), AdjointSolver(max_steps=2))
     learned = learn_psi(module, progress=False)
     assert module._probes is not None and not module._probes.probes[0] and module._probes.probes[1]

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.base import Probes
 from neural_sim.gradient.hypergradient import hypergradient
 from neural_sim.outer.retrained import (
@@ -51,9 +52,7 @@ def stripes(labels, bins, generator):
 def problem():
     """Two objects, three bins, the head of a micro detector trained to stationarity; one image a bin and object."""
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(
-        2, 32, "micro", strides=(8,), anchor_sizes=((16,),), anchor_reference=32, channels=8, head_convs=1
-    )
+    detector = RetinaNet(2, 32, Backbone("micro"), Head(8, 1), Anchors((8,), ((16,),), 32))
     params = detector.init(generator)
     backbone, trainable = detector.split(params)
     fixed = {name: value.double() for name, value in trainable.items() if not name.startswith("head.")}
@@ -135,7 +134,7 @@ def test_a_binned_problem_takes_the_first_images_of_every_bin(generator):
     bins = torch.tensor([2, 0, 0, 1, 2])
     kept = first_of_every_bin(Probes(torch.arange(5) + 10, bins), 1)
     assert kept.index.tolist() == [11, 13, 10] and kept.bins.tolist() == [0, 1, 2]
-    detector = Detector(2, 32, "micro", anchor_sizes=((14,), (28,)), channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,))))
     params = detector.init(generator)
     backbone, trainable = detector.split(params)
     labels, every = torch.zeros(6, dtype=torch.long), torch.arange(3).repeat_interleave(2)

@@ -7,7 +7,9 @@ import torch
 
 from neural_sim.baseline.lts import LearningToSimulate
 from neural_sim.baseline.search import RandomSearch
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
+from neural_sim.detector.training import Training
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.rewarded import RewardLoop
@@ -21,11 +23,12 @@ from neural_sim.synthesis.scene import join
 @pytest.fixture
 def inner(scene):
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = join(scene.training_set(torch.zeros(2, 4), 3, generator))
     settings = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
     return lambda: InnerLoop(
-        scene, detector, detector.init(torch.Generator().manual_seed(1)), validation, settings, 4, 0.0,
+        scene, detector, detector.init(torch.Generator().manual_seed(1)), validation, settings,
+        Training(batch_size=4, weight_decay=0.0),
         torch.Generator().manual_seed(2),
     )  # fmt: skip
 

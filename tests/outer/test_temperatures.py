@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.still import StillLoop
 from neural_sim.outer.temperatures import Temperatures, against, bin_shares
@@ -48,14 +49,7 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
     """At a temperature of 1e-4 no draw is near a tie: all of the truth is missed."""
     psi = torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    detector = Detector(
-        num_classes=2,
-        image_size=32,
-        anchor_sizes=((10,), (18,)),
-        anchor_reference=32,
-        channels=8,
-        head_convs=1,
-    )
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     theta, validation = detector.init(generator), join(scene.training_set(psi, 3, generator))
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     images = join(scene.training_set(psi, 4, generator))

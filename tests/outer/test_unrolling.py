@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.training import Training
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.unrolled import Examples
@@ -24,8 +26,9 @@ from neural_sim.solver.hvp import gradient
 from neural_sim.solver.solution import Status
 from neural_sim.synthesis.scene import join
 
-MICRO = {"architecture": "micro", "anchor_sizes": ((14,), (28,)), "anchor_reference": 48, "channels": 8,
-         "head_convs": 1}  # fmt: skip
+MICRO = {
+    "backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)), reference=48), "head": Head(8, 1)
+}  # fmt: skip
 ESTIMATORS = [
     PathwiseEstimator(), PathwiseEstimator("reverse"), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()
 ]  # fmt: skip
@@ -34,7 +37,7 @@ EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, score_every=1)
 
 def _module(scene, estimator, psi=None, **outer):
     generator = torch.Generator().manual_seed(0)
-    detector, psi = Detector(2, 32, **MICRO), torch.zeros(2, 4) if psi is None else psi
+    detector, psi = RetinaNet(2, 32, **MICRO), torch.zeros(2, 4) if psi is None else psi
     params = detector.init(generator)
     settings = {
         "iterations": 2, "images_per_object": 6, "epochs": 2, "train_first": True, "adjoint": "unrolled",
@@ -42,7 +45,16 @@ def _module(scene, estimator, psi=None, **outer):
     }  # fmt: skip
     validation = join(scene.training_set(psi, 3, generator))
     chosen = Outer(Mirror(shrink=False), **(settings | outer))
-    inner = InnerLoop(scene, detector, params, validation, chosen, 4, 0.01, generator, estimator.draws)
+    inner = InnerLoop(
+        scene,
+        detector,
+        params,
+        validation,
+        chosen,
+        Training(batch_size=4, weight_decay=0.01),
+        generator,
+        estimator.draws,
+    )
     return SimulatorModule(inner, psi, estimator, AdjointSolver())
 
 

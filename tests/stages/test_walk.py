@@ -61,10 +61,8 @@ def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distr
     scene = context.results(graph.scene)
     drawn = join(scene.training_set(graph.psi("initial"), training.images_per_object, generator))
     params, _ = train_detector(
-        detector, detector.init(generator), drawn, generator, epochs=training.cold_epochs,
-        batch_size=training.batch_size, learning_rate=training.learning_rate,
-        weight_decay=training.weight_decay, progress=False,
-    )  # fmt: skip
+        detector, detector.init(generator), drawn, generator, training.of(training.cold_epochs)
+    )
     val, test = (
         evaluate(detector.predict(params, part.images), part, list(graph.names)).ap
         for part in (targets.val, targets.test)

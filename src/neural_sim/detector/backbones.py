@@ -144,7 +144,7 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     else:
         names = list(get_model_weights(architecture).__members__)
         if weights not in (*names, "DEFAULT"):
-            raise ValueError(f"detector.weights: want a file or one of {names}, got {weights!r}")
+            raise ValueError(f"detector.backbone.weights: want a file or one of {names}, got {weights!r}")
         state = get_model(architecture, weights=weights).state_dict()
     state = {k: v for k, v in state.items() if not k.startswith("fc.") and "num_batches" not in k}
     template = get_model(architecture).state_dict()
@@ -153,7 +153,9 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
         k for k in wanted.keys() | state.keys() if k not in state or state[k].shape != wanted.get(k)
     )
     if wrong:
-        raise ValueError(f"detector.weights: {weights} does not fit {architecture}, first at {wrong[:3]}")
+        raise ValueError(
+            f"detector.backbone.weights: {weights} does not fit {architecture}, first at {wrong[:3]}"
+        )
     return state
 
 
@@ -168,7 +170,7 @@ def build_backbone(
     if architecture in PLANS:
         if weights is not None:
             raise ValueError(
-                f"detector.weights: {architecture} has no published weights, got {weights!r}, want null"
+                f"detector.backbone.weights: {architecture} has no published weights, got {weights!r}, want null"
             )
         return StridedBackbone(PLANS[architecture], strides, activation)
     return ResNetBackbone(architecture, strides, activation, weights)

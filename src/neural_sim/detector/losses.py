@@ -9,8 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-BOX_LOSSES = ("pseudo_huber", "l1")
-
 
 def focal_loss(
     logits: Float[Tensor, "*shape"], targets: Float[Tensor, "*shape"], alpha: float, gamma: float

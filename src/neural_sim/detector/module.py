@@ -4,23 +4,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from neural_sim.checks import at_least
 from neural_sim.detector.losses import proximal_loss
 from neural_sim.detector.optimiser import AdamW, State
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import Recorder, Recording, Trajectory
 
 Batch = tuple[tuple[Tensor, ...], Targets]
 
 
+@dataclass(frozen=True)
+class Optimisation:
+    """How a detector is trained: AdamW with linear warm-up and cosine decay to zero.
+
+    Args:
+        epochs, batch_size: the budget of steps.
+        learning_rate: at its peak.
+        weight_decay: decoupled, on convolution weights only.
+        warmup_fraction: part of the steps over which the learning rate rises.
+
+    Raises:
+        ValueError: no epochs or no batch size.
+    """
+
+    epochs: int
+    batch_size: int = 32
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-4
+    warmup_fraction: float = 0.1
+
+    def __post_init__(self) -> None:
+        at_least("training", 1, epochs=self.epochs, batch_size=self.batch_size)
+
+
 class DetectorModule(pl.LightningModule):
-    """Minimises the detector's mean loss over ``learned`` with AdamW, linear warm-up and cosine decay to zero.
+    """Minimises the detector's mean loss over ``learned``.
 
     Batches are (inputs, targets). Inputs are the images (one tensor [n, 3, h, w]) where the backbone is learned,
     else the features of the frozen backbone (one tensor for each level).
@@ -29,10 +55,7 @@ class DetectorModule(pl.LightningModule):
         learned: parameters that are trained; copied.
         fixed: all others; never written to.
         total_steps: optimiser steps until the learning rate reaches zero.
-        learning_rate: at its peak.
-        weight_decay: decoupled, on convolution weights only.
-        warmup_fraction: part of ``total_steps`` in which the learning rate rises.
-        proximal: adds ``proximal / 2 |learned - anchor|^2`` to the loss; ``anchor`` holds the learned names.
+        anchor: of the detector's proximal term, which is left out without it; holds the learned names.
         recording: what is kept of the steps, for :meth:`trajectory`.
 
     Raises:
@@ -44,11 +67,8 @@ class DetectorModule(pl.LightningModule):
         detector: Detector,
         learned: Parameters,
         fixed: Parameters,
+        how: Optimisation,
         total_steps: int,
-        learning_rate: float,
-        weight_decay: float,
-        warmup_fraction: float,
-        proximal: float = 0.0,
         anchor: Parameters | None = None,
         recording: Recording | None = None,
     ) -> None:
@@ -56,12 +76,11 @@ class DetectorModule(pl.LightningModule):
         self.detector = detector
         self._names = list(learned)
         self._values = nn.ParameterList([nn.Parameter(value.detach().clone()) for value in learned.values()])
-        self._proximal = proximal
         self._anchor = anchor
         self._fixed = {name: value.detach() for name, value in fixed.items()}
-        self._on_features = not any(name.startswith("backbone.") for name in learned)
-        self.total_steps, self.warmup_steps = total_steps, math.ceil(warmup_fraction * total_steps)
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+        self._on_features = not set(learned) & set(detector.split({**fixed, **learned})[0])
+        self.how, self.total_steps = how, total_steps
+        self.warmup_steps = math.ceil(how.warmup_fraction * total_steps)
         self.epoch_losses: list[float] = []
         self.steps_done = 0
         self._losses: list[Tensor] = []
@@ -90,12 +109,12 @@ class DetectorModule(pl.LightningModule):
         learned = dict(zip(self._names, self._values, strict=True))
         backbone, trainable = self.detector.split({**self._fixed, **learned})
         features = inputs if self._on_features else self.detector.features(backbone, inputs[0])
-        loss = self.detector.loss(trainable, features, targets)
+        loss = self.detector.per_image_loss(trainable, features, targets).mean()
         self._losses.append(loss.detach())
         self._sizes.append(len(targets))
-        if self._proximal == 0.0 or self._anchor is None:
+        if self.detector.proximal == 0.0 or self._anchor is None:
             return loss
-        return loss + proximal_loss(learned, self._anchor, self._proximal)
+        return loss + proximal_loss(learned, self._anchor, self.detector.proximal)
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning's own version refuses frozen dataclasses.
@@ -136,16 +155,16 @@ class DetectorModule(pl.LightningModule):
         decayed = [value for value in self._values if value.ndim > 1]
         others = [value for value in self._values if value.ndim <= 1]
         groups = [
-            {"params": decayed, "weight_decay": self.weight_decay},
+            {"params": decayed, "weight_decay": self.how.weight_decay},
             {"params": others, "weight_decay": 0.0},
         ]
-        optimiser = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
+        optimiser = torch.optim.AdamW(groups, lr=self.how.learning_rate, fused=True)
         schedule = LambdaLR(optimiser, self._rate)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def _decay(self) -> Tensor:
         """The weight decay of each entry of the learned parameters."""
-        decays = [self.weight_decay if value.ndim > 1 else 0.0 for value in self._values]
+        decays = [self.how.weight_decay if value.ndim > 1 else 0.0 for value in self._values]
         return torch.cat(
             [
                 value.detach().new_full((value.numel(),), decay)

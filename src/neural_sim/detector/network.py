@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -15,9 +14,7 @@ from torchvision.ops import FeaturePyramidNetwork
 from torchvision.ops.feature_pyramid_network import ExtraFPNBlock
 
 from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, group_norm, set_activation
-
-Normalisation = Literal["group", "none"]
-"""Of the pyramid and the head, see :func:`backbones.group_norm`."""
+from neural_sim.detector.settings import Anchors, Head
 
 
 class NormalisedBackbone(nn.Module):
@@ -73,38 +70,29 @@ class Predictor(nn.Module):
 
 
 def build_predictor(
-    in_channels: list[int],
-    channels: int,
-    anchors: list[int],
-    num_classes: int,
-    head_convs: int,
-    activation: str,
-    normalisation: Normalisation = "group",
+    in_channels: list[int], levels: int, anchors: int, num_classes: int, settings: Head, activation: str
 ) -> Predictor:
-    """The pyramid and head; ``anchors`` are the anchors per location of each level, those of levels past the last of
-    ``in_channels`` included.
-
-    Raises:
-        ValueError: where levels differ in anchors per location: they share one head.
-    """
-    if len(set(anchors)) != 1:
-        raise ValueError(f"detector.anchor_sizes: want equally many sizes on every level, got {anchors}")
-    norm = group_norm if normalisation == "group" else None
-    coarser = len(anchors) - len(in_channels)
+    """The pyramid of ``levels``, those past the last of ``in_channels`` included, and the head, which has ``anchors``
+    at each location."""
+    channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
+    coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
     fpn = FeaturePyramidNetwork(in_channels, channels, extra, norm)
-    head = RetinaNetHead(channels, anchors[0], num_classes, norm_layer=norm)
+    head = RetinaNetHead(channels, anchors, num_classes, norm_layer=norm)
     for branch in (head.classification_head, head.regression_head):
-        branch.conv = branch.conv[:head_convs]
+        branch.conv = branch.conv[: settings.convs]
     predictor = Predictor(fpn, head)
     set_activation(predictor, activation)
     return predictor
 
 
 def fixed_anchors(
-    generator: AnchorGenerator, image_size: tuple[int, int], strides: tuple[int, ...]
+    settings: Anchors, image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
     """Anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
+    scale = 1.0 if settings.reference is None else min(image_size) / settings.reference
+    sizes = tuple(tuple(scale * size for size in level) for level in settings.sizes)
+    generator, strides = AnchorGenerator(sizes, (tuple(settings.ratios),) * len(sizes)), settings.strides
     # A strided convolution of padding 1 leaves ceil(size / 2) pixels, so at least one.
     grids = [[-(-side // stride) for side in image_size] for stride in strides]
     steps = [[torch.tensor(stride), torch.tensor(stride)] for stride in strides]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neural_sim.checks import at_least
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.module import Batch, DetectorModule
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.module import Batch, DetectorModule, Optimisation
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import trainer_on
@@ -29,7 +29,7 @@ class Training:
     warm_epochs: int = 30
     cold_epochs: int = 30
     batch_size: int = 32
-    learning_rate: float = 2e-3
+    learning_rate: float = 3e-3
     weight_decay: float = 1e-4
 
     def __post_init__(self) -> None:
@@ -37,6 +37,10 @@ class Training:
         at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
         at_least("training", 16, image_size=self.image_size)
         at_least("training", 0, learning_rate=self.learning_rate, weight_decay=self.weight_decay)
+
+    def of(self, epochs: int) -> Optimisation:
+        """A training of this many epochs."""
+        return Optimisation(epochs, self.batch_size, self.learning_rate, self.weight_decay)
 
 
 @dataclass(frozen=True)
@@ -73,23 +77,16 @@ def train_detector(
     params: Parameters,
     images: LabelledImages | CachedSet,
     generator: torch.Generator,
-    epochs: int = 30,
-    batch_size: int = 32,
-    learning_rate: float = 3e-3,
-    weight_decay: float = 1e-2,
-    warmup_fraction: float = 0.1,
-    progress: bool = False,
-    proximal: float = 0.0,
+    how: Optimisation,
     anchor: Parameters | None = None,
     recording: Recording | None = None,
 ) -> tuple[Parameters, TrainingHistory]:
-    """Train from ``params`` with AdamW, warm-up and cosine decay to zero; ``params`` itself stays as it is.
+    """Train from ``params``, which stay as they are.
 
     Args:
         images: on the device of ``params``; where they come as features, or the detector freezes its backbone, the
             pyramid and the head alone are trained.
-        warmup_fraction: part of the steps over which the learning rate rises linearly.
-        proximal, anchor: add ``proximal / 2 |theta - anchor|^2`` over what is trained to the loss.
+        anchor: theta_0, which adds the detector's proximal term over what is trained to the loss; None: without it.
         recording: what the history keeps of the steps (None: nothing).
 
     Returns:
@@ -97,38 +94,30 @@ def train_detector(
         leave the proximal term out.
 
     Raises:
-        ValueError: without images, epochs or a batch size; for a proximal term without its anchor; for a recording
-            that does not fit its memory.
+        ValueError: without images; for a recording that does not fit its memory.
     """
-    if len(images) == 0 or epochs < 1 or batch_size < 1:
-        raise ValueError(
-            f"train_detector: want images, epochs and batch_size, got {len(images)}, {epochs}, {batch_size}"
-        )
-    if proximal > 0.0 and anchor is None:
-        raise ValueError(f"train_detector: proximal {proximal} wants its anchor theta_0, got None")
-    if detector.freeze_backbone and not isinstance(images, CachedSet):
-        images = CachedSet.of(detector, detector.split(params)[0], images)
+    if len(images) == 0:
+        raise ValueError("train_detector: got no images, want at least one")
+    fixed, learned = detector.split(params)
+    names = set(detector.learnable(params))
+    if not names & set(fixed) and not isinstance(images, CachedSet):
+        images = CachedSet.of(detector, fixed, images)
     if isinstance(images, CachedSet):
-        fixed, learned = detector.split(params)
         inputs, targets = images.features, images.targets
     else:
-        names = set(detector.learnable(params))
         learned = {name: value for name, value in params.items() if name in names}
         fixed = {name: value for name, value in params.items() if name not in names}
         inputs, targets = (images.images,), detector.assign(images.boxes, images.labels)
-    batches = Batches(inputs, targets, batch_size, generator)
-    module = DetectorModule(
-        detector, learned, fixed, epochs * len(batches), learning_rate, weight_decay, warmup_fraction,
-        proximal, anchor, recording,
-    )  # fmt: skip
-    _fit(module, batches, epochs, progress, next(iter(learned.values())).device)
+    batches = Batches(inputs, targets, how.batch_size, generator)
+    module = DetectorModule(detector, learned, fixed, how, how.epochs * len(batches), anchor, recording)
+    _fit(module, batches, next(iter(learned.values())).device)
     values = {**fixed, **module.parameters_by_name()}
     trajectory = module.trajectory(batches.drawn) if recording else None
     history = TrainingHistory(tuple(module.epoch_losses), module.steps_done, trajectory)
     return {name: values[name] for name in params}, history
 
 
-def _fit(module: DetectorModule, batches: Batches, epochs: int, progress: bool, device: torch.device) -> None:
+def _fit(module: DetectorModule, batches: Batches, device: torch.device) -> None:
     """Run Lightning's loop with everything off that writes files or talks."""
     talker = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     level = talker.level
@@ -136,6 +125,6 @@ def _fit(module: DetectorModule, batches: Batches, epochs: int, progress: bool, 
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="lightning")
-            trainer_on(device, epochs, progress).fit(module, batches)
+            trainer_on(device, module.how.epochs, progress=False).fit(module, batches)
     finally:
         talker.setLevel(level)

@@ -7,7 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
 from neural_sim.synthesis.scene import RenderedObject, Scene

@@ -6,14 +6,15 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector, Parameters
-from neural_sim.detector.training import train_detector
+from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.detector.training import Training, train_detector
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.settings import Outer
@@ -44,6 +45,7 @@ class InnerLoop:
     an iteration asks, on the device of ``params``, where the scene's fields are too. ``validation`` is the labelled
     target set, anywhere; no step sees any other real image. ``draws`` says how the method wants images drawn. Relaxed
     ones, and those under a light that moves, are always rendered anew, all others come from a pool of every bin.
+    The batch size and the decay of its steps are those of ``training``.
     ``images`` and ``steps`` count labelled images made and optimiser steps; ``cpu_begun`` is the processor time at
     which the pool was begun.
     """
@@ -55,13 +57,12 @@ class InnerLoop:
         params: Parameters,
         validation: LabelledImages,
         settings: Outer,
-        batch_size: int,
-        weight_decay: float,
+        training: Training,
         generator: torch.Generator,
         draws: Draws = HARD,
     ) -> None:
         self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
-        self.batch_size, self.weight_decay, self.generator = batch_size, weight_decay, generator
+        self.training, self.generator = training, generator
         self.backbone, self.warm_start = detector.split(params)
         self.validation = CachedSet.of(detector, self.backbone, validation)
         self.draws, self.device = draws, self.validation.device
@@ -97,19 +98,13 @@ class InnerLoop:
         """
         if self.settings.epochs == 0:
             return math.nan
+        how = replace(self.training.of(self.settings.epochs), learning_rate=self.settings.learning_rate)
+        # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
+        if self.detector.proximal > 0.0:
+            how = replace(how, weight_decay=0.0)
+        start = self.theta if self.settings.start == "previous" else self._start
         self.theta, history = train_detector(
-            self.detector,
-            self.theta if self.settings.start == "previous" else self._start,
-            images,
-            self.generator,
-            epochs=self.settings.epochs,
-            batch_size=self.batch_size,
-            learning_rate=self.settings.learning_rate,
-            # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
-            weight_decay=0.0 if self.detector.proximal > 0.0 else self.weight_decay,
-            proximal=self.detector.proximal,
-            anchor=self.warm_start,
-            recording=recording,
+            self.detector, start, images, self.generator, how, self.warm_start, recording
         )
         self.steps += history.steps
         self.trajectory = history.trajectory

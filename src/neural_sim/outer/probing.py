@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Probes
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.synthesis.scene import RenderedObject, Scene, join

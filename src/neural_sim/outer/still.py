@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Losses, MixedDerivative
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores

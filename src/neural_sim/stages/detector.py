@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.retinanet import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.cost import Cost
@@ -79,10 +79,12 @@ class DetectorStage(Stage[TrainedDetector]):
         begun, cpu_begun = time.perf_counter(), time.process_time()
         images = join(self.images(scene, generator))
         params, history = train_detector(
-            detector, placed(detector.init(generator), self.device), images, generator, epochs=self.epochs,
-            batch_size=training.batch_size, learning_rate=training.learning_rate,
-            weight_decay=training.weight_decay, progress=False,
-        )  # fmt: skip
+            detector,
+            placed(detector.init(generator), self.device),
+            images,
+            generator,
+            training.of(self.epochs),
+        )
         synchronise(self.device)
         cost = Cost(
             images=len(images),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.protocol import Detector
 from neural_sim.detector.training import Training
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.base import MixedDerivative, Params
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.solver.adjoint import AdjointSolver
@@ -190,7 +191,7 @@ def untrained_detector(scope: Scope) -> Checks:
     derivative of the loss along the gradient itself, extrapolated from two central differences (Richardson). The
     tolerance is that reference's own error: what the extrapolation changed, and eps L / step.
     """
-    detector = Detector(2, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     start = {name: value.double() for name, value in detector.init(scope.generator()).items()}
     backbone, head = detector.split(start)
     pixels = torch.rand(3, 3, 32, 32, generator=scope.generator(), dtype=DOUBLE)

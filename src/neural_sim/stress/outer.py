@@ -10,7 +10,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
+from neural_sim.detector.training import Training
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
@@ -193,14 +195,22 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
         synthesizer,
         SceneDistribution.of([Pose(bins=4)]),
     )
-    network = Detector(1, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    network = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     psi = torch.zeros(1, 4)
     validation = join(scene.training_set(psi, 2, generator))
     settings = Outer(
         Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
         on_untrusted=choice,
     )  # fmt: skip
-    inner = InnerLoop(scene, network, network.init(generator), validation, settings, 3, 0.0, generator)
+    inner = InnerLoop(
+        scene,
+        network,
+        network.init(generator),
+        validation,
+        settings,
+        Training(batch_size=3, weight_decay=0.0),
+        generator,
+    )
     return SimulatorModule(
         inner,
         psi,

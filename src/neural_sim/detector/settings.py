@@ -1,0 +1,155 @@
+"""What a RetinaNet is made of, each part with what belongs together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Normalisation = Literal["group", "none"]
+"""Of the pyramid and the head, see :func:`backbones.group_norm`."""
+BoxLoss = Literal["pseudo_huber", "l1"]
+ARCHITECTURES = {
+    "micro": (8, 16),
+    "tiny": (8, 16),
+    "resnet18": (4, 8, 16, 32),
+    "resnet50": (4, 8, 16, 32),
+}
+"""Strides of the backbones' maps."""
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """The network that makes feature maps of images.
+
+    Args:
+        architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
+        weights: of the ResNets: None, a file with a torchvision state dictionary, or torchvision's name of the weights.
+        freeze: it keeps ``weights`` in every training. It is always frozen in the psi loop.
+    """
+
+    architecture: str = "tiny"
+    weights: str | None = None
+    freeze: bool = False
+
+    def __post_init__(self) -> None:
+        check(
+            "detector.backbone",
+            architecture=(
+                self.architecture,
+                self.architecture in ARCHITECTURES,
+                f"one of {tuple(ARCHITECTURES)}",
+            ),
+            freeze=(
+                self.freeze,
+                not self.freeze or self.weights is not None,
+                "detector.backbone.weights too, since a frozen backbone without them is random",
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Head:
+    """The feature pyramid, and the head that its levels share.
+
+    Args:
+        channels: of both, a multiple of 8.
+        convs: convolutions in each branch of the head, 1 to 4.
+        normalisation: of both, ``group`` or ``none`` (torchvision's own).
+        prior: foreground probability that the untrained head predicts.
+    """
+
+    channels: int = 48
+    convs: int = 2
+    normalisation: Normalisation = "group"
+    prior: float = 0.01
+
+    def __post_init__(self) -> None:
+        kinds = get_args(Normalisation)
+        check(
+            "detector.head",
+            channels=(
+                self.channels,
+                self.channels >= 8 and self.channels % 8 == 0,
+                "a positive multiple of 8",
+            ),
+            convs=(self.convs, 1 <= self.convs <= 4, "1 to 4"),
+            normalisation=(self.normalisation, self.normalisation in kinds, f"one of {kinds}"),
+            prior=(self.prior, 0 < self.prior < 1, "inside (0, 1)"),
+        )
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """The boxes that predictions start from, and which of them should find which object.
+
+    Args:
+        strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last for each
+            of any coarser levels, see :class:`network.CoarserLevels`.
+        sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side is
+            ``reference``; they scale with the image's.
+        reference: that side in pixels; None: sizes are pixels of any image, as in torchvision.
+        ratios: of every anchor, height / width.
+        foreground_iou, background_iou: overlaps from which an anchor is foreground, below which background.
+    """
+
+    strides: Sequence[int] = (8, 16)
+    sizes: Sequence[Sequence[float]] = ((22, 28, 36), (46, 58, 74))
+    reference: float | None = 96
+    ratios: Sequence[float] = (1.0,)
+    foreground_iou: float = 0.5
+    background_iou: float = 0.4
+
+    def __post_init__(self) -> None:
+        counts, low = [len(level) for level in self.sizes], self.background_iou
+        check(
+            "detector.anchors",
+            reference=(self.reference, self.reference is None or self.reference > 0, "above 0, or null"),
+            sizes=(
+                self.sizes,
+                len(counts) == len(self.strides) and len(set(counts)) == 1,
+                "one list for each stride, all of them equally long",
+            ),
+            foreground_iou=(self.foreground_iou, low <= self.foreground_iou <= 1, "background_iou up to 1"),
+        )
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What an anchor's error costs.
+
+    Args:
+        box: ``pseudo_huber`` or ``l1`` (torchvision's own).
+        box_delta: scale of the pseudo-Huber loss, in encoded units.
+        focal_alpha, focal_gamma: of the focal loss.
+    """
+
+    box: BoxLoss = "pseudo_huber"
+    box_delta: float = 0.1
+    focal_alpha: float = 0.25
+    focal_gamma: float = 2.0
+
+    def __post_init__(self) -> None:
+        check(
+            "detector.losses",
+            box=(self.box, self.box in get_args(BoxLoss), f"one of {get_args(BoxLoss)}"),
+            box_delta=(self.box_delta, self.box_delta > 0, "above 0"),
+        )
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Which predictions are detections: per level, the ``candidates`` best scores above ``score_threshold``; then
+    non-maximum suppression within each class at ``nms_iou``, and the best ``limit`` are kept."""
+
+    score_threshold: float = 0.05
+    nms_iou: float = 0.5
+    limit: int = 100
+    candidates: int = 1000
+
+
+def check(where: str, **conditions: tuple[object, bool, str]) -> None:
+    """Raises ``ValueError`` for the first key of (got, holds, wanted) that does not hold."""
+    for key, (got, holds, wanted) in conditions.items():
+        if not holds:
+            raise ValueError(f"{where}.{key}: want {wanted}, got {got!r}")
