@@ -43,7 +43,7 @@ def checked(cosine):
 
 def judge(found, cosine=None, trust=STRICT, on_untrusted="shrink"):
     check = None if cosine is None else checked(cosine)
-    return certify(found, ("a", "b"), ("pose",), check, trust, on_untrusted)
+    return certify(found, found.p_values, ("a", "b"), ("pose",), check, trust, on_untrusted)
 
 
 def actions(certificate):

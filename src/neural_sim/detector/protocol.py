@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -13,6 +14,20 @@ from neural_sim.detector.targets import Targets
 
 Parameters = dict[str, Tensor]
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors 4"]]
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best detections of every class in every image, image by image and class by class, the best first.
+
+    ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs that they come
+    from; which outputs these are is fixed.
+    """
+
+    image: Int[Tensor, "m"]
+    label: Int[Tensor, "m"]
+    logits: Float[Tensor, "m"]
+    boxes: Float[Tensor, "m 4"]
 
 
 class Detector(Protocol):
@@ -58,6 +73,10 @@ class Detector(Protocol):
         self, trainable: Parameters, features: Sequence[Tensor], targets: Targets
     ) -> Float[Tensor, "n"]:
         """:meth:`losses_of` the :meth:`outputs`."""
+        ...
+
+    def best(self, outputs: Outputs, per_class: int) -> Best:
+        """At most ``per_class`` detections of each class in each image, after non-maximum suppression, however low."""
         ...
 
     def predict(

@@ -20,7 +20,7 @@ from neural_sim.detector.backbones import ACTIVATIONS, build_backbone
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.losses import box_loss, focal_loss
 from neural_sim.detector.network import NormalisedBackbone, build_predictor, fixed_anchors
-from neural_sim.detector.protocol import Outputs, Parameters
+from neural_sim.detector.protocol import Best, Outputs, Parameters
 from neural_sim.detector.settings import ARCHITECTURES, Anchors, Backbone, Detections, Head, Losses, check
 from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
 
@@ -151,6 +151,31 @@ class RetinaNet:
         regression = box_loss(residual, costs.box, costs.box_delta).sum(-1) * foreground
         return (focal + regression).sum(-1) / foreground.sum(-1).clamp(min=1)
 
+    def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
+        """At most ``per_class`` detections of each class in each image, of its ``candidates`` best logits after
+        non-maximum suppression. No score is too low: a box that is missed today should be able to rise."""
+        logits, deltas = outputs
+        top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
+        image = torch.arange(len(top), device=top.device)[:, None].expand_as(index).flatten()
+        anchor, label = (index // self.num_classes).flatten(), (index % self.num_classes).flatten()
+        group = image * self.num_classes + label
+        kept = batched_nms(
+            self._decoded(deltas.detach()[image, anchor], anchor),
+            top.flatten(),
+            group,
+            self._detections.nms_iou,
+        )
+        kept = kept[group[kept].argsort(stable=True)]
+        place = torch.arange(len(kept), device=kept.device) - torch.searchsorted(group[kept], group[kept])
+        image, anchor, label = (part[kept[place < per_class]] for part in (image, anchor, label))
+        boxes = self._decoded(deltas[image, anchor], anchor)
+        return Best(image, label, logits[image, anchor, label], boxes)
+
+    def _decoded(self, deltas: Float[Tensor, "m 4"], anchor: Int[Tensor, "m"]) -> Float[Tensor, "m 4"]:
+        """Boxes in pixels, within the image."""
+        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas, self.anchors.to(deltas)[anchor])
+        return clip_boxes_to_image(boxes, self.image_size)
+
     @torch.no_grad()
     def predict(
         self, params: Parameters, images: Float[Tensor, "n 3 h w"], batch_size: int = 64
@@ -182,8 +207,7 @@ class RetinaNet:
         """One image's detections of its candidates."""
         keep = best > self._detections.score_threshold
         best, anchor, labels, moves = (part[keep] for part in (best, anchor, labels, moves))
-        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(moves, self.anchors.to(moves)[anchor])
-        boxes = clip_boxes_to_image(boxes, self.image_size)
+        boxes = self._decoded(moves, anchor)
         keep = batched_nms(boxes, best, labels, self._detections.nms_iou)[: self._detections.limit]
         return {"boxes": boxes[keep], "scores": best[keep], "labels": labels[keep]}
 

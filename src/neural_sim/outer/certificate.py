@@ -36,9 +36,9 @@ class Certificate:
     where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the hypergradient's
     relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with a retrained finite
     difference, nan where none was made. ``doubts`` names what speaks against all steps. ``p_values``, by object and
-    factor, are those of the null that this iteration's derivative is zero; the step follows its average with those of
-    earlier iterations. ``actions`` has the objects whose psi moves; a step without doubt and with a significant
-    derivative is kept.
+    factor, are those of the null that a derivative is zero: this iteration's, or, where steps are checked, its average
+    with those of earlier iterations, which steps follow. ``actions`` has the objects whose psi moves; a step without
+    doubt and with a significant derivative is kept.
     """
 
     stationarity: float
@@ -71,13 +71,15 @@ class Certificate:
 
 def certify(
     result: Hypergradient,
+    p_values: Mapping[str, Mapping[str, float]],
     names: Sequence[str],
     factors: Sequence[str],
     check: Check | None,
     trust: Trust,
     on_untrusted: OnUntrusted,
 ) -> Certificate:
-    """Judge an iteration's hypergradient; ``names`` are the objects whose psi moves, ``factors`` those of psi.
+    """Judge an iteration's hypergradient; ``names`` are the objects whose psi moves, ``factors`` those of psi, and
+    ``p_values`` those of the derivatives that steps follow.
 
     No step follows a gradient that is not finite. A step is without signal where its p-value is above ``trust.level``;
     where nothing was tested, nothing speaks against it.
@@ -90,7 +92,7 @@ def certify(
             action = "skipped"
         actions: Actions = {name: dict.fromkeys(factors, action) for name in names}
     else:
-        actions = _by_signal(result.p_values, names, factors, trust.level, on_untrusted)
+        actions = _by_signal(p_values, names, factors, trust.level, on_untrusted)
     spectrum, solution = result.damping.spectrum, result.solution
     return Certificate(
         stationarity=result.stationarity,
@@ -106,7 +108,7 @@ def certify(
         sensitivity=result.sensitivity,
         cosine=check.cosine if check else math.nan,
         doubts=found,
-        p_values={name: dict(found) for name, found in result.p_values.items()},
+        p_values={name: dict(found) for name, found in p_values.items()},
         actions=actions,
     )
 

@@ -17,6 +17,7 @@ from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
+from neural_sim.outer.objective import Objective
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.pool import ImagePool
@@ -75,7 +76,8 @@ class InnerLoop:
         self._start = params
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
-        self.images = self.steps = 0
+        self.objective = Objective(self.validation, validation, settings.objective, settings.smooth_ap)
+        self.images = self.steps = self._numbers = 0
         self.trajectory: Trajectory | None = None
 
     @property
@@ -87,9 +89,21 @@ class InnerLoop:
         """An iteration's training images of every object."""
         count, labels = self.settings.images_per_object, range(len(self.scene.names))
         self.images += count * len(labels)
+        generator = self._common(0)
         if self.pool is None:
-            return self.scene.training_set(psi, count, self.generator, self.draws)
-        return [self.pool.draw(label, psi[label], count, self.generator) for label in labels]
+            return self.scene.training_set(psi, count, generator, self.draws)
+        return [self.pool.draw(label, psi[label], count, generator) for label in labels]
+
+    def _common(self, purpose: int) -> torch.Generator:
+        """Where steps are checked, the same random numbers every time until :meth:`renew`; else new ones."""
+        if self.settings.steps == "free":
+            return self.generator
+        seed = self.generator.initial_seed() + 2_000_003 * (1 + self._numbers) + purpose
+        return torch.Generator().manual_seed(seed)
+
+    def renew(self) -> None:
+        """Other random numbers from now on."""
+        self._numbers += 1
 
     def train(self, images: CachedSet, recording: Recording | None = None) -> float:
         """Train theta on the images; returns the last epoch's loss, nan where there are no epochs.
@@ -104,7 +118,7 @@ class InnerLoop:
             how = replace(how, weight_decay=0.0)
         start = self.theta if self.settings.start == "previous" else self._start
         self.theta, history = train_detector(
-            self.detector, start, images, self.generator, how, self.warm_start, recording
+            self.detector, start, images, self._common(1), how, self.warm_start, recording
         )
         self.steps += history.steps
         self.trajectory = history.trajectory
@@ -117,4 +131,9 @@ class InnerLoop:
 
     def validation_loss(self) -> float:
         """L_val at theta."""
-        return self.loss(self.validation)
+        with torch.no_grad():
+            return float(sum(term(self.trainable) for term in self.objective.terms()))
+
+    def scores(self) -> Float[Tensor, "classes"]:
+        """How good theta is on the validation images for each class, more is better."""
+        return self.objective.scores(self.trainable)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import lightning.pytorch as pl
@@ -17,6 +17,7 @@ from neural_sim.devices import trainer_on
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.outer.steps import Verdict
 from neural_sim.types import LabelledImages
 
 logger = logging.getLogger(__name__)
@@ -60,6 +61,8 @@ class OuterLoop(pl.LightningModule):
         certificate: Certificate | None = None,
         gradient_norms: list[float] | None = None,
         products: int = 0,
+        scores: Tensor | None = None,
+        verdicts: Mapping[str, Verdict] | None = None,
     ) -> IterationRecord:
         """Keep what an iteration did with images drawn from ``psi``, before any step."""
         p_by_factor = self.scene.distribution.probabilities(psi.detach())
@@ -80,6 +83,8 @@ class OuterLoop(pl.LightningModule):
                 detector_steps=done[1] - self._counted[1],
                 products=products,
                 images_without_box=int((~images.present.any(-1)).sum()),
+                scores=[] if scores is None else scores.tolist(),
+                verdicts=dict(verdicts or {}),
                 seconds=seconds,
                 cpu_seconds=cpu - self._cpu,
             )

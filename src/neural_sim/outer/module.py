@@ -14,14 +14,14 @@ from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, SplitLoss, hypergradient
 from neural_sim.outer.binding import bound_losses, object_images
-from neural_sim.outer.certificate import Certificate, certify
+from neural_sim.outer.certificate import certify
+from neural_sim.outer.checked import CheckedSteps
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.retrained import Check, as_double, binned_problem, check
+from neural_sim.outer.steps import FreeSteps, Steps
 from neural_sim.outer.unrolling import through_training
-from neural_sim.parameter.factor import Factor
-from neural_sim.parameter.update import Update, UpdateState
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
@@ -41,8 +41,8 @@ class SimulatorModule(OuterLoop):
         self.estimator, self.solver = estimator, solver
         wanted, names = inner.settings.learned, self.scene.names
         self._learned = [i for i, name in enumerate(names) if wanted is None or name in wanted]
-        parts = self.scene.distribution.split(self.psi[self._learned])
-        self._update_states = {name: UpdateState.zeros(part) for name, part in parts.items()}
+        self._names = [names[label] for label in self._learned]
+        self.steps = self._begin()
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
         # A generator of its own, so that being certified does not change a run.
@@ -50,67 +50,59 @@ class SimulatorModule(OuterLoop):
         self._recording = self.settings.unrolled.recording if self.settings.adjoint == "unrolled" else None
         self._stopped = False
 
+    def _begin(self) -> Steps:
+        psi, distribution = self.psi[self._learned], self.scene.distribution
+        if self.settings.steps == "free":
+            return FreeSteps(self.settings, distribution, self._names, psi)
+        shrink = self.settings.trust.shrink
+        return CheckedSteps(self.settings.checks, shrink, distribution, self._names, self._learned, psi)
+
     def training_step(self, batch: int, batch_idx: int) -> None:
         seconds: dict[str, float] = {}
         with timed(seconds, "render", self.inner.device):
             rendered = self.inner.draw(self.psi)
             images = join(rendered)
+        last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
         with timed(seconds, "probes", self.inner.device):
-            self._draw_probes()
+            if not last:
+                self._draw_probes()
         with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
         with timed(seconds, "train", self.inner.device):
             # The warm start has trained on this psi already, on more images and for longer than an iteration would.
             arrived = not self.records and not self.settings.train_first
             training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached, self._recording)
+        with timed(seconds, "judge", self.inner.device):
+            scores = self.inner.scores()
+            verdicts = self.steps.judge(scores)
+        if last:
+            self.record(self.psi, images, training_loss, seconds, scores=scores, verdicts=verdicts)
+            self._go_to(self.steps.reported)
+            return
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._hypergradient(rendered, images, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
         with timed(seconds, "certify", self.inner.device):
             check = self._check(result)
-        moving = [self.scene.names[label] for label in self._learned]
-        factors = self.scene.distribution.names
-        certificate = certify(result, moving, factors, check, self.settings.trust, self.settings.on_untrusted)
+        p_values, factors = self.steps.observe(result), self.scene.distribution.names
+        trust, otherwise = self.settings.trust, self.settings.on_untrusted
+        certificate = certify(result, p_values, self._names, factors, check, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
-        self.record(self.psi, images, training_loss, seconds, certificate, norms, _products(result))
-        self._move(result, certificate)
+        self.record(
+            self.psi, images, training_loss, seconds, certificate, norms, _products(result), scores, verdicts
+        )
+        self._stopped = certificate.stopped
+        psi = self.steps.next(certificate)
+        if not self.steps.moved:
+            self.inner.renew()  # the same training again would say nothing new
+        self._go_to(psi)
+
+    def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
+        self.psi.data[self._learned] = psi
         self.trajectory.append(self.psi.detach().clone())
 
     def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
         return -1 if self._stopped else None
-
-    def _move(self, result: Hypergradient, certificate: Certificate) -> None:
-        """psi's step, or what its certificate leaves of it.
-
-        A derivative without signal joins the momentum nevertheless: the average of several may tell what each does not.
-        """
-        self._stopped = certificate.stopped
-        if certificate.void:
-            return
-        names = [self.scene.names[i] for i in self._learned]
-        gradient, error = (
-            torch.stack([values[name] for name in names]).to(self.psi)
-            for values in (result.psi_gradients, result.standard_errors)
-        )
-        distribution, before = self.scene.distribution, self.psi[self._learned]
-        psi, slope, noise = (distribution.split(values) for values in (before, gradient, error))
-        moved, parts = {}, {"kept": 1.0, "shrunk": self.settings.trust.shrink, "skipped": 0.0}
-        for factor in distribution.factors:
-            held = psi[factor.name], slope[factor.name], noise[factor.name], self._update_states[factor.name]
-            after, self._update_states[factor.name] = self._step(factor, *held)
-            left = [parts[certificate.actions[name][factor.name]] for name in names]
-            moved[factor.name] = held[0] + after.new_tensor(left)[:, None] * (after - held[0])
-        done = (len(self.records) - 1) / max(1, self.settings.iterations - 1)
-        part = 1.0 + done * (self.settings.final_step - 1.0)
-        self.psi.data[self._learned] = before + part * (distribution.join(moved) - before)
-
-    def _step(
-        self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor, state: UpdateState
-    ) -> tuple[Tensor, UpdateState]:
-        """One factor's step: in logits of bins, or in weights of lights, which stay on their constraint."""
-        update: Update = getattr(self.settings, factor.update)
-        moved, after = update.step(psi, factor.log_probabilities(psi), slope, noise, state)
-        return factor.project(moved), after
 
     def _hypergradient(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
@@ -143,7 +135,7 @@ class SimulatorModule(OuterLoop):
         }
         result = hypergradient(
             inner,
-            self.inner.validation.mean_terms(),
+            self.inner.objective.terms(),
             estimates,
             self.solver,
             self.inner.generator,
@@ -209,7 +201,7 @@ class SimulatorModule(OuterLoop):
         pulls = [(self.inner.detector.proximal, self.inner.warm_start), (result.damping.value, trainable)]
         ordered = [part[factor.name] for part in probed.probes]
         problem = binned_problem(probed.cached, ordered, per_bin, pulls, factor.log_probabilities)
-        validation = self.inner.validation.double().mean_terms()
+        validation = self.inner.objective.double().terms()
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
         return check(problem, validation, psi, label, as_double(trainable), gradient)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.cost import Cost
+from neural_sim.outer.steps import Verdict
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,9 @@ class IterationRecord:
     ``images`` are the labelled images made in it, probes included, ``detector_steps`` the optimiser steps and
     ``products`` the Hessian products spent. ``seconds`` are by phase and by the clock on the wall, ``cpu_seconds``
     those that all processor cores together worked, which other processes on the machine disturb less.
-    ``certificate`` is None for methods without a hypergradient.
+    ``certificate`` is None for methods without a hypergradient, and where the last iteration took none. ``scores`` of
+    the classes are those of the loop's objective, more is better; ``verdicts`` are of the objects whose last step was
+    checked.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -34,6 +37,8 @@ class IterationRecord:
     detector_steps: int
     products: int
     images_without_box: int
+    scores: list[float]
+    verdicts: dict[str, Verdict]
     seconds: dict[str, float]
     cpu_seconds: float
 
@@ -48,7 +53,13 @@ def cost_of(record: IterationRecord) -> Cost:
 def record_of(stored: Mapping[str, Any]) -> IterationRecord:
     """A record from what ``dataclasses.asdict`` made of one."""
     certificate = stored["certificate"]
-    return IterationRecord(**{**stored, "certificate": certificate and Certificate(**certificate)})
+    return IterationRecord(
+        **{
+            **stored,
+            "certificate": certificate and Certificate(**certificate),
+            "verdicts": {name: Verdict(**verdict) for name, verdict in stored["verdicts"].items()},
+        }
+    )
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,16 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from neural_sim.checks import at_least
+from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.significance import SMALLEST
 from neural_sim.parameter.update import Mirror, Update
 from neural_sim.renderer.nerf import Quality
 
+ObjectiveKind = Literal["average_precision", "loss"]
 Start = Literal["previous", "warm", "fresh"]
 AdjointKind = Literal["implicit", "unrolled"]
+StepKind = Literal["checked", "free"]
 OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
 
@@ -55,6 +58,45 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class Checks:
+    """Steps that the next iteration's training accepts or undoes.
+
+    Args:
+        radius: of each object's first step by a factor, in total variation (of lights: half the absolute change of the
+            weights).
+        largest, smallest: radii; under ``smallest`` an object rests.
+        grow, shrink: what an accepted and an undone step multiply the radius by.
+        momentum: what an iteration's derivative counts in the next one's average, before noise is weighed.
+        max_step: the most by which a step changes a logit (or a weight).
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    radius: float = 0.5
+    largest: float = 0.7
+    smallest: float = 0.05
+    grow: float = 1.3
+    shrink: float = 0.4
+    momentum: float = 0.5
+    max_step: float = 4.0
+
+    def __post_init__(self) -> None:
+        where = "outer.checks"
+        if not 0.0 < self.smallest <= self.radius <= self.largest:
+            raise ValueError(
+                f"{where}: want 0 < smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
+            )
+        at_least(where, 1, grow=self.grow)
+        at_least(where, 0, momentum=self.momentum)
+        if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
+            raise ValueError(
+                f"{where}: want shrink in (0, 1), momentum in [0, 1] and max_step above 0, got {self.shrink}, "
+                f"{self.momentum} and {self.max_step}"
+            )
+
+
+@dataclass(frozen=True)
 class Outer:
     """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
 
@@ -70,6 +112,10 @@ class Outer:
     anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
     renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
     objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
+    ``objective`` is L_val: one minus the smooth average precision of the validation images (``smooth_ap`` says how
+    smooth), or their ``loss``, as in the paper.
+    ``steps`` are ``checked`` as ``checks`` says: every iteration trains under the same random numbers, and the last one
+    trains only to judge the last step; or ``free``, by ``update``.
     ``adjoint`` says what the hypergradient is of: a stationary point, by the solver (``implicit``, the paper's Eq. 2),
     or the training that was run (``unrolled``, as ``unrolled`` says), which every iteration must then have: it wants
     ``train_first`` and epochs, and no retrained finite differences, which are of a stationary point.
@@ -86,16 +132,20 @@ class Outer:
     epochs: int = 12
     learning_rate: float = 3e-3
     start: Start = "fresh"
-    train_first: bool = False
-    adjoint: AdjointKind = "implicit"
+    train_first: bool = True
+    adjoint: AdjointKind = "unrolled"
     unrolled: Unrolled = field(default_factory=Unrolled)
+    objective: ObjectiveKind = "average_precision"
+    smooth_ap: SmoothAP = field(default_factory=SmoothAP)
+    steps: StepKind = "checked"
+    checks: Checks = field(default_factory=Checks)
     final_step: float = 0.1
     curvature_images: int = 64
     pool_per_bin: int = 24
     refresh: float = 0.5
     quality: Quality | None = None
     trust: Trust = field(default_factory=Trust)
-    on_untrusted: OnUntrusted = "shrink"
+    on_untrusted: OnUntrusted = "skip"
     learned: tuple[str, ...] | None = None
     light_update: Update = field(default_factory=lambda: Mirror(learning_rate=0.6, max_step=1.0))
     certify_every: int = 0
@@ -123,9 +173,15 @@ class Outer:
             raise ValueError(
                 f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
             )
-        if self.adjoint not in get_args(AdjointKind):
+        for key, kinds in (("adjoint", AdjointKind), ("objective", ObjectiveKind), ("steps", StepKind)):
+            if getattr(self, key) not in get_args(kinds):
+                raise ValueError(
+                    f"outer.{key} must be one of {', '.join(get_args(kinds))}, got {getattr(self, key)!r}"
+                )
+        if self.steps == "checked" and (not self.train_first or self.start == "previous" or self.epochs == 0):
             raise ValueError(
-                f"outer.adjoint must be one of {', '.join(get_args(AdjointKind))}, got {self.adjoint!r}"
+                "outer.steps=checked compares trainings: want train_first=true, start=fresh or warm and epochs of at "
+                f"least 1, got {self.train_first}, {self.start} and {self.epochs}"
             )
         if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or self.certify_every):
             raise ValueError(

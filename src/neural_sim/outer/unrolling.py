@@ -52,7 +52,7 @@ def through_training(
         problem,
         loop.trajectory,
         examples,
-        loop.validation.mean_terms(),
+        loop.objective.terms(),
         {name: lambda found, name=name: estimate(name, found) for name in images},
         loop.settings.unrolled,
         loop.generator,

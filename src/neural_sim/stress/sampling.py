@@ -61,7 +61,7 @@ def one_hot(scope: Scope) -> Checks:
         yield Check(f"dp/dpsi, {short(dtype)}", worst(slope), 8 * eps(dtype))
     wanted = torch.eye(8, dtype=DOUBLE)[2]
     back = pose.log_probabilities(pose.psi_of(wanted)).exp()
-    # logits() raises zeros to 1e-6, which the normalisation shares out
+    # psi_of() raises zeros to 1e-6, which the normalisation shares out
     yield Check("logits of a one-hot p", worst(back - wanted), 7.1e-6)
 
 

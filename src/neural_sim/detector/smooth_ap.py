@@ -1,0 +1,133 @@
+"""A smooth average precision: what the psi loop differentiates in the place of the validation loss.
+
+The detections are those of the forward pass, after non-maximum suppression; which anchors they come from is fixed,
+their scores and boxes are differentiated. Two steps of COCO's definition are made smooth. A detection is a true positive
+by a sigmoid of its overlap, not by a threshold. And it ranks below another by a sigmoid of the difference of their logits
+(Brown et al. 2020, Smooth-AP, Eq. 6), not by which is larger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from neural_sim.detector.protocol import Detector, Outputs
+from neural_sim.types import LabelledImages
+
+THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
+"""COCO's overlaps, over which AP is averaged."""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One class's detections in all images, and what they found. Image by image, the best of an image first.
+
+    ``overlaps`` are with the nearest box of the class in the image, 0 where there is none. ``image`` numbers the image
+    of each, ``box`` its nearest box among all of the class, -1 for none. ``boxes`` is how many boxes the class has.
+    """
+
+    logits: Float[Tensor, "m"]
+    overlaps: Float[Tensor, "m"]
+    image: Int[Tensor, "m"]
+    box: Int[Tensor, "m"]
+    boxes: int
+
+
+@dataclass(frozen=True)
+class SmoothAP:
+    """Settings of the smooth AP.
+
+    Args:
+        temperature: of a rank, in logits. AP's own ranks are the limit at 0.
+        width: of a true positive, in overlap. AP's own are the limit at 0.
+        per_class: the best detections of an image that count for each class.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
+
+    temperature: float = 0.2
+    width: float = 0.1
+    per_class: int = 5
+
+    def __post_init__(self) -> None:
+        for key in ("temperature", "width"):
+            if not getattr(self, key) > 0.0:
+                raise ValueError(f"smooth_ap.{key} must be above 0, got {getattr(self, key)}")
+        if self.per_class < 1:
+            raise ValueError(f"smooth_ap.per_class must be at least 1, got {self.per_class}")
+
+    def __call__(
+        self, detector: Detector, outputs: Outputs, images: LabelledImages
+    ) -> Float[Tensor, "classes"]:
+        """Every class's AP of the detector's outputs on these images; nan for a class without boxes."""
+        found = ranked(detector, outputs, images, self.per_class)
+        return torch.stack(
+            [self.of_class(part) if part.boxes else part.logits.new_tensor(torch.nan) for part in found]
+        )
+
+    def of_class(self, found: Ranked) -> Float[Tensor, ""]:
+        """One class's AP, the mean over :data:`THRESHOLDS`; 0 without detections.
+
+        Raises:
+            ValueError: for a class without boxes, whose AP does not exist.
+        """
+        if found.boxes == 0:
+            raise ValueError("smooth_ap: want at least one box of the class")
+        true = self.true_positives(found)
+        candidates = (found.box >= 0).nonzero().flatten()  # only they can be true
+        above = torch.sigmoid((found.logits - found.logits[candidates, None]) / self.temperature)
+        # A detection ranks above itself by a half; in full it is 1.
+        above = above + 0.5 * (candidates[:, None] == torch.arange(len(found.box), device=above.device))
+        precision = (above @ true) / above.sum(1, keepdim=True)
+        return (true[candidates] * precision).sum(0).mean() / found.boxes
+
+    def true_positives(self, found: Ranked) -> Float[Tensor, "m thresholds"]:
+        """How far each detection is a true positive, at each overlap: as far as it overlaps its box, and as far as no
+        better detection of the same box is one. Those of a box sum to at most 1."""
+        levels = found.overlaps.new_tensor(THRESHOLDS)
+        reached = torch.sigmoid((found.overlaps[:, None] - levels) / self.width)
+        reached = torch.where((found.box >= 0)[:, None], reached, 0.0)
+        left = torch.ones_like(reached)
+        for back in range(1, self.per_class):
+            # The detection ``back`` places before, if it is in the same image and at the same box.
+            before, same = reached.roll(back, 0), (found.box == found.box.roll(back)) & (found.box >= 0)
+            same = same & (torch.arange(len(same), device=same.device) >= back)
+            left = left * torch.where(same[:, None], 1.0 - before, 1.0)
+        return reached * left
+
+
+def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_class: int) -> list[Ranked]:
+    """Each class's detections in these images, at most ``per_class`` of an image; differentiable in the outputs."""
+    found = detector.best(outputs, per_class)
+    labels, boxes = images.labels.to(found.image.device), images.boxes.to(found.boxes)
+    classes = []
+    for number in range(outputs[0].shape[-1]):
+        own, present = found.label == number, labels == number
+        image = found.image[own]
+        overlaps, which = nearest_box(found.boxes[own], boxes[image], present[image])
+        box = torch.where(which >= 0, image * labels.shape[1] + which, -1)
+        classes.append(Ranked(found.logits[own], overlaps, image, box, int(present.sum())))
+    return classes
+
+
+def nearest_box(
+    boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
+) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
+    """The largest overlap of each detection with a box of its image, and which box; 0 and -1 where there is none."""
+    if truth.shape[1] == 0:
+        return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
+    overlaps = torch.where(present, overlap(boxes[:, None], truth), 0.0)
+    best, which = overlaps.max(1)
+    return best, torch.where(present.any(1), which, -1)
+
+
+def overlap(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+    """Intersection over union of boxes (x0, y0, x1, y1), pair by pair; differentiable in both."""
+    sides = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp_min(0.0)
+    shared = sides.prod(-1)
+    areas = [(box[..., 2:] - box[..., :2]).clamp_min(0.0).prod(-1) for box in (a, b)]
+    return shared / (areas[0] + areas[1] - shared).clamp_min(torch.finfo(shared.dtype).tiny)

@@ -1,0 +1,205 @@
+"""Steps that are checked: proposed in a trust region where there is evidence, judged by the next iteration's training.
+
+Each iteration trains a detector anyway. Under the random numbers of the training before (the same start, batches,
+backgrounds and noise of the draws) the difference of the two is what the step did, with little noise. A step that did
+not help its own object is undone and its region shrinks, one that did grows it (Conn, Gould and Toint 2000, Chapter 6;
+here each object's reduction is measured).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.outer.certificate import Certificate
+from neural_sim.outer.settings import Checks
+from neural_sim.outer.steps import PARTS, PValues, Verdict, stacked
+from neural_sim.parameter.factor import Factor
+from neural_sim.parameter.product import SceneDistribution
+
+HALVINGS = 40
+
+
+@dataclass(frozen=True)
+class Average:
+    """A weighted mean of the iterations' directions, each weighted by one over its noise variance, and less from
+    iteration to iteration: one that is long because it is noisy, or because it was the first, does not rule."""
+
+    total: Float[Tensor, "objects k"]
+    weight: Float[Tensor, "objects 1"]
+    noise: Float[Tensor, "objects k"]
+
+    @staticmethod
+    def zeros(psi: Float[Tensor, "objects k"]) -> Average:
+        return Average(torch.zeros_like(psi), torch.zeros_like(psi[:, :1]), torch.zeros_like(psi))
+
+    def joined(
+        self, direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"], keep: float
+    ) -> Average:
+        """With one more direction; what was there counts ``keep`` times as much as before. Objects whose direction or
+        variance is not finite stay as they are."""
+        known = (direction.isfinite() & variance.isfinite()).all(1, keepdim=True)
+        mean = variance.mean(1, keepdim=True)
+        # Without noise (an exact derivative) all iterations weigh alike.
+        weight = torch.where(mean > 0.0, 1.0 / mean, 1.0)
+        joined = (
+            keep * self.total + weight * direction,
+            keep * self.weight + weight,
+            keep**2 * self.noise + weight.square() * variance,
+        )
+        return Average(*(torch.where(known, new, old) for new, old in zip(joined, self._parts, strict=True)))
+
+    @property
+    def _parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.total, self.weight, self.noise
+
+    @property
+    def value(self) -> Float[Tensor, "objects k"]:
+        return self.total / self.weight.clamp_min(torch.finfo(self.total.dtype).tiny)
+
+    @property
+    def p_values(self) -> Float[Tensor, "objects"]:
+        """Of the null that all components of the mean are equal, by a chi-square of size - 1 degrees of freedom: each
+        component over its own variance. 1 where nothing was seen, 0 without noise."""
+        variance = self.noise / self.weight.square().clamp_min(torch.finfo(self.total.dtype).tiny)
+        sharp = (variance == 0.0).all(1)
+        weights = 1.0 / torch.where(variance > 0.0, variance, 1.0)
+        centre = (weights * self.value).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+        statistic = (weights * (self.value - centre).square()).sum(1)
+        freedom = torch.full_like(statistic, 0.5 * (self.value.shape[1] - 1))
+        found = torch.special.gammaincc(freedom, 0.5 * statistic)
+        return torch.where(sharp, torch.where(self.value.abs().amax(1) > 0.0, 0.0, 1.0).to(found), found)
+
+
+class CheckedSteps:
+    """See the module. ``labels`` are the classes of the objects ``names``, whose psi moves."""
+
+    def __init__(
+        self,
+        settings: Checks,
+        shrink: float,
+        distribution: SceneDistribution,
+        names: Sequence[str],
+        labels: Sequence[int],
+        psi: Float[Tensor, "objects K"],
+    ) -> None:
+        self.settings, self.shrink, self.distribution = settings, shrink, distribution
+        self.names, self.labels = names, torch.tensor(labels)
+        self.accepted = self.tried = psi.detach().clone()
+        parts = distribution.split(psi)
+        self.radius = {name: torch.full_like(part[:, 0], settings.radius) for name, part in parts.items()}
+        self._averages = {name: Average.zeros(part) for name, part in parts.items()}
+        self._joined = self._averages
+        self._promised = torch.zeros_like(psi[:, 0])
+        self._moved = torch.zeros(len(psi), dtype=torch.bool)
+        self._reference: Tensor | None = None
+
+    @property
+    def reported(self) -> Float[Tensor, "objects K"]:
+        return self.accepted
+
+    @property
+    def moved(self) -> bool:
+        """Whether an object has a step that is not judged yet."""
+        return bool(self._moved.any())
+
+    def judge(self, scores: Float[Tensor, "classes"]) -> dict[str, Verdict]:
+        """A step is undone where its object's own score did not rise. Where no own score fell and yet the mean over all
+        classes did, steps harm each other, and all of them are undone."""
+        scores = scores.double()
+        if self._reference is None:
+            self._reference = scores
+        came, rest = scores - self._reference, scores[self.labels]
+        own, mean = came[self.labels], came.nanmean()
+        rose = own > 0.0
+        if bool(self._moved.any()) and bool(rose[self._moved].all()) and mean < 0.0:
+            rose = torch.zeros_like(rose)
+        accepted = self._moved & rose
+        self.accepted = torch.where(accepted[:, None], self.tried, self.accepted)
+        for name, radius in self.radius.items():
+            grown = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
+            self.radius[name] = torch.where(self._moved, grown.clamp_max(self.settings.largest), radius)
+        # An object whose step was undone is compared with its last training at the psi that it is back at.
+        undone = self._moved & ~accepted
+        reference = scores.clone()
+        reference[self.labels] = torch.where(undone, self._reference[self.labels], rest)
+        verdicts = {
+            name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]))
+            for i, name in enumerate(self.names)
+            if self._moved[i]
+        }
+        self._reference, self._moved = reference, torch.zeros_like(self._moved)
+        return verdicts
+
+    def observe(self, result: Hypergradient) -> PValues:
+        gradient, error = stacked(result, self.names, self.accepted)
+        parts = (self.distribution.split(values) for values in (self.tried, gradient, error))
+        psi, slope, noise = parts
+        found: dict[str, dict[str, float]] = {name: {} for name in self.names}
+        self._joined = {}
+        for factor in self.distribution.factors:
+            name = factor.name
+            p = factor.log_probabilities(psi[name]).exp()
+            # By p: the slope in logits is p times it, and a bin that p has left gets as long a step as any.
+            direction = -slope[name] / p
+            direction = direction - direction.mean(-1, keepdim=True)
+            self._joined[name] = self._averages[name].joined(
+                direction, (noise[name] / p).square(), self.settings.momentum
+            )
+            for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
+                found[object_name][name] = value
+        return found
+
+    def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
+        self._promised = torch.zeros_like(self._promised)
+        if certificate.void:
+            self.tried = self.accepted
+            return self.tried
+        self._averages = self._joined
+        psi, moved = self.distribution.split(self.accepted), {}
+        parts = {**PARTS, "shrunk": self.shrink}
+        for factor in self.distribution.factors:
+            name = factor.name
+            left = [parts[certificate.actions[object_name][name]] for object_name in self.names]
+            radius = self.radius[name] * psi[name].new_tensor(left)
+            radius = torch.where(self.radius[name] < self.settings.smallest, 0.0, radius)
+            direction = self._averages[name].value
+            moved[name] = within(factor, psi[name], direction, radius, self.settings.max_step)
+            change = factor.p_of(moved[name]) - factor.p_of(psi[name])
+            self._promised = self._promised + (direction * change).sum(1)
+        self.tried = self.distribution.join(moved)
+        self._moved = (self.tried != self.accepted).any(1)
+        return self.tried
+
+
+def within(
+    factor: Factor,
+    psi: Float[Tensor, "objects k"],
+    direction: Float[Tensor, "objects k"],
+    radius: Float[Tensor, "objects"],
+    max_step: float,
+) -> Float[Tensor, "objects k"]:
+    """psi moved along ``direction`` until half the absolute change of p (of bins: the total variation) is ``radius``,
+    or the largest change of a number of psi ``max_step``; by bisection."""
+    before = factor.p_of(psi)
+    size = direction.abs().amax(1, keepdim=True)
+    longest = direction * (max_step / torch.where(size > 0.0, size, 1.0))
+    low, high = torch.zeros_like(radius), torch.ones_like(radius)
+
+    def moved(part: Tensor) -> Tensor:
+        return factor.project(psi + part[:, None] * longest)
+
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        inside = 0.5 * (factor.p_of(moved(middle)) - before).abs().sum(1) <= radius
+        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+    low = torch.where(
+        0.5 * (factor.p_of(moved(torch.ones_like(low))) - before).abs().sum(1) <= radius, 1.0, low
+    )
+    still = (radius <= 0.0) | (size[:, 0] == 0.0)
+    return torch.where(still[:, None], psi, moved(low))

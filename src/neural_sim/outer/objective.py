@@ -1,0 +1,66 @@
+"""What psi lowers: a loss of the trained detector on the validation images, and its parts by class."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.protocol import Outputs, Parameters
+from neural_sim.detector.smooth_ap import SmoothAP
+from neural_sim.outer.settings import ObjectiveKind
+from neural_sim.solver.hvp import Term
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class Objective:
+    """L_val as a function of the parameters.
+
+    ``loss`` is the training loss of the validation images ``cached``, as in the paper. ``average_precision`` is one
+    minus the mean over classes of the ``smooth`` average precision, which needs the boxes of ``images``, the same ones.
+    """
+
+    cached: CachedSet
+    images: LabelledImages
+    kind: ObjectiveKind
+    smooth: SmoothAP
+
+    def terms(self) -> list[Term]:
+        """L_val as a sum of terms; the smooth average precision, which ranks all images, is one."""
+        if self.kind == "loss":
+            return self.cached.mean_terms()
+        return [lambda params: 1.0 - self.smooth_ap(params).nanmean()]
+
+    def smooth_ap(self, params: Parameters) -> Float[Tensor, "classes"]:
+        """The smooth average precision of every class; nan for a class without a box."""
+        return self.smooth(self.cached.detector, self.outputs(params), self.images)
+
+    def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
+        """The detector's outputs on all images. Only these stay in memory for a derivative, not what led to them."""
+        parts = [
+            checkpoint(self.cached.outputs, params, rows, use_reentrant=False)
+            for rows in torch.arange(len(self.cached), device=self.cached.device).split(chunk_size)
+        ]
+        logits, deltas = zip(*parts, strict=True)
+        return torch.cat(logits), torch.cat(deltas)
+
+    @torch.no_grad()
+    def scores(self, params: Parameters) -> Float[Tensor, "classes"]:
+        """How good the detector is for each class, more is better: the smooth average precision, or minus the mean loss
+        of the images with a box of the class; nan for a class without one. On the CPU."""
+        if self.kind == "average_precision":
+            return self.smooth_ap(params).cpu()
+        outputs, labels = self.outputs(params), self.images.labels.cpu()
+        rows = torch.arange(len(self.cached), device=self.cached.device)
+        losses = self.cached.losses_of(outputs, rows).cpu()
+        classes = range(outputs[0].shape[-1])
+        return torch.stack([-losses[(labels == number).any(1)].mean() for number in classes])
+
+    def double(self) -> Objective:
+        """The same in float64."""
+        return replace(self, cached=self.cached.double())

@@ -1,0 +1,158 @@
+"""The smooth average precision against AP counted by hand, against COCO's own, and against central differences."""
+
+import pytest
+import torch
+from torchvision.ops import box_iou
+
+from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.protocol import Best
+from neural_sim.detector.smooth_ap import THRESHOLDS, Ranked, SmoothAP, overlap, ranked
+from neural_sim.types import LabelledImages
+
+SHARP = SmoothAP(temperature=1e-6, width=1e-6)
+
+
+def counted(found: Ranked) -> float:
+    """AP without interpolation: the mean precision at the true positives, over thresholds; greedy as COCO matches."""
+    order = found.logits.argsort(descending=True).tolist()
+    total = 0.0
+    for threshold in THRESHOLDS:
+        taken, true = set(), 0
+        for rank, i in enumerate(order, 1):
+            box = int(found.box[i])
+            if box >= 0 and box not in taken and float(found.overlaps[i]) > threshold:
+                taken.add(box)
+                true += 1
+                total += true / rank
+    return total / len(THRESHOLDS) / found.boxes
+
+
+def some(generator: torch.Generator, images: int = 12, per_image: int = 3) -> Ranked:
+    """Detections of images of which every third has no box, and the others one or two."""
+    rows = []
+    for image in range(images):
+        boxes = [] if image % 3 == 0 else [2 * image, 2 * image + 1][: image % 3]
+        logits = torch.randn(per_image, generator=generator, dtype=torch.float64).sort(descending=True).values
+        for logit in logits:
+            chosen = boxes[int(torch.randint(len(boxes), (), generator=generator))] if boxes else -1
+            overlap_ = torch.rand((), generator=generator, dtype=torch.float64) * bool(boxes)
+            rows.append((logit, overlap_, image, chosen))
+    logits, overlaps, image, box = zip(*rows, strict=True)
+    boxes = sum(image % 3 for image in range(images))
+    return Ranked(torch.stack(logits), torch.stack(overlaps), torch.tensor(image), torch.tensor(box), boxes)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_its_limit_is_ap_as_one_counts_it(seed):
+    found = some(torch.Generator().manual_seed(seed))
+    assert float(SHARP.of_class(found)) == pytest.approx(counted(found), abs=1e-9)
+
+
+def test_a_box_is_found_once_however_many_detections_it_has():
+    found = Ranked(
+        torch.tensor([3.0, 2.0, 1.0]), torch.tensor([0.8, 0.9, 0.9]), torch.zeros(3), torch.zeros(3).long(), 1
+    )
+    true = SmoothAP().true_positives(found)
+    assert bool((true.sum(0) <= 1.0 + 1e-6).all())
+    # From 0.8 on the second is the true one, at 0.85; the first is then a false positive above it.
+    assert float(SHARP.of_class(found)) == pytest.approx((6 + 2 * 0.5 + 0.25) / 10, abs=0.06)
+
+
+def test_false_positives_on_images_of_others_lower_it():
+    own = Ranked(torch.tensor([1.0, -9.0]), torch.tensor([0.9, 0.0]), torch.arange(2), torch.tensor([0, -1]), 1)
+    fooled = Ranked(torch.tensor([1.0, 1.5]), own.overlaps, own.image, own.box, 1)
+    assert float(SmoothAP().of_class(fooled)) < 0.6 * float(SmoothAP().of_class(own))
+
+
+def test_its_slope_is_that_of_central_differences():
+    found = some(torch.Generator().manual_seed(3))
+    smooth = SmoothAP(temperature=0.3, width=0.1)
+    leaves = found.logits.clone().requires_grad_(), found.overlaps.clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda a, b: smooth.of_class(Ranked(a, b, found.image, found.box, found.boxes)), leaves
+    )
+
+
+def test_no_boxes_is_refused_and_no_detections_is_zero():
+    none = Ranked(torch.zeros(0), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long(), 2)
+    assert float(SmoothAP().of_class(none)) == 0.0
+    with pytest.raises(ValueError, match="at least one box"):
+        SmoothAP().of_class(Ranked(none.logits, none.overlaps, none.image, none.box, 0))
+
+
+@pytest.mark.parametrize("bad", [{"temperature": 0.0}, {"width": -1.0}, {"per_class": 0}])
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match=f"smooth_ap.{next(iter(bad))}"):
+        SmoothAP(**bad)
+
+
+def test_overlap_is_torchvisions():
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.rand(2, 50, 2, generator=generator, dtype=torch.float64) * 20
+    boxes = torch.cat([corners, corners + 1 + 10 * torch.rand(2, 50, 2, generator=generator)], -1)
+    torch.testing.assert_close(overlap(boxes[0], boxes[1]), box_iou(boxes[0], boxes[1]).diagonal())
+
+
+def scattered(generator: torch.Generator, count: int) -> tuple[LabelledImages, Best, list[dict]]:
+    """Images with no, one or two boxes of two classes, and the same detections as the detector and as COCO sees them."""
+    boxes, labels = torch.zeros(count, 2, 4), torch.full((count, 2), -1)
+    rows, predictions = [], []
+    for image in range(count):
+        for place in range(image % 3):
+            corner = torch.tensor([5.0 + 40 * place, 10.0]) + 5 * torch.rand(2, generator=generator)
+            boxes[image, place] = torch.cat([corner, corner + 25])
+            labels[image, place] = int(torch.randint(2, (), generator=generator))
+        seen = []
+        for label in range(2):
+            near = [boxes[image, i] for i in range(2) if labels[image, i] == label]
+            parts = [box + 3 * torch.randn(4, generator=generator) for box in near]
+            parts += [torch.tensor([60.0, 60.0, 80.0, 80.0])]
+            logits = torch.randn(len(parts), generator=generator) + torch.tensor([1.0] * len(near) + [0.0])
+            for i in logits.argsort(descending=True).tolist():
+                rows.append((image, label, logits[i], parts[i]))
+                seen.append((label, logits[i].sigmoid(), parts[i]))
+        predictions.append(
+            {
+                "labels": torch.tensor([row[0] for row in seen]),
+                "scores": torch.stack([row[1] for row in seen]),
+                "boxes": torch.stack([row[2] for row in seen]),
+            }
+        )
+    image, label, logit, box = zip(*rows, strict=True)
+    best = Best(torch.tensor(image), torch.tensor(label), torch.stack(logit), torch.stack(box))
+    images = LabelledImages(torch.zeros(count, 3, 96, 96), boxes, labels, torch.zeros(count).long())
+    return images, best, predictions
+
+
+def test_it_is_coco_s_ap_but_for_the_interpolation():
+    """COCO takes at each recall the best precision from there on: never lower, but for its 101 recalls."""
+    images, best, predictions = scattered(torch.Generator().manual_seed(1), 150)
+
+    class Given:
+        def best(self, outputs, per_class):
+            return best
+
+    found = ranked(Given(), (torch.zeros(150, 1, 2), torch.zeros(150, 1, 4)), images, 5)
+    coco = evaluate(predictions, images, ["a", "b"]).per_class
+    for number, name in enumerate("ab"):
+        ours = float(SHARP.of_class(found[number]))
+        assert ours == pytest.approx(coco[name], abs=0.03)
+        assert ours < coco[name] + 0.01
+
+
+def test_a_retinanet_s_best_are_its_predictions(tools, generator):
+    detector, images = tools.detector(), tools.images(4)
+    params = tools.noisy(detector.init(generator), generator)
+    backbone, trainable = detector.split(params)
+    outputs = detector.outputs(trainable, detector.features(backbone, images.images))
+    best = detector.best(outputs, 100)
+    wanted = detector.predict(params, images.images)
+    for number, image in enumerate(wanted):
+        for label in range(detector.num_classes):
+            theirs = image["labels"] == label
+            ours = (best.image == number) & (best.label == label)
+            count = min(5, int(theirs.sum()))
+            torch.testing.assert_close(best.logits[ours].sigmoid()[:count], image["scores"][theirs][:count])
+            torch.testing.assert_close(best.boxes[ours][:count], image["boxes"][theirs][:count])
+    one = detector.best(outputs, 1)
+    assert len(one.image) <= 4 * detector.num_classes

@@ -1,0 +1,178 @@
+"""Checked steps: where they go, what evidence moves them, and what a training's outcome does to them."""
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.outer.certificate import certify
+from neural_sim.outer.checked import Average, CheckedSteps, within
+from neural_sim.outer.settings import Checks, Trust
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.solver.damping import Damped
+from neural_sim.solver.solution import Solution, Status
+
+POSE = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi)
+LIGHTS = Illumination(3)
+NAMES = ("a", "b")
+
+
+def hypergradient(gradient, error, names=NAMES):
+    solution = Solution(torch.zeros(1), Status.UNROLLED, 1, 0.0, (0.0, 0.0), 1, False)
+    return Hypergradient(
+        dict(zip(names, gradient, strict=True)), dict(zip(names, error, strict=True)), {}, solution,
+        Damped(0.0, None), math.nan, 0.0, 0.0,
+    )  # fmt: skip
+
+
+def steps_at(psi, factors=(POSE,), labels=(0, 1), **checks):
+    return CheckedSteps(Checks(**checks), 0.25, SceneDistribution(factors), NAMES, labels, psi)
+
+
+def proposed(steps, gradient, error, level=0.05):
+    result = hypergradient(gradient, error)
+    p_values = steps.observe(result)
+    factors = steps.distribution.names
+    return steps.next(certify(result, p_values, NAMES, factors, None, Trust(level=level), "skip")), p_values
+
+
+def gradients(target, psi):
+    """Of minus the mean score, for bins that score 1 at ``target``: the derivative by logits in closed form."""
+    p = POSE.log_probabilities(psi).exp()
+    scores = torch.zeros_like(p)
+    scores[range(len(p)), target] = 1.0
+    return -p * (scores - (p * scores).sum(-1, keepdim=True))
+
+
+def variation(factor, a, b):
+    return 0.5 * (factor.p_of(a) - factor.p_of(b)).abs().sum(-1)
+
+
+@pytest.mark.parametrize(("factor", "start"), [(POSE, [0.0, 3.0, 0.0, 0.0]), (LIGHTS, [0.2, 0.7, 0.1])])
+def test_a_step_is_as_long_as_its_radius(factor, start):
+    psi = torch.tensor([start, start], dtype=torch.float64)
+    direction = torch.randn(psi.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    direction = direction - direction.mean(1, keepdim=True)
+    radius = torch.tensor([0.1, 0.0], dtype=torch.float64)
+    moved = within(factor, psi, direction, radius, 10.0)
+    assert float(variation(factor, moved, psi)[0]) == pytest.approx(0.1, abs=1e-6)
+    assert torch.equal(moved[1], psi[1])
+    short = within(factor, psi, direction, torch.ones(2, dtype=torch.float64), 1e-3)
+    assert float((short - psi).abs().max()) == pytest.approx(1e-3, rel=0.5)
+
+
+def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order_gain():
+    psi = POSE.psi_of(torch.tensor([[0.7, 0.1, 0.1, 0.1], [0.25, 0.25, 0.25, 0.25]], dtype=torch.float64))
+    steps = steps_at(psi, radius=0.2)
+    steps.judge(torch.zeros(2))
+    gradient = gradients([2, 3], psi)
+    tried, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    p, before = POSE.p_of(tried), POSE.p_of(psi)
+    assert p.argmax(1)[1] == 3 and float((p - before)[0, 2]) > 0.15
+    torch.testing.assert_close(variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0)
+    assert max(p_values["a"]["pose"], p_values["b"]["pose"]) < 1e-6
+    verdicts = steps.judge(torch.tensor([0.1, 0.1]))
+    # The score is linear in p: the promise is its change, exactly but for the floor under p.
+    for i, name in enumerate(NAMES):
+        assert verdicts[name].promised == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
+
+
+def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():
+    psi = torch.zeros(2, 4, dtype=torch.float64)
+    steps = steps_at(psi)
+    steps.judge(torch.tensor([0.5, 0.5, 0.5]))
+    gradient = gradients([1, 2], psi)
+    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    verdicts = steps.judge(torch.tensor([0.6, 0.45, 0.5]))
+    assert verdicts["a"].accepted and not verdicts["b"].accepted
+    assert verdicts["b"].came == pytest.approx(-0.05)
+    assert torch.equal(steps.reported, torch.stack([tried[0], psi[1]]))
+    assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
+    # The next step of b sets out from where it was, and is judged against its score there.
+    again, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    assert float(variation(POSE, again, psi)[1]) == pytest.approx(0.2, abs=1e-6)
+    assert steps.judge(torch.tensor([0.7, 0.52, 0.5]))["b"].came == pytest.approx(0.02)
+
+
+def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_undone():
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+    steps.judge(torch.tensor([0.5, 0.5, 0.5]))
+    gradient = gradients([1, 2], steps.accepted)
+    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    verdicts = steps.judge(torch.tensor([0.52, 0.51, 0.3]))
+    assert not any(verdict.accepted for verdict in verdicts.values())
+    assert float(steps.reported.abs().max()) == 0.0
+
+
+def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
+    psi = torch.zeros(2, 4, dtype=torch.float64)
+    steps = steps_at(psi, momentum=1.0)
+    steps.judge(torch.zeros(2))
+    gradient = gradients([1, 2], psi) * 0.3
+    noise = torch.full_like(gradient, 0.03)
+    found = []
+    for _ in range(6):
+        tried, p_values = proposed(steps, gradient, noise, level=0.01)
+        found.append(p_values["a"]["pose"])
+        if torch.equal(tried, psi):
+            assert steps.judge(torch.zeros(2)) == {} and not steps.moved
+    assert found[0] > 0.01 > found[-1]
+    assert not torch.equal(tried, psi)
+
+
+def test_an_object_whose_radius_is_too_small_rests():
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), smallest=0.3)
+    steps.judge(torch.zeros(2))
+    gradient = gradients([1, 2], steps.accepted)
+    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps.judge(torch.tensor([-1.0, -1.0]))
+    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    assert torch.equal(tried, steps.accepted)
+
+
+def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+    steps.judge(torch.zeros(2))
+    bad = torch.full((2, 4), math.nan, dtype=torch.float64)
+    tried, _ = proposed(steps, bad, bad)
+    assert torch.equal(tried, steps.accepted)
+    gradient = gradients([1, 2], steps.accepted)
+    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    assert POSE.p_of(tried).argmax(1).tolist() == [1, 2]
+
+
+def test_a_noisy_direction_counts_by_its_variance():
+    average = Average.zeros(torch.zeros(1, 4, dtype=torch.float64))
+    good = torch.tensor([[3.0, -1.0, -1.0, -1.0]], dtype=torch.float64)
+    wild = torch.tensor([[-90.0, 90.0, 0.0, 0.0]], dtype=torch.float64)
+    average = average.joined(good, torch.full_like(good, 0.01), 0.5)
+    average = average.joined(wild, torch.full_like(good, 1e4), 0.5)
+    # Inverse-variance weights in closed form.
+    wanted = (0.5 * good / 0.01 + wild / 1e4) / (0.5 / 0.01 + 1e-4)
+    torch.testing.assert_close(average.value, wanted)
+
+
+def test_p_values_are_those_of_the_chi_square_and_uniform_under_noise():
+    generator = torch.Generator().manual_seed(0)
+    spread = torch.tensor([0.5, 1.0, 2.0, 1.0], dtype=torch.float64)
+    noise = torch.randn(4000, 4, generator=generator, dtype=torch.float64) * spread
+    average = Average.zeros(noise).joined(noise, spread.square().expand_as(noise), 0.5)
+    centre = (noise / spread**2).sum(1, keepdim=True) / (1 / spread**2).sum()
+    wanted = stats.chi2.sf(((noise - centre) ** 2 / spread**2).sum(1).numpy(), 3)
+    torch.testing.assert_close(average.p_values, torch.from_numpy(wanted))
+    # A binomial's standard deviation at 4,000 draws is 0.0034.
+    assert float((average.p_values <= 0.05).double().mean()) == pytest.approx(0.05, abs=4 * 0.0034)
+    again = average.joined(noise.flip(0), spread.square().expand_as(noise), 0.5)
+    assert float((again.p_values <= 0.05).double().mean()) == pytest.approx(0.05, abs=4 * 0.0034)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"radius": 0.8}, {"smallest": 0.0}, {"grow": 0.9}, {"shrink": 1.0}, {"momentum": -0.1}, {"max_step": 0.0}]
+)
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match="outer.checks"):
+        Checks(**bad)

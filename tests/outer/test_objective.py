@@ -1,0 +1,68 @@
+"""What psi lowers: the loss, or one minus the smooth average precision, and its scores by class."""
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.smooth_ap import SmoothAP
+from neural_sim.outer.objective import Objective
+from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.hvp import gradient
+from tests.small_loop import TINY
+
+
+@pytest.fixture
+def made(scene, generator):
+    """An objective in float64, and a detector's trained part after a little noise."""
+
+    def make(kind):
+        from neural_sim.synthesis.scene import join
+
+        detector = RetinaNet(**TINY)
+        images = join(scene.training_set(torch.zeros(2, 4), 5, generator))
+        backbone, trainable = detector.split(detector.init(generator))
+        noisy = {k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double() for k, v in trainable.items()}
+        objective = Objective(CachedSet.of(detector, backbone, images), images, kind, SmoothAP())
+        return objective.double(), noisy
+
+    return make
+
+
+@pytest.mark.parametrize("kind", ["loss", "average_precision"])
+def test_its_slope_is_that_of_central_differences(made, kind, generator):
+    objective, params = made(kind)
+    slope = gradient(objective.terms(), params)
+    along = torch.randn(slope.shape, generator=generator, dtype=torch.float64)
+
+    def value(step):
+        moved = unflatten(flatten(params) + step * along, params)
+        with torch.no_grad():
+            return float(sum(term(moved) for term in objective.terms()))
+
+    # The error of a central difference is 1e-10 in relative size here, and which detections are ranked stays the same.
+    assert float(slope @ along) == pytest.approx((value(1e-6) - value(-1e-6)) / 2e-6, rel=1e-5)
+
+
+def test_scores_add_up_to_what_psi_lowers(made):
+    objective, params = made("average_precision")
+    with torch.no_grad():
+        whole = float(sum(term(params) for term in objective.terms()))
+    assert float(objective.scores(params).mean()) == pytest.approx(1.0 - whole, abs=1e-12)
+    objective, params = made("loss")
+    scores = objective.scores(params)
+    # As many images of each class: the mean over classes is that over images.
+    with torch.no_grad():
+        whole = float(sum(term(params) for term in objective.terms()))
+    assert float(scores.mean()) == pytest.approx(-whole, rel=1e-9)
+
+
+def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
+    objective, params = made("average_precision")
+    first = objective.images.labels[:, 0] == 0
+    rows = first.nonzero().flatten()
+    fewer = Objective(objective.cached.select(rows), objective.images.select(rows), "average_precision", SmoothAP())
+    scores = fewer.scores(params)
+    assert bool(scores[1].isnan()) and bool(scores[0].isfinite())
+    with torch.no_grad():
+        assert float(fewer.terms()[0](params)) == pytest.approx(1.0 - float(scores[0]), abs=1e-12)
