@@ -46,7 +46,7 @@ def one_pixel_object(scope: Scope) -> Checks:
         error = float((boxes[0, 0] - torch.tensor(expected)).abs().max())
         status = "BOX" if bool(present[0]) else "NO_BOX"
         yield Check(f"box in {size} x {size} pixels", error, 0.0, status, wanted)
-        synthesizer = Synthesizer(ProceduralClutter())
+        synthesizer = Synthesizer(ProceduralClutter(), shift=0.0)
         nuisance = synthesizer.draw_nuisance(1, camera, scope.generator())
         made = synthesizer.compose(rgb, opacity, nuisance, 0, torch.zeros(1, dtype=torch.long))
         boxed = float(made.present.sum())
