@@ -108,9 +108,8 @@ def test_a_proximal_term_joins_the_steps_and_stays_out_of_the_history(tools, gen
     assert added == pytest.approx(1.5 * sum(value.numel() for value in start.values()) * 0.01, rel=1e-4)
     module.on_train_epoch_end()
     module.on_train_end()
-    assert module.epoch_losses == [
-        pytest.approx(float(detector.per_image_loss(start, features, targets).mean()), rel=1e-6)
-    ]
+    wanted = float(detector.per_image_loss(start, features, targets).mean())
+    assert module.epoch_losses == [pytest.approx(wanted, rel=1e-6)]
 
 
 def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):

@@ -14,7 +14,8 @@ from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, places, standing
 from neural_sim.gradient.base import ObjectImages, Probes
-from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.stratified import stratified
 from neural_sim.gradient.unrolled import Examples, reversed_steps

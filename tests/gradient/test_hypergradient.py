@@ -17,7 +17,7 @@ from neural_sim.solver.solution import Status
 from neural_sim.synthesis.motion import moved_by
 
 DOUBLE = torch.float64
-EXACT = AdjointSolver(ConjugateGradient(), FixedDamping(0.0), rtol=1e-12, max_steps=200)
+EXACT = AdjointSolver(ConjugateGradient(), FixedDamping(0.0, 0), rtol=1e-12, max_steps=200)
 
 
 def solve(problem, inner, estimate, solver=EXACT):

@@ -240,7 +240,7 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms, pathwise
     params = minimiser(batch.images, anchor)
     estimates = {"can": lambda v: pathwise(loss_of, params, v, batch)}
     solver = AdjointSolver(
-        ConjugateGradient(), FixedDamping(0.0), rtol=1e-10, max_steps=300, retain_graph=True
+        ConjugateGradient(), FixedDamping(0.0, 0), rtol=1e-10, max_steps=300, retain_graph=True
     )
     result = hypergradient(
         inner_problem(params, batch.images), [validation], estimates, solver, torch.Generator().manual_seed(0)

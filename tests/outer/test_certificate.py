@@ -111,7 +111,7 @@ def test_an_object_without_signal_holds_up_no_other(p_values, on_untrusted, expe
 def test_each_factor_is_judged_by_itself():
     found = result()
     found.p_values["a"]["zoom"], found.p_values["b"]["zoom"] = 0.5, 0.02
-    certificate = certify(found, ("a", "b"), ("pose", "zoom"), None, STRICT, "skip")
+    certificate = certify(found, found.p_values, ("a", "b"), ("pose", "zoom"), None, STRICT, "skip")
     assert certificate.actions == {
         "a": {"pose": "kept", "zoom": "skipped"},
         "b": {"pose": "kept", "zoom": "kept"},
@@ -120,7 +120,7 @@ def test_each_factor_is_judged_by_itself():
 
 def test_only_objects_that_move_have_actions_and_what_was_not_tested_is_kept():
     found = dataclasses.replace(result(), p_values={})
-    certificate = certify(found, ("b",), ("pose",), None, STRICT, "shrink")
+    certificate = certify(found, found.p_values, ("b",), ("pose",), None, STRICT, "shrink")
     assert certificate.actions == {"b": {"pose": "kept"}} and certificate.p_values == {}
 
 
@@ -155,7 +155,7 @@ def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(gene
             psi_gradients={name: part.value for name, part in zip(names, estimates, strict=True)},
             p_values={name: part.p_values for name, part in zip(names, estimates, strict=True)},
         )
-        certificate = certify(found, names, ("pose",), None, Trust(level=level), "shrink")
+        certificate = certify(found, found.p_values, names, ("pose",), None, Trust(level=level), "shrink")
         assert certificate.doubts == []
         kept.update(name for name in names if certificate.actions[name]["pose"] == "kept")
     wrongly = sum(kept[name] for name in names[:-1])

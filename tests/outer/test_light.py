@@ -11,8 +11,9 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training
 from neural_sim.field.appearance import AppearanceField
-from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.binding import bound_losses, image_losses, object_images
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
@@ -184,7 +185,7 @@ def test_opacity_does_not_know_the_light():
 def test_explored_lights_differ_and_carry_their_density():
     scene, generator = _scene(), torch.Generator().manual_seed(0)
     psi = scene.distribution.psi("initial", ["a"])[0].float()
-    part = scene.draw(0, psi, 4, generator, ReinforceEstimator.draws)
+    part = scene.draw(0, psi, 4, generator, ReinforceEstimator().draws)
     assert part.draw.explored is not None and part.draw.weights is not None
     assert len(part.draw.weights.unique(dim=0)) == 4
     density = torch.distributions.Normal(psi, 0.1).log_prob(part.draw.explored).sum(-1)

@@ -11,7 +11,8 @@ from small_loop import small_loop
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
-from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
 from neural_sim.parameter.pose import Pose

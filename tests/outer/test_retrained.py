@@ -78,7 +78,7 @@ def oracle(problem):
 def implicit(problem, linear, rtol, max_steps):
     binned, terms, minimum = problem
     estimates = {str(label): binned.estimate(PSI, label, minimum.params) for label in range(2)}
-    solver = AdjointSolver(linear, FixedDamping(0.0), rtol=rtol, max_steps=max_steps)
+    solver = AdjointSolver(linear, FixedDamping(0.0, 0), rtol=rtol, max_steps=max_steps)
     inner = binned.at(PSI, minimum.params)
     return hypergradient(inner, terms, estimates, solver, torch.Generator().manual_seed(0))
 

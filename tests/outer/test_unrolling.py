@@ -10,7 +10,8 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.training import Training
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
-from neural_sim.gradient.estimators import PathwiseEstimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.unrolled import Examples
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi

@@ -107,7 +107,7 @@ def test_steps_lead_to_the_constrained_optimum_of_a_quadratic(constraint, genera
 @pytest.mark.parametrize("constraint", ["simplex", "affine"])
 def test_the_plain_step_is_momentum_and_projection_written_out(constraint, generator):
     illumination = Illumination(anchors=5, constraint=constraint)
-    update = SGD(learning_rate=0.4, momentum=0.7, max_step=None)
+    update = SGD(learning_rate=0.4, momentum=0.7)
     psi = illumination.project(normal(generator, 3, 5))
     state, gradients = UpdateState.zeros(psi), 10.0 * normal(generator, 6, 3, 5)
     for done in range(6):
@@ -125,7 +125,7 @@ def test_plain_steps_on_the_plane_follow_the_recursion_of_heavy_ball(generator):
     best = illumination.project(normal(generator, 2, 5))
     wanted = best + normal(generator, 2, 1)  # off the plane, along its normal
     psi = illumination.project(normal(generator, 2, 5))
-    update, state, errors = SGD(rate, momentum, max_step=None), UpdateState.zeros(psi), [psi - best]
+    update, state, errors = SGD(rate, momentum), UpdateState.zeros(psi), [psi - best]
     for _ in range(40):
         psi, state = step(illumination, update, psi, psi - wanted, torch.zeros_like(psi), state)
         errors.append(psi - best)
@@ -136,7 +136,7 @@ def test_plain_steps_on_the_plane_follow_the_recursion_of_heavy_ball(generator):
         torch.testing.assert_close(after, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("update", [Mirror(), SGD(learning_rate=1.0, max_step=None)])
+@pytest.mark.parametrize("update", [Mirror(), SGD(learning_rate=1.0)])
 def test_a_gradient_that_is_not_finite_moves_nothing(update):
     illumination = Illumination(anchors=3)
     psi = torch.tensor([[0.2, 0.3, 0.5]], dtype=DOUBLE)

@@ -35,7 +35,7 @@ def test_sgd_without_a_bound_takes_the_whole_step():
     """Under a constant gradient g the n-th velocity is g (1 - 0.9^n) / 0.1, and psi has moved by the sum of them."""
     psi = torch.tensor([[0.3, -0.1, -0.2]], dtype=torch.float64)
     gradient = torch.tensor([[40.0, -50.0, 10.0]], dtype=torch.float64)
-    update, state, moved = SGD(learning_rate=3.0, momentum=0.9, max_step=None), UpdateState.zeros(psi), psi
+    update, state, moved = SGD(learning_rate=3.0, momentum=0.9), UpdateState.zeros(psi), psi
     for _ in range(5):
         moved, state = update.step(moved, psi.log_softmax(-1), gradient, torch.full_like(psi, 1e9), state)
     velocities = sum((1.0 - 0.9**n) / 0.1 for n in range(1, 6))
@@ -70,7 +70,7 @@ def test_mirror_step_is_exponentiated_gradient():
     torch.testing.assert_close(torch.softmax(moved, -1), expected)
 
 
-@pytest.mark.parametrize("update", [SGD(learning_rate=2.0), Adam(), Mirror()])
+@pytest.mark.parametrize("update", [SGD(learning_rate=2.0, max_step=0.5), Adam(), Mirror()])
 def test_each_finds_the_best_bin(update):
     cost = torch.tensor([[0.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 1.0]], dtype=torch.float64)
     psi = torch.log(torch.tensor([[0.02, 0.94, 0.02, 0.02]], dtype=torch.float64)).repeat(2, 1)
@@ -83,7 +83,7 @@ def test_each_finds_the_best_bin(update):
 
 
 @pytest.mark.parametrize(
-    "update", [SGD(learning_rate=1e3), SGD(learning_rate=1e3, max_step=None), Adam(), Mirror()]
+    "update", [SGD(learning_rate=1e3, max_step=0.5), SGD(learning_rate=1e3), Adam(), Mirror()]
 )
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e308])
 def test_a_gradient_that_is_not_finite_is_refused_and_forgotten(update, bad):
@@ -155,7 +155,7 @@ def test_mirror_goes_on_after_a_cliff():
 
 @pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0), lambda: Adam(betas=(1.0, 0.9)),
                                   lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0),
-                                  lambda: SGD(max_step=0.0)])  # fmt: skip
+                                  lambda: SGD(1.0, max_step=0.0)])  # fmt: skip
 def test_bad_settings_are_refused(make):
     with pytest.raises(ValueError, match=r"^(learning_rate|beta1|momentum|max_step) must "):
         make()

@@ -259,7 +259,7 @@ def test_damping_is_raised_until_conjugate_gradients_hold(start, generator):
     assert adjoint.raises >= 1
     assert adjoint.solution.status is Status.CONVERGED
     torch.testing.assert_close(adjoint.vector, b / (values + adjoint.damping.value), rtol=1e-6, atol=1e-7)
-    fixed = AdjointSolver(ConjugateGradient(), FixedDamping(0.1), rtol=1e-8).solve(
+    fixed = AdjointSolver(ConjugateGradient(), FixedDamping(0.1, 0), rtol=1e-8).solve(
         terms, params, b, None, generator
     )
     assert (

@@ -79,7 +79,7 @@ def test_the_box_goes_with_the_shift_and_is_clipped() -> None:
     opacity[:, 2:5, 3:7] = 1.0
     shifts = torch.tensor([[0, 0], [2, -1], [-5, 5], [7, 0]])
     nuisance = Nuisance(torch.zeros(4, 3, 8, 10), shifts)
-    made = Synthesizer(ProceduralClutter(), minimum_area=1).compose(
+    made = Synthesizer(ProceduralClutter(), 0.0, minimum_area=1).compose(
         opacity[..., None].expand(-1, -1, -1, 3), opacity, nuisance, 1, torch.arange(4)
     )
     assert made.boxes[:, 0].tolist() == [[3, 2, 7, 5], [5, 1, 9, 4], [0, 7, 2, 8], [0, 0, 0, 0]]
@@ -94,7 +94,7 @@ def test_small_and_lost_objects_are_counted_not_fatal(caplog: pytest.LogCaptureF
     opacity[1, :4] = 1.0
     nuisance = Nuisance(torch.zeros(3, 3, 8, 10), torch.zeros(3, 2, dtype=torch.long))
     with caplog.at_level(logging.DEBUG):
-        made = Synthesizer(ProceduralClutter(), minimum_area=4).compose(
+        made = Synthesizer(ProceduralClutter(), 0.0, minimum_area=4).compose(
             opacity[..., None].expand(-1, -1, -1, 3), opacity, nuisance, 0, torch.zeros(3, dtype=torch.long)
         )
     assert made.present[:, 0].tolist() == [False, True, False]

@@ -49,7 +49,7 @@ def meshes() -> dict[str, ObjectMesh]:
 
 @pytest.fixture
 def synthesizer() -> Synthesizer:
-    return Synthesizer(ProceduralClutter(octaves=1, contrast=0.0, shapes=0, grain=0.0))
+    return Synthesizer(ProceduralClutter(octaves=1, contrast=0.0, shapes=0, grain=0.0), shift=0.0)
 
 
 def draw_at(distances: list[float]) -> SceneDraw:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, get_args
+from typing import ClassVar, Protocol, get_args
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -13,12 +13,45 @@ from torch.nn.functional import one_hot
 from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
 from neural_sim.gradient.mixed import ThetaMode, scores
-from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
 from neural_sim.parameter.factor import Factor
-from neural_sim.synthesis.scene import HardDraws
+from neural_sim.synthesis.scene import Draws, HardDraws
+
+
+class Estimator(Protocol):
+    """How psi's derivative is estimated from images.
+
+    ``draws`` says how an iteration's images are drawn; ``probes_per_bin`` how many images of every stratum of every
+    factor are made beside them (0: none); ``through_images`` whether :meth:`accumulated` wants the derivatives by the
+    training images' inputs.
+    """
+
+    through_images: ClassVar[bool]
+
+    @property
+    def draws(self) -> Draws: ...
+
+    @property
+    def probes_per_bin(self) -> int: ...
+
+    def estimate(
+        self,
+        losses: Losses,
+        params: Params,
+        vector: Params,
+        images: ObjectImages,
+        probes: Mapping[str, Probes],
+    ) -> MixedDerivative:
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign; ``probes`` by factor."""
+        ...
+
+    def accumulated(
+        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+    ) -> MixedDerivative:
+        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -30,7 +63,6 @@ class StratifiedEstimator:
     (see :func:`gradient.mixed.scores`).
     """
 
-    draws: ClassVar[HardDraws] = HardDraws()
     through_images: ClassVar[bool] = False
     probes_per_bin: int = 16
     chunk_size: int = 64
@@ -43,6 +75,11 @@ class StratifiedEstimator:
             raise ValueError(
                 f"gradient.theta_mode must be one of {get_args(ThetaMode)}, got {self.theta_mode!r}"
             )
+
+    @property
+    def draws(self) -> HardDraws:
+        """Exact samples of p_psi."""
+        return HardDraws()
 
     def estimate(
         self,
@@ -96,10 +133,18 @@ class StratifiedEstimator:
 class ReinforceEstimator:
     """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
 
-    draws: ClassVar[HardDraws] = HardDraws(explore=True)
     through_images: ClassVar[bool] = False
-    probes_per_bin: ClassVar[int] = 0
     chunk_size: int = 64
+
+    @property
+    def draws(self) -> HardDraws:
+        """Samples of p_psi that have a density."""
+        return HardDraws(explore=True)
+
+    @property
+    def probes_per_bin(self) -> int:
+        """None: an iteration's own images are scored."""
+        return 0
 
     def estimate(
         self,
@@ -142,6 +187,3 @@ def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Fa
     if factor.same_scenes:
         return no_difference(scores.view(factor.size, -1).T)
     return no_association(scores, one_hot(strata, factor.size))
-
-
-Estimator = PathwiseEstimator | StratifiedEstimator | ReinforceEstimator

@@ -62,7 +62,6 @@ class PathwiseEstimator:
     """
 
     through_images: ClassVar[bool] = True
-    probes_per_bin: ClassVar[int] = 0
     mode: Mode = "forward"
     relaxation: Relaxation = "gumbel_softmax"
     conditional_draws: int = 8
@@ -81,6 +80,11 @@ class PathwiseEstimator:
         for key in ("conditional_draws", "patch_size", "chunk_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
+
+    @property
+    def probes_per_bin(self) -> int:
+        """None: an iteration's own images are differentiated."""
+        return 0
 
     @property
     def draws(self) -> RelaxedDraws:

@@ -77,15 +77,15 @@ def _accept(
 
 @dataclass(frozen=True)
 class SGD:
-    """Gradient descent with momentum on the logits (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
+    """Gradient descent with momentum (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
 
     ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; steps are as long as that says where ``max_step``
     is None, as in the paper.
     """
 
-    learning_rate: float = 1e-5
+    learning_rate: float
     momentum: float = 0.9
-    max_step: float | None = 0.5
+    max_step: float | None = None
 
     def __post_init__(self) -> None:
         check_rates(self.learning_rate, self.max_step, momentum=self.momentum)

@@ -57,7 +57,7 @@ class AdjointSolver:
     linear: LinearSolver = field(default_factory=ConjugateGradient)
     damping: Damping = field(default_factory=LanczosDamping)
     mode: Mode = "reverse_over_reverse"
-    rtol: float = 1e-3
+    rtol: float = 3e-2
     max_steps: int = 40
     retain_graph: bool = True
     max_raises: int = 3

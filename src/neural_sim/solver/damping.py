@@ -65,7 +65,7 @@ class FixedDamping(Damping):
     """
 
     value: float
-    lanczos_steps: int = 0
+    lanczos_steps: int = 12
 
     def __post_init__(self) -> None:
         _check("fixed", self.value, self.lanczos_steps)
@@ -92,7 +92,7 @@ class LanczosDamping(Damping):
     margin: float = 0.25
     max_condition: float = 100.0
     minimum: float = 1e-6
-    lanczos_steps: int = 12
+    lanczos_steps: int = 14
     start: Start = "rhs"
 
     def __post_init__(self) -> None:
@@ -141,7 +141,7 @@ class GaussNewtonDamping(Damping):
 
     curvature: ClassVar[Curvature] = "gauss_newton"
     value: float
-    lanczos_steps: int = 0
+    lanczos_steps: int = 12
 
     def __post_init__(self) -> None:
         _check("gauss_newton", self.value, self.lanczos_steps)

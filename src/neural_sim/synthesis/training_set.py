@@ -49,7 +49,7 @@ class Synthesizer:
     """
 
     background: Background
-    shift: float = 0.0
+    shift: float = 0.15
     threshold: float = 0.5
     minimum_area: float = 16.0
     label_gradient: Literal["ignored", "differentiable"] = "ignored"

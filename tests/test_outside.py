@@ -1,0 +1,73 @@
+"""A parameter, an estimator and a detector from outside the package: each one file and one YAML, in tests/outside."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from neural_sim.main import UserError, build, conf_directory, context_of
+from neural_sim.stages.walk import walk
+
+OUTSIDE = Path(__file__).parent / "outside"
+MINE = {
+    "parameter": "parameter=[my_turn]",
+    "gradient": "gradient=my_score_function",
+    "detector": "detector=my_cells",
+}
+
+
+@pytest.fixture(autouse=True)
+def on_the_path(monkeypatch):
+    monkeypatch.syspath_prepend(OUTSIDE)
+    yield
+    for path in OUTSIDE.glob("*.py"):
+        sys.modules.pop(path.stem, None)
+
+
+def composed(*overrides):
+    """As ``python -m src.main --config-dir tests/outside/conf`` composes it."""
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return compose("config", [f"hydra.searchpath=[file://{OUTSIDE / 'conf'}]", "scale=smoke", *overrides])
+
+
+def test_each_is_built_from_its_group():
+    pose = build(composed()).imaging.distribution
+    with_turn = build(composed("parameter=[pose,my_turn]")).imaging.distribution
+    assert with_turn.names == ("pose", "turn") and with_turn.size == pose.size + 4
+    target = with_turn.probabilities(with_turn.psi("target", ["mug"]))["turn"][0]
+    torch.testing.assert_close(target, torch.tensor([0.02, 0.94, 0.02, 0.02], dtype=torch.float64))
+    assert build(composed(MINE["gradient"])).loop.gradient.chunk_size == 8
+    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=32)
+    assert len(detector.anchors) == 16
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("parameter.turn.bins=two", "parameter.turn.bins: want int, got 'two'"),
+        ("parameter.turn.range_deg=[3,1]", r"parameter.turn.range_deg must be ordered, got \[3, 1\]"),
+        ("+gradient.draws=1", "gradient.draws: unknown key, want one of chunk_size"),
+        ("detector.cell=0.5", "detector.cell: want int, got 0.5"),
+    ],
+)
+def test_its_settings_are_checked_like_all_others(override, message):
+    with pytest.raises(UserError, match=message):
+        build(composed(*MINE.values(), override))
+
+
+@pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
+def test_they_run_together(adjoint, tmp_path):
+    config = composed(
+        *MINE.values(), "objects.names=[can,mug]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
+        f"outer.adjoint={adjoint}", "outer.train_first=true", "progress=false",
+        f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
+    )  # fmt: skip
+    context, others = context_of(config, tmp_path)
+    validation_ap = walk(context, others)
+    learned = context.results(context.graph.learned)
+    assert learned.trajectory.shape == (3, 2, 4) and bool(learned.trajectory.isfinite().all())
+    assert bool((learned.last != learned.trajectory[0]).any(-1).all())
+    assert validation_ap is not None and 0.0 <= validation_ap <= 1.0
+    assert set(learned.records[-1].certificate.actions) == {"can", "mug"}
