@@ -21,7 +21,13 @@ TINY = {
 MICRO = {"backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)), reference=48)}
 
 
-FREE = {"objective": "loss", "steps": "free", "adjoint": "implicit", "train_first": False, "on_untrusted": "shrink"}
+FREE = {
+    "objective": "loss",
+    "steps": "free",
+    "adjoint": "implicit",
+    "train_first": False,
+    "on_untrusted": "shrink",
+}
 """The paper's: steps as they come, of the loss, by the implicit derivative."""
 
 

@@ -64,7 +64,9 @@ def noisy(params: dict[str, torch.Tensor], generator: torch.Generator) -> dict[s
 def mean_loss(detector: RetinaNet, params: dict[str, torch.Tensor], images: LabelledImages) -> float:
     backbone, trainable = detector.split(params)
     targets = detector.assign(images.boxes, images.labels)
-    return float(detector.per_image_loss(trainable, detector.features(backbone, images.images), targets).mean())
+    return float(
+        detector.per_image_loss(trainable, detector.features(backbone, images.images), targets).mean()
+    )
 
 
 def configured(name: str):

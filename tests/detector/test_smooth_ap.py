@@ -59,7 +59,9 @@ def test_a_box_is_found_once_however_many_detections_it_has():
 
 
 def test_false_positives_on_images_of_others_lower_it():
-    own = Ranked(torch.tensor([1.0, -9.0]), torch.tensor([0.9, 0.0]), torch.arange(2), torch.tensor([0, -1]), 1)
+    own = Ranked(
+        torch.tensor([1.0, -9.0]), torch.tensor([0.9, 0.0]), torch.arange(2), torch.tensor([0, -1]), 1
+    )
     fooled = Ranked(torch.tensor([1.0, 1.5]), own.overlaps, own.image, own.box, 1)
     assert float(SmoothAP().of_class(fooled)) < 0.6 * float(SmoothAP().of_class(own))
 

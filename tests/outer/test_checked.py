@@ -73,7 +73,9 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
     tried, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     p, before = POSE.p_of(tried), POSE.p_of(psi)
     assert p.argmax(1)[1] == 3 and float((p - before)[0, 2]) > 0.15
-    torch.testing.assert_close(variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0
+    )
     assert max(p_values["a"]["pose"], p_values["b"]["pose"]) < 1e-6
     verdicts = steps.judge(torch.tensor([0.1, 0.1]))
     # The score is linear in p: the promise is its change, exactly but for the floor under p.
@@ -171,7 +173,15 @@ def test_p_values_are_those_of_the_chi_square_and_uniform_under_noise():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"radius": 0.8}, {"smallest": 0.0}, {"grow": 0.9}, {"shrink": 1.0}, {"momentum": -0.1}, {"max_step": 0.0}]
+    "bad",
+    [
+        {"radius": 0.8},
+        {"smallest": 0.0},
+        {"grow": 0.9},
+        {"shrink": 1.0},
+        {"momentum": -0.1},
+        {"max_step": 0.0},
+    ],
 )
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match="outer.checks"):

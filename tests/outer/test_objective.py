@@ -22,7 +22,10 @@ def made(scene, generator):
         detector = RetinaNet(**TINY)
         images = join(scene.training_set(torch.zeros(2, 4), 5, generator))
         backbone, trainable = detector.split(detector.init(generator))
-        noisy = {k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double() for k, v in trainable.items()}
+        noisy = {
+            k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double()
+            for k, v in trainable.items()
+        }
         objective = Objective(CachedSet.of(detector, backbone, images), images, kind, SmoothAP())
         return objective.double(), noisy
 
@@ -61,7 +64,9 @@ def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
     objective, params = made("average_precision")
     first = objective.images.labels[:, 0] == 0
     rows = first.nonzero().flatten()
-    fewer = Objective(objective.cached.select(rows), objective.images.select(rows), "average_precision", SmoothAP())
+    fewer = Objective(
+        objective.cached.select(rows), objective.images.select(rows), "average_precision", SmoothAP()
+    )
     scores = fewer.scores(params)
     assert bool(scores[1].isnan()) and bool(scores[0].isfinite())
     with torch.no_grad():

@@ -39,7 +39,10 @@ class Average:
         return Average(torch.zeros_like(psi), torch.zeros_like(psi[:, :1]), torch.zeros_like(psi))
 
     def joined(
-        self, direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"], keep: float
+        self,
+        direction: Float[Tensor, "objects k"],
+        variance: Float[Tensor, "objects k"],
+        keep: Float[Tensor, "objects 1"] | float,
     ) -> Average:
         """With one more direction; what was there counts ``keep`` times as much as before. Objects whose direction or
         variance is not finite stay as they are."""
@@ -97,6 +100,7 @@ class CheckedSteps:
         self._joined = self._averages
         self._promised = torch.zeros_like(psi[:, 0])
         self._moved = torch.zeros(len(psi), dtype=torch.bool)
+        self._left = torch.zeros(len(psi), dtype=torch.bool)
         self._reference: Tensor | None = None
 
     @property
@@ -133,6 +137,7 @@ class CheckedSteps:
             for i, name in enumerate(self.names)
             if self._moved[i]
         }
+        self._left = accepted
         self._reference, self._moved = reference, torch.zeros_like(self._moved)
         return verdicts
 
@@ -141,6 +146,8 @@ class CheckedSteps:
         parts = (self.distribution.split(values) for values in (self.tried, gradient, error))
         psi, slope, noise = parts
         found: dict[str, dict[str, float]] = {name: {} for name in self.names}
+        # What was seen where an object still is stays as good as new.
+        keep = torch.where(self._left, self.settings.momentum, 1.0)[:, None].to(self.accepted)
         self._joined = {}
         for factor in self.distribution.factors:
             name = factor.name
@@ -148,9 +155,7 @@ class CheckedSteps:
             # By p: the slope in logits is p times it, and a bin that p has left gets as long a step as any.
             direction = -slope[name] / p
             direction = direction - direction.mean(-1, keepdim=True)
-            self._joined[name] = self._averages[name].joined(
-                direction, (noise[name] / p).square(), self.settings.momentum
-            )
+            self._joined[name] = self._averages[name].joined(direction, (noise[name] / p).square(), keep)
             for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
                 found[object_name][name] = value
         return found

@@ -47,6 +47,7 @@ class InnerLoop:
     target set, anywhere; no step sees any other real image. ``draws`` says how the method wants images drawn. Relaxed
     ones, and those under a light that moves, are always rendered anew, all others come from a pool of every bin.
     The batch size and the decay of its steps are those of ``training``.
+    With ``common_numbers`` all draws and trainings use the same random numbers, so that two of them differ by psi alone.
     ``images`` and ``steps`` count labelled images made and optimiser steps; ``cpu_begun`` is the processor time at
     which the pool was begun.
     """
@@ -78,6 +79,7 @@ class InnerLoop:
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
         self.objective = Objective(self.validation, validation, settings.objective, settings.smooth_ap)
         self.images = self.steps = self._numbers = 0
+        self.common_numbers = False
         self.trajectory: Trajectory | None = None
 
     @property
@@ -95,8 +97,8 @@ class InnerLoop:
         return [self.pool.draw(label, psi[label], count, generator) for label in labels]
 
     def _common(self, purpose: int) -> torch.Generator:
-        """Where steps are checked, the same random numbers every time until :meth:`renew`; else new ones."""
-        if self.settings.steps == "free":
+        """The same random numbers every time until :meth:`renew`, or new ones."""
+        if not self.common_numbers:
             return self.generator
         seed = self.generator.initial_seed() + 2_000_003 * (1 + self._numbers) + purpose
         return torch.Generator().manual_seed(seed)

@@ -54,6 +54,7 @@ class SimulatorModule(OuterLoop):
         psi, distribution = self.psi[self._learned], self.scene.distribution
         if self.settings.steps == "free":
             return FreeSteps(self.settings, distribution, self._names, psi)
+        self.inner.common_numbers = True
         shrink = self.settings.trust.shrink
         return CheckedSteps(self.settings.checks, shrink, distribution, self._names, self._learned, psi)
 

@@ -142,7 +142,9 @@ def degenerate(scope: Scope) -> Checks:
     }
     for name, solver in TRIED.items():
         for label, term in flat.items():
-            found = AdjointSolver(solver, FixedDamping(0.0, 0), rtol=1e-3).solve([term], params, b, None, torch.Generator())
+            found = AdjointSolver(solver, FixedDamping(0.0, 0), rtol=1e-3).solve(
+                [term], params, b, None, torch.Generator()
+            )
             yield ended(f"|v|: {name}, {label}", worst(found.vector), 0.0, found.solution, *UNTRUSTED)
             damped = AdjointSolver(solver, FixedDamping(1e-3, 0), rtol=1e-3)
             found = damped.solve([term], params, b, None, torch.Generator())
