@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
+from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.gauss_newton import GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator
 
@@ -37,7 +38,7 @@ def test_it_has_at_most_5000_parameters_and_learns(micro, tools, generator, size
 
 
 def test_curvature_of_its_loss_is_smooth_and_split_at_the_outputs(micro, tools, generator, images):
-    """All modes of Hessian products agree, and Gauss-Newton ones with the Jacobian of the outputs, in float64."""
+    """Hessian products agree with forward over reverse, Gauss-Newton ones with the outputs' Jacobian, in float64."""
     detector = micro(num_classes=3, image_size=32)
     backbone, trainable = detector.split(tools.noisy(detector.init(generator), generator))
     cached = CachedSet.of(detector, backbone, images)
@@ -49,9 +50,11 @@ def test_curvature_of_its_loss_is_smooth_and_split_at_the_outputs(micro, tools, 
     reference = HessianOperator(plain.terms(), trainable)
     vector = torch.randn(reference.size, generator=generator, dtype=torch.float64)
     expected = reference(vector)
-    for mode, tolerance in (("forward_over_reverse", 1e-10), ("central_difference", 1e-6)):
-        product = HessianOperator(split.terms(), trainable, mode)(vector)
-        assert (product - expected).norm() < tolerance * expected.norm()
+    differenced = HessianOperator(split.terms(), trainable, "central_difference")(vector)
+    assert (differenced - expected).norm() < 1e-6 * expected.norm()
+    slope = torch.func.grad(lambda at: sum(term(unflatten(at, trainable)) for term in split.terms()))
+    forward = torch.func.jvp(slope, (flatten(trainable),), (vector,))[1]
+    assert (forward - expected).norm() < 1e-10 * expected.norm()
 
     def outputs(params):
         return torch.cat([part.flatten() for part in cached.outputs(params, torch.arange(len(images)))])

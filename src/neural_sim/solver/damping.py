@@ -6,7 +6,7 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,6 @@ from neural_sim.solver.operator import Matvec
 
 logger = logging.getLogger(__name__)
 Curvature = Literal["hessian", "gauss_newton"]
-Start = Literal["rhs", "random"]
 
 
 @dataclass(frozen=True)
@@ -82,18 +81,16 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    ``start``: from ``rhs``, the Krylov space is the one that conjugate gradients search, which go on from it, and
-    lambda past its smallest Ritz value is what keeps these first steps of theirs from breaking down; ``random`` looks
-    for the spectrum's own ends, but a detector's few negative eigenvalues hide among many near zero: on a
-    tiny RetinaNet 12 steps saw -0.01 where lambda_min was -2.4. Where a longer solve still meets negative
-    curvature, lambda is raised past it.
+    The Krylov space is the right-hand side's, which conjugate gradients search and go on from: lambda past its
+    smallest Ritz value is what keeps these first steps of theirs from breaking down. (From a random start a detector's
+    few negative eigenvalues hide among many near zero: on a tiny RetinaNet 12 steps saw -0.01 where lambda_min was
+    -2.4.) Where a longer solve still meets negative curvature, lambda is raised past it.
     """
 
     margin: float = 0.25
     max_condition: float = 100.0
     minimum: float = 1e-6
     lanczos_steps: int = 12
-    start: Start = "rhs"
 
     def __post_init__(self) -> None:
         _check("lanczos", self.minimum, self.lanczos_steps)
@@ -102,15 +99,11 @@ class LanczosDamping(Damping):
                 "solver.damping (lanczos): want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
                 f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
             )
-        if self.start not in get_args(Start):
-            raise ValueError(
-                f"solver.damping (lanczos): start must be one of {get_args(Start)}, got {self.start!r}"
-            )
 
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         # A zero or non-finite right-hand side has no Krylov space; its solve has a status of its own.
         usable = bool(torch.isfinite(b).all()) and bool(b.any())
-        if self.start == "rhs" and usable:
+        if usable:
             spectrum = lanczos(matvec, b, self.lanczos_steps)
         else:
             spectrum = _estimate(matvec, b, self.lanczos_steps, generator)
@@ -120,9 +113,7 @@ class LanczosDamping(Damping):
             )
             return Damped(self.minimum, spectrum)
         value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
-        if self.start == "random" or not usable or spectrum.krylov is None:
-            return Damped(value, spectrum)
-        return Damped(value, spectrum, spectrum.krylov)
+        return Damped(value, spectrum, spectrum.krylov if usable else None)
 
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0
