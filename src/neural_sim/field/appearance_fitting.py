@@ -13,7 +13,8 @@ from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
 from neural_sim.field.objective import Fitting, Rendering
 from neural_sim.field.quadrature import composite
-from neural_sim.field.rendering import render_views, sample_points
+from neural_sim.field.rendering import render_views
+from neural_sim.field.samples import sample_points
 from neural_sim.field.scores import compare
 from neural_sim.types import PosedViews
 
