@@ -30,7 +30,7 @@ from neural_sim.detector.retinanet import Detector
 from neural_sim.detector.training import train_detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Probes
-from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss, hypergradient
+from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.main import conf_directory
 from neural_sim.outer.retrained import BinnedProblem, as_double, centred_cosine, finite_difference
 from neural_sim.parameter.pose import Pose
@@ -42,7 +42,6 @@ from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
 from neural_sim.solver.exact import Exact
 from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.gauss_newton import GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
 from neural_sim.solver.identity import Identity
 from neural_sim.solver.minres import MinimumResidual
@@ -113,9 +112,8 @@ def trained_problem() -> tuple[BinnedProblem, list[Term]]:
     backbone, warm = detector.split(params)
     held = CachedSet.of(detector, backbone, probes).double()
     bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
-    losses = SplitLoss(held.outputs, held.losses_of)
     problem = BinnedProblem(
-        losses, bins, scene.distribution.factors[0].log_probabilities, 0.0, as_double(warm)
+        held.losses, bins, scene.distribution.factors[0].log_probabilities, 0.0, as_double(warm)
     )
     return problem, CachedSet.of(detector, backbone, validation).double().mean_terms()
 
@@ -240,16 +238,12 @@ def product_costs(images: int = 64, repeats: int = 7) -> list[dict[str, Any]]:
     )  # fmt: skip
     held = CachedSet.of(detector, backbone, drawn)
     weights = torch.full((images,), 1.0 / images)
-    terms = InnerProblem(params, SplitLoss(held.outputs, held.losses_of), weights).terms()
+    terms = InnerProblem(params, held.losses, weights).terms()
     rows = []
     for kind, retain in (
         ("reverse_over_reverse", True), ("reverse_over_reverse", False), ("central_difference", False),
-        ("gauss_newton", True), ("gauss_newton", False),
     ):  # fmt: skip
-        if kind == "gauss_newton":
-            operator = GaussNewtonOperator(terms, params, retain)  # pyright: ignore[reportArgumentType]
-        else:
-            operator = HessianOperator(terms, params, kind, retain)  # pyright: ignore[reportArgumentType]
+        operator = HessianOperator(terms, params, kind, retain)  # pyright: ignore[reportArgumentType]
         vector = gradient(terms, params)
         pairs = [
             (seconds(lambda: gradient(terms, params)), seconds(lambda op=operator, v=vector: op(v)))

@@ -1,4 +1,4 @@
-"""The choice of lambda in ``(H + lambda I) v = b``, and of the curvature operator it is added to."""
+"""The choice of lambda in ``(H + lambda I) v = b``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -17,7 +16,6 @@ from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
 from neural_sim.solver.operator import Matvec
 
 logger = logging.getLogger(__name__)
-Curvature = Literal["hessian", "gauss_newton"]
 
 
 @dataclass(frozen=True)
@@ -42,9 +40,7 @@ class Damped:
 
 
 class Damping(abc.ABC):
-    """Chooses lambda for an operator; ``curvature`` names the operator that this choice is meant for."""
-
-    curvature: ClassVar[Curvature] = "hessian"
+    """Chooses lambda for an operator."""
 
     @abc.abstractmethod
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
@@ -122,23 +118,6 @@ class LanczosDamping(Damping):
     def _past(self, low: float, largest: float) -> float:
         bounded = (largest - self.max_condition * low) / (self.max_condition - 1.0)
         return max(self.minimum, (1.0 + self.margin) * max(0.0, -low), bounded)
-
-
-@dataclass(frozen=True)
-class GaussNewtonDamping(Damping):
-    """The Gauss-Newton operator in the Hessian's place, whose curvature is non-negative where the loss is
-    convex in the model's outputs, with a fixed lambda.
-    """
-
-    curvature: ClassVar[Curvature] = "gauss_newton"
-    value: float
-    lanczos_steps: int = 0
-
-    def __post_init__(self) -> None:
-        _check("gauss_newton", self.value, self.lanczos_steps)
-
-    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
 def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generator) -> Spectrum | None:
