@@ -27,13 +27,11 @@ SAMPLING = {f"field/marching.py:{part}" for part in ("march", "_wave", "_enter",
 }
 
 
-def _fit(views, device, make, held_out=0, progress=None, steps=24):
+def _fit(views, device, make, held_out=0, steps=24):
     torch.manual_seed(0)  # of the colour head's layers
     fitting = make(device)
     generator = torch.Generator().manual_seed(0)
-    return fit_field(views.to(device), fitting, generator, steps=steps, held_out=held_out, progress=progress)[
-        0
-    ]
+    return fit_field(views.to(device), fitting, generator, steps=steps, held_out=held_out)[0]
 
 
 def _grid(device):
@@ -70,17 +68,21 @@ def test_a_field_is_fitted_as_on_the_cpu(lit_ball, pretend, same_pieces, make):
         assert torch.equal(got.cpu(), want), name
 
 
-def test_only_choosing_samples_makes_a_fit_wait(lit_ball, pretend):
-    counts, places = [], set()
+def test_only_choosing_samples_makes_a_fit_wait(lit_ball, pretend, monkeypatch):
+    counts, places, advance = [], set(), GridFitting.advance
+    steps = 16 + 2 * BATCHES_PER_BLOCK + 1
 
-    def progress(step, steps):
+    def counting(self, step):
+        changed = advance(self, step)
         counts.append(pretend.count())
         if step == 16:
             pretend.trips.clear()  # past preparation and refinement
         if step == steps - 1:
             places.update(place for _, _, place in pretend.trips if place)
+        return changed
 
-    _fit(lit_ball(14, 0), DEVICE, _grid, progress=progress, steps=16 + 2 * BATCHES_PER_BLOCK + 1)
+    monkeypatch.setattr(GridFitting, "advance", counting)
+    _fit(lit_ball(14, 0), DEVICE, _grid, steps=steps)
     assert _functions(places) <= SAMPLING
     block = counts[16 + BATCHES_PER_BLOCK] - counts[16]
     assert block <= 3 * BATCHES_PER_BLOCK
