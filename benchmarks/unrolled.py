@@ -30,7 +30,7 @@ from neural_sim.detector.protocol import Parameters
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, places, standing
-from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
+from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
 from neural_sim.main import build, conf_directory
@@ -142,9 +142,7 @@ class Walked:
                 : world.context.experiment.loop.outer.curvature_images
             ]
             weights = torch.full((len(data),), 1.0 / len(data))
-            inner = InnerProblem(
-                self.trained, SplitLoss(data.outputs, data.losses_of), weights, subset=chosen
-            )
+            inner = InnerProblem(self.trained, data.losses, weights, subset=chosen)
             slope = world.context.experiment.loop.solver.solve(
                 inner.terms(chosen), self.trained, slope, None, generator
             ).vector

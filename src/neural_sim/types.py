@@ -41,8 +41,7 @@ class PosedViews:
 
     ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
     (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
-    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or lights that
-    nobody knows (photographs).
+    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views.
     """
 
     images: Float[Tensor, "views height width 4"]

@@ -1,6 +1,5 @@
 """Fields on another device: the CPU's numbers bit for bit, with few trips between host and device."""
 
-import dataclasses
 import math
 from functools import partial
 
@@ -28,13 +27,11 @@ SAMPLING = {f"field/marching.py:{part}" for part in ("march", "_wave", "_enter",
 }
 
 
-def _fit(views, device, make, held_out=0, progress=None, steps=24):
+def _fit(views, device, make, held_out=0, steps=24):
     torch.manual_seed(0)  # of the colour head's layers
     fitting = make(device)
     generator = torch.Generator().manual_seed(0)
-    return fit_field(views.to(device), fitting, generator, steps=steps, held_out=held_out, progress=progress)[
-        0
-    ]
+    return fit_field(views.to(device), fitting, generator, steps=steps, held_out=held_out)[0]
 
 
 def _grid(device):
@@ -42,14 +39,8 @@ def _grid(device):
 
 
 def _grid_w(device):
-    field = AppearanceField(code_size=4, head_width=8, learned=3, anchors=3).to(device)
+    field = AppearanceField(code_size=4, head_width=8, anchors=3).to(device)
     return AppearanceFitting(field, GRID)
-
-
-def _photographs(device):
-    """Codes of the views' own, fitted to held-out views too, and transients in front of the object."""
-    field = AppearanceField(code_size=4, head_width=8, view_dependent=True).to(device)
-    return AppearanceFitting(field, GRID, shared_lights=False, anchors=2, transients=True)
 
 
 def _network(device):
@@ -68,28 +59,30 @@ def same_pieces(monkeypatch):
     monkeypatch.setattr(devices, "CACHES", 1)
 
 
-@pytest.mark.parametrize("make", [_grid, _grid_w, _photographs, _network])
+@pytest.mark.parametrize("make", [_grid, _grid_w, _network])
 def test_a_field_is_fitted_as_on_the_cpu(lit_ball, pretend, same_pieces, make):
     views, steps = lit_ball(14, 0), 10 if make is _network else 24
-    if make is _photographs:
-        views = dataclasses.replace(views, light_weights=None)
     here, there = (_fit(views, device, make, held_out=2, steps=steps) for device in (CPU, DEVICE))
     for (name, want), got in zip(here.state_dict().items(), there.state_dict().values(), strict=True):
         assert got.device.type == "pretend" or name.endswith("cell")
         assert torch.equal(got.cpu(), want), name
 
 
-def test_only_choosing_samples_makes_a_fit_wait(lit_ball, pretend):
-    counts, places = [], set()
+def test_only_choosing_samples_makes_a_fit_wait(lit_ball, pretend, monkeypatch):
+    counts, places, advance = [], set(), GridFitting.advance
+    steps = 16 + 2 * BATCHES_PER_BLOCK + 1
 
-    def progress(step, steps):
+    def counting(self, step):
+        changed = advance(self, step)
         counts.append(pretend.count())
         if step == 16:
             pretend.trips.clear()  # past preparation and refinement
         if step == steps - 1:
             places.update(place for _, _, place in pretend.trips if place)
+        return changed
 
-    _fit(lit_ball(14, 0), DEVICE, _grid, progress=progress, steps=16 + 2 * BATCHES_PER_BLOCK + 1)
+    monkeypatch.setattr(GridFitting, "advance", counting)
+    _fit(lit_ball(14, 0), DEVICE, _grid, steps=steps)
     assert _functions(places) <= SAMPLING
     block = counts[16 + BATCHES_PER_BLOCK] - counts[16]
     assert block <= 3 * BATCHES_PER_BLOCK

@@ -72,7 +72,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def oracle(problem):
-    return implicit(problem, Exact("cholesky"), 1e-12, 1)
+    return implicit(problem, Exact(), 1e-12, 1)
 
 
 def implicit(problem, linear, rtol, max_steps):

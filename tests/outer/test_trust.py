@@ -16,7 +16,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping
+from neural_sim.solver.damping import FixedDamping
 from neural_sim.synthesis.scene import HARD
 
 PROXIMAL = 20.0  # past the negative curvature of an untrained detector
@@ -89,11 +89,8 @@ def test_a_step_is_certified_by_retraining_without_changing_the_run(scene, estim
     assert plain.records[1].certificate.solver_residual == second.solver_residual
 
 
-@pytest.mark.parametrize(
-    "damping", [GaussNewtonDamping(1.0, lanczos_steps=4), FixedDamping(0.0)], ids=lambda d: d.curvature
-)
-def test_gauss_newton_and_the_proximal_problem_run_in_the_loop(scene, damping):
-    solver = AdjointSolver(ConjugateGradient(), damping, sensitivity=True)
+def test_the_proximal_problem_runs_in_the_loop(scene):
+    solver = AdjointSolver(ConjugateGradient(), FixedDamping(0.0), sensitivity=True)
     module = small_loop(
         scene,
         StratifiedEstimator(probes_per_bin=2),
@@ -103,9 +100,5 @@ def test_gauss_newton_and_the_proximal_problem_run_in_the_loop(scene, damping):
         learning_rate=0.0,
     )
     certificate = learn_psi(module, False).records[0].certificate
-    assert certificate.solver_status == "CONVERGED" and certificate.damping == damping.value
-    assert (certificate.sensitivity > 0.0) == (damping.value > 0.0)
-    if (
-        damping.curvature == "gauss_newton"
-    ):  # the proximal term's own curvature, below which a near-convex loss adds none
-        assert PROXIMAL - 1e-2 <= certificate.curvature_min < certificate.curvature_max
+    assert certificate.solver_status == "CONVERGED" and certificate.damping == 0.0
+    assert certificate.sensitivity == 0.0

@@ -26,7 +26,6 @@ ALL = [
     Nystrom(shift=0.5, sketch="gaussian", refine=False),
     Identity(),
     Exact(),
-    Exact(method="cholesky"),
 ]
 # Those whose settings carry no unit of the operator, unlike a fixed scale or shift.
 WITHOUT_UNIT = [solver for solver in ALL if not isinstance(solver, Identity | Nystrom)]

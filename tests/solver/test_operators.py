@@ -1,4 +1,4 @@
-"""Hessian and Gauss-Newton products against torch.func.hessian, Lanczos and damping against eigvalsh."""
+"""Hessian products against torch.func.hessian, Lanczos and damping against eigvalsh."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import torch
 
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.damping import FixedDamping, GaussNewtonDamping, LanczosDamping
+from neural_sim.solver.damping import FixedDamping, LanczosDamping
 from neural_sim.solver.exact import Exact
 from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import lanczos, random_start
 from neural_sim.solver.operator import Shifted, columns
 from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
-MODES = ["reverse_over_reverse", "forward_over_reverse", "central_difference"]
+MODES = ["reverse_over_reverse", "central_difference"]
 
 
 @pytest.fixture
 def network(generator):
-    """A small network's parameters and its loss terms, split at the outputs, over uneven chunks of inputs."""
+    """A small network's parameters and its loss terms over uneven chunks of inputs."""
 
     def draw(*shape: int):
         return torch.randn(*shape, generator=generator, dtype=DOUBLE)
@@ -32,15 +31,14 @@ def network(generator):
     params = {"in": draw(3, 4), "bias": draw(4), "out": draw(4, 2)}
     inputs, targets = draw(7, 3), draw(7, 2)
 
-    def outputs(x):
-        return lambda p: (torch.nn.functional.silu(x @ p["in"] + p["bias"]) @ p["out"],)
+    def term(x, y):
+        def loss(p):
+            out = torch.nn.functional.silu(x @ p["in"] + p["bias"]) @ p["out"]
+            return torch.logaddexp(out, -y * out).sum() / 7
 
-    def loss(y):
-        return lambda out: torch.logaddexp(out[0], -y * out[0]).sum() / 7
+        return loss
 
-    terms = [
-        CompositeTerm(outputs(x), loss(y)) for x, y in zip(inputs.split(3), targets.split(3), strict=True)
-    ]
+    terms = [term(x, y) for x, y in zip(inputs.split(3), targets.split(3), strict=True)]
     return params, terms
 
 
@@ -89,8 +87,7 @@ def test_linear_and_constant_terms_have_no_curvature(mode):
     assert product.norm() < 1e-8
 
 
-@pytest.mark.parametrize("mode", MODES[:2])
-def test_a_product_evaluates_the_loss_once(network, mode):
+def test_a_product_evaluates_the_loss_once(network):
     params, terms = network
     calls = 0
 
@@ -99,32 +96,8 @@ def test_a_product_evaluates_the_loss_once(network, mode):
         calls += 1
         return terms[0](p)
 
-    HessianOperator([counted], params, mode)(flatten(params))
+    HessianOperator([counted], params)(flatten(params))
     assert calls == 1
-
-
-def test_gauss_newton_products_equal_the_dense_matrix(network):
-    params, terms = network
-    reference = torch.zeros(flatten(params).numel(), flatten(params).numel(), dtype=DOUBLE)
-    for term in terms:
-        out = term.outputs(params)[0]
-        jacobian = torch.func.jacrev(
-            lambda flat, term=term: term.outputs(unflatten(flat, params))[0].flatten()
-        )(flatten(params))
-        curvature = torch.func.hessian(lambda flat, term=term, out=out: term.loss((flat.view_as(out),)))(
-            out.flatten()
-        )
-        reference += jacobian.T @ curvature @ jacobian
-    for retain in (False, True):
-        operator = GaussNewtonOperator(terms, params, retain)
-        torch.testing.assert_close(operator.dense(), reference, rtol=1e-11, atol=1e-12)
-
-
-def test_gauss_newton_of_linear_outputs_is_the_hessian(generator):
-    params = {"w": torch.randn(3, generator=generator, dtype=DOUBLE)}
-    x = torch.randn(5, 3, generator=generator, dtype=DOUBLE)
-    term = CompositeTerm(lambda p: x @ p["w"], lambda out: torch.cosh(out).sum())
-    torch.testing.assert_close(GaussNewtonOperator([term], params).dense(), dense_hessian(params, [term]))
 
 
 def test_flatten_round_trip(network):
@@ -144,8 +117,6 @@ def test_operators_refuse_nonsense(network):
         HessianOperator(terms, params, "sideways")
     with pytest.raises(ValueError, match="terms"):
         HessianOperator([], params)
-    with pytest.raises(ValueError, match="terms"):
-        GaussNewtonOperator([], params)
 
 
 def test_lanczos_finds_the_extreme_eigenvalues(generator):
@@ -209,7 +180,7 @@ def test_damping_of_a_non_finite_operator_is_its_minimum(generator):
     [
         lambda: FixedDamping(-1.0),
         lambda: FixedDamping(math.nan),
-        lambda: GaussNewtonDamping(math.inf),
+        lambda: FixedDamping(math.inf),
         lambda: LanczosDamping(max_condition=1.0),
         lambda: LanczosDamping(lanczos_steps=0),
     ],
@@ -219,9 +190,7 @@ def test_damping_refuses_nonsense(make):
         make()
 
 
-@pytest.mark.parametrize(
-    "damping", [FixedDamping(0.7), LanczosDamping(), GaussNewtonDamping(0.2, lanczos_steps=4)]
-)
+@pytest.mark.parametrize("damping", [FixedDamping(0.7), LanczosDamping()])
 def test_adjoint_solves_the_damped_system(network, damping, generator):
     params, terms = network
     b = gradient(terms, params)
@@ -237,16 +206,7 @@ def test_adjoint_solves_the_damped_system(network, damping, generator):
     torch.testing.assert_close(adjoint.doubled, doubled, rtol=1e-7, atol=1e-8)
 
 
-def test_gauss_newton_damping_wants_composite_terms(network, generator):
-    params, _ = network
-    with pytest.raises(ValueError, match="CompositeTerm"):
-        AdjointSolver(damping=GaussNewtonDamping(1.0)).solve(
-            [lambda p: p["in"].sum()], params, flatten(params), None, generator
-        )
-
-
-@pytest.mark.parametrize("start", ["rhs", "random"])
-def test_damping_is_raised_until_conjugate_gradients_hold(start, generator):
+def test_damping_is_raised_until_conjugate_gradients_hold(generator):
     """One negative eigenvalue among very many near zero: too few Lanczos steps do not see it."""
     values = torch.cat(
         [torch.linspace(0.0, 1e-2, 397, dtype=DOUBLE), torch.tensor([-2.0, 60.0, 150.0], dtype=DOUBLE)]
@@ -254,7 +214,7 @@ def test_damping_is_raised_until_conjugate_gradients_hold(start, generator):
     params = {"w": torch.zeros(400, dtype=DOUBLE)}
     terms = [lambda p: 0.5 * (values * p["w"].square()).sum()]
     b = torch.randn(400, generator=generator, dtype=DOUBLE)
-    damping = LanczosDamping(max_condition=1e3, lanczos_steps=2, start=start)
+    damping = LanczosDamping(max_condition=1e3, lanczos_steps=2)
     adjoint = AdjointSolver(ConjugateGradient(), damping, rtol=1e-8).solve(terms, params, b, None, generator)
     assert adjoint.raises >= 1
     assert adjoint.solution.status is Status.CONVERGED

@@ -57,11 +57,8 @@ class CachedSet:
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
         """Losses of the images ``index``."""
-        return self.losses_of(self.outputs(params, index), index)
-
-    def outputs(self, params: Parameters, index: Tensor) -> Outputs:
-        """The predictor's outputs on the images ``index``."""
-        return self.detector.outputs(params, tuple(level[index] for level in self.features))
+        features = tuple(level[index] for level in self.features)
+        return self.detector.per_image_loss(params, features, self.targets.select(index))
 
     @property
     def inputs(self) -> tuple[Tensor, ...]:
@@ -74,10 +71,6 @@ class CachedSet:
         """Losses of the images ``index`` from these rows of :attr:`inputs`, differentiable in them."""
         targets = Targets(self.targets.labels[index], inputs[-1])
         return self.detector.per_image_loss(params, inputs[:-1], targets)
-
-    def losses_of(self, outputs: Outputs, index: Tensor) -> Float[Tensor, "n"]:
-        """Losses of the images ``index`` as a function of their outputs alone, for Gauss-Newton products."""
-        return self.detector.losses_of(outputs, self.targets.select(index))
 
     def select(self, index: Tensor) -> CachedSet:
         """The images ``index`` alone."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neural_sim.field.quadrature import composite
-from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.field.samples import PackedSamples, Span, sample_points
 from neural_sim.types import PinholeCamera, Rays
 
 
@@ -79,10 +79,7 @@ class RadianceField(nn.Module, ABC):
         empty is stepped over; neither changes a pixel. A field that knows no empty space ignores both.
         """
         samples = self.sample(rays, termination)
-        directions = rays.directions.index_select(0, samples.ray)
-        origins = rays.origins.index_select(0, samples.ray)
-        sigma, rgb = self.query(origins + directions * samples.distance[:, None], directions)
-        return composite(sigma, rgb, samples)
+        return composite(*self.query(*sample_points(rays, samples)), samples)
 
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span | None:
         """Between which distances the rays of an image's ``rows`` may meet anything; None where nothing is known."""

@@ -9,15 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neural_sim.cameras import focal_length
 from neural_sim.field.grid import GridField
-from neural_sim.field.hull import visual_hull
+from neural_sim.field.hull import pixels_across, visual_hull
 from neural_sim.field.objective import Fitting, Rendering, Rounds
 from neural_sim.field.occupancy import crop
 from neural_sim.field.pool import RayPool, build_pool
 from neural_sim.field.quadrature import composite, render_weights
-from neural_sim.field.rendering import sample_points
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.samples import PackedSamples, sample_points
 from neural_sim.types import PosedViews
 
 BATCHES_PER_BLOCK = 8
@@ -65,8 +63,7 @@ class GridFitting(Fitting):
         occupied, origin = crop(occupied, origin, cell)
         self.field.reset(occupied, origin, cell)
         # A hull cell projects at most two of its own diagonals beyond the silhouette (see ``visual_hull``).
-        nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
-        border = math.ceil(focal_length(views.camera) * math.sqrt(3.0) * cell / nearest) + 1
+        border = pixels_across(views, math.sqrt(3.0) * cell)
         self._rounds = Rounds(build_pool(views, border, generator))
         self._ready = []
 

@@ -51,13 +51,17 @@ def visual_hull(
         occupied, size = subdivide(occupied), 2 * size
 
 
+def pixels_across(views: PosedViews, length: float) -> int:
+    """How many pixels a length of the unit sphere covers at most in any view, one more for where pixels begin."""
+    nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
+    return math.ceil(focal_length(views.camera) * length / nearest) + 1
+
+
 def _inside_all(
     views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
 ) -> Bool[Tensor, "cells"]:
     """Whether every view that sees a centre finds object within ``radius`` of it; unseen centres stay."""
-    camera, focal = views.camera, focal_length(views.camera)
-    nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
-    reach = math.ceil(focal * radius / nearest) + 1
+    camera, focal, reach = views.camera, focal_length(views.camera), pixels_across(views, radius)
     mask = (views.images[..., 3] > alpha_threshold).to(centres.dtype)[:, None]
     mask = functional.max_pool2d(mask, (2 * reach + 1, 1), 1, (reach, 0))
     mask = functional.max_pool2d(mask, (1, 2 * reach + 1), 1, (0, reach))[:, 0] > 0

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from neural_sim.cameras import unit_sphere_span
 from neural_sim.field.base import RadianceField
 from neural_sim.field.quadrature import render_weights
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.samples import PackedSamples, sample_points
 from neural_sim.types import Rays
 
 SKIP_LAYER = 4
@@ -153,10 +153,7 @@ class MLPField(RadianceField):
 
         A ray has coarse_samples + fine_samples samples or, where it misses the unit sphere, none.
         """
-        positions = rays.origins.detach().index_select(0, coarse.ray)
-        directions = rays.directions.detach().index_select(0, coarse.ray)
-        positions = positions + directions * coarse.distance[:, None]
-        sigma, _ = self.query_coarse(positions, directions)
+        sigma, _ = self.query_coarse(*sample_points(rays, coarse))
         weights = render_weights(sigma, coarse).view(-1, self.coarse_samples)
         middle, width = coarse.distance.view_as(weights), coarse.width.view_as(weights)
         low, total = middle[:, :1] - 0.5 * width[:, :1], width.sum(1, keepdim=True)

@@ -10,7 +10,8 @@ from neural_sim.field.mlp import MLPField
 from neural_sim.field.objective import Fitting, Rendering, Rounds
 from neural_sim.field.pool import build_pool
 from neural_sim.field.quadrature import composite
-from neural_sim.field.rendering import render_samples, sample_points
+from neural_sim.field.rendering import render_samples
+from neural_sim.field.samples import sample_points
 from neural_sim.types import PosedViews
 
 

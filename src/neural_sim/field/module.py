@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any, cast
 
 import lightning
@@ -16,9 +15,6 @@ from neural_sim.types import PosedViews
 
 TERMINATION = 1e-3
 RAYS_PER_CHUNK = 1 << 15
-
-Progress = Callable[[int, int], None]
-"""Told (steps done, steps in all) after every step."""
 
 
 class RadianceFieldModule(lightning.LightningModule):
@@ -39,7 +35,6 @@ class RadianceFieldModule(lightning.LightningModule):
         steps: int,
         final_rate: float = 0.1,
         score_every: int = 0,
-        progress: Progress | None = None,
     ) -> None:
         super().__init__()
         if steps < 1:
@@ -50,7 +45,6 @@ class RadianceFieldModule(lightning.LightningModule):
         self.fitting, self.field = fitting, fitting.field
         self.views, self.held_out, self.generator = views, held_out, generator
         self.steps, self.final_rate, self.score_every = steps, final_rate, score_every
-        self.progress = progress
         self.history: list[dict[str, float]] = []
         self._steps_done = 0
         self._begun = time.perf_counter()
@@ -81,8 +75,6 @@ class RadianceFieldModule(lightning.LightningModule):
         self._steps_done += 1
         if self.fitting.advance(self._steps_done):
             _replace_parameters(optimizer, [parameters for parameters, _ in self.fitting.learning_rates()])
-        if self.progress is not None:
-            self.progress(self._steps_done, self.steps)
         last = self._steps_done == self.steps
         if last or (self.score_every and self._steps_done % self.score_every == 0):
             self._score()

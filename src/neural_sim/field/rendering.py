@@ -12,22 +12,13 @@ from neural_sim.cameras import pixel_rays
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.samples import PackedSamples, sample_points
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2
 """Up to so many rates each is taken through the samples; of more, a ray's derivatives by its six numbers."""
 SAMPLES_AT_ONCE = 16_384
 """Samples asked for derivatives together on a CPU: they keep to its cache."""
-
-
-def sample_points(
-    rays: Rays, samples: PackedSamples
-) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples 3"]]:
-    """Positions and directions of the samples, differentiable in the rays; the distances are constants."""
-    directions = rays.directions.index_select(0, samples.ray)
-    origins = rays.origins.index_select(0, samples.ray)
-    return origins + directions * samples.distance[:, None], directions
 
 
 def render_samples(

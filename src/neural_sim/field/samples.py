@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.types import Rays
+
 
 @dataclass(frozen=True)
 class PackedSamples:
@@ -47,3 +49,12 @@ class Span:
 
     def select(self, index: Int[Tensor, "some"]) -> Span:
         return Span(self.near.index_select(0, index), self.far.index_select(0, index))
+
+
+def sample_points(
+    rays: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples 3"]]:
+    """Positions and directions of the samples, differentiable in the rays; the distances are constants."""
+    directions = rays.directions.index_select(0, samples.ray)
+    origins = rays.origins.index_select(0, samples.ray)
+    return origins + directions * samples.distance[:, None], directions

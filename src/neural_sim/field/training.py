@@ -12,7 +12,7 @@ from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.module import Progress, RadianceFieldModule
+from neural_sim.field.module import RadianceFieldModule
 from neural_sim.field.objective import Fitting
 from neural_sim.types import PosedViews
 
@@ -32,7 +32,6 @@ def fit_field(
     held_out: int = 0,
     final_rate: float = 0.1,
     score_every: int = 0,
-    progress: Progress | None = None,
 ) -> tuple[RadianceField, list[dict[str, float]]]:
     """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
 
@@ -53,7 +52,6 @@ def fit_field(
         steps,
         final_rate,
         score_every,
-        progress,
     )
     trainer_on(views.images.device).fit(module)
     return module.field.eval().requires_grad_(False), module.history

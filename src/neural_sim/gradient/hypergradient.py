@@ -10,10 +10,9 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.losses import proximal_loss
@@ -24,7 +23,6 @@ from neural_sim.gradient.unrolled import Examples
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.flatten import unflatten
-from neural_sim.solver.gauss_newton import CompositeTerm
 from neural_sim.solver.hvp import Term, gradient
 from neural_sim.solver.operator import norm
 from neural_sim.solver.solution import Solution, Status
@@ -34,31 +32,13 @@ UnrolledEstimate = Callable[[Accumulated], MixedDerivative]
 
 
 @dataclass(frozen=True)
-class SplitLoss:
-    """An ``IndexedLoss`` given as model outputs and losses of outputs, which Gauss-Newton products need apart."""
-
-    outputs: Callable[[Params, Tensor], Any]
-    losses_of: Callable[[Any, Tensor], Float[Tensor, "n"]]
-
-    def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]:
-        return self.losses_of(self.outputs(params, index), index)
-
-    def term(self, index: Int[Tensor, "n"], weights: Float[Tensor, "n"]) -> CompositeTerm:
-        """The weighted sum over the rows ``index``."""
-        return CompositeTerm(
-            lambda params: self.outputs(params, index),
-            lambda outputs: self.losses_of(outputs, index) @ weights,
-        )
-
-
-@dataclass(frozen=True)
 class InnerProblem:
     """``L_train(theta) = sum_i w_i l_i(theta) + proximal / 2 |theta - anchor|^2`` at its (near) minimiser
     ``params``.
 
-    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. Losses given as ``SplitLoss``
-    serve Gauss-Newton products too. At most ``chunk_size`` images are in memory at a time. ``anchor`` is the fixed
-    theta_0 of the proximal term. ``subset`` limits Hessian products (not the stationarity) to these rows, their weights
+    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. At most ``chunk_size`` images are
+    in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term: with it ``(H + proximal I)^-1`` is the
+    problem's exact derivative. ``subset`` limits Hessian products (not the stationarity) to these rows, their weights
     scaled up to the same sum.
     """
 
@@ -89,15 +69,14 @@ class InnerProblem:
         if subset is not None:
             weights = weights * (self.weights.sum() / weights.sum())
         chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
-        terms: list[Term] = [self._term(rows, weight) for rows, weight in chunks]
-        if self.proximal > 0.0 and self.anchor is not None:
-            terms.append(proximal_term(self.proximal, self.anchor))
+        terms: list[Term] = [
+            lambda params, rows=rows, weight=weight: self.losses(params, rows) @ weight
+            for rows, weight in chunks
+        ]
+        anchor = self.anchor
+        if self.proximal > 0.0 and anchor is not None:
+            terms.append(lambda params: proximal_loss(params, anchor, self.proximal))
         return terms
-
-    def _term(self, rows: Tensor, weights: Tensor) -> Term:
-        if isinstance(self.losses, SplitLoss):
-            return self.losses.term(rows, weights)
-        return lambda params: self.losses(params, rows) @ weights
 
 
 @dataclass(frozen=True)
@@ -226,9 +205,3 @@ def _relative_change(before: Mapping[str, MixedDerivative], after: Mapping[str, 
     new = torch.cat([part.value for part in after.values()])
     size = norm(old)
     return norm(new - old) / size if size > 0.0 else math.nan
-
-
-def proximal_term(proximal: float, anchor: Params) -> Term:
-    """``proximal / 2 |theta - anchor|^2``: with it, ``(H + proximal I)^-1`` is the inner problem's exact derivative."""
-
-    return CompositeTerm(lambda params: params, lambda params: proximal_loss(params, anchor, proximal))

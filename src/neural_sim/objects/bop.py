@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neural_sim.objects.files import choose, file_digest, load_file
+from neural_sim.objects.files import MeshFiles, file_digest, folder_of, load_file
 from neural_sim.objects.mesh import ObjectMesh
 
 log = logging.getLogger(__name__)
@@ -18,30 +18,23 @@ MILLIMETRE = 1e-3
 DIAMETER_TOLERANCE = 0.05
 
 
-class BOP:
+class BOP(MeshFiles):
     """Objects of a BOP models folder, all of them or those named: 'obj_000001', '000001', '1' or 1.
 
     Raises ``ValueError`` where the folder holds no ``obj_*.ply`` or a name is unknown.
     """
 
     def __init__(self, root: str | Path, names: list[str | int] | None = None) -> None:
-        self.root = Path(root)
-        if not self.root.is_dir():
-            raise ValueError(f"objects.root: {self.root} is not a folder")
-        files = {path.stem: path for path in self.root.glob("obj_*.ply")}
-        if not files:
-            raise ValueError(f"objects.root: {self.root} holds no obj_*.ply; want a BOP models folder")
+        folder = folder_of(root)
+        files = {path.stem: path for path in folder.glob("obj_*.ply")}
         aliases: dict[str, str] = {}
         for stem in files:
             number = stem.removeprefix("obj_")
             aliases[number] = stem
             aliases[number.lstrip("0") or "0"] = stem
         wanted = None if names is None else [str(name) for name in names]
-        self._files = {name: files[name] for name in choose(files, wanted, aliases, str(self.root))}
-        self._info = self.root / "models_info.json"
-
-    def names(self) -> list[str]:
-        return list(self._files)
+        super().__init__(folder, files, wanted, aliases, "obj_*.ply; want a BOP models folder")
+        self._info = folder / "models_info.json"
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of the mesh and its texture file by object, without parsing the mesh."""

@@ -13,6 +13,7 @@ import trimesh
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.objects.repair import repair
 
+COMPANIONS = (".mtl", ".png", ".jpg", ".jpeg")
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -83,3 +84,51 @@ def choose(
     if not chosen:
         raise ValueError(f"objects.names: want at least one of {', '.join(sorted(available))}, got none")
     return chosen
+
+
+class MeshFiles:
+    """Objects of a folder, a mesh file each; ``files`` of all that there are, of which ``names`` (None: all) are taken.
+
+    Raises ``ValueError`` where there are none, which are ``wanted``, or for a name that there is not, through
+    ``aliases`` too.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        files: dict[str, Path],
+        names: list[str] | None,
+        aliases: dict[str, str],
+        wanted: str,
+    ) -> None:
+        if not files:
+            raise ValueError(f"objects.root: {root} holds no {wanted}")
+        self.root = root
+        self._files = {name: files[name] for name in choose(files, names, aliases, str(root))}
+
+    def names(self) -> list[str]:
+        return list(self._files)
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each mesh and the material and image files beside it, without parsing them."""
+        return {name: file_digest(path, *_companions(path)) for name, path in self._files.items()}
+
+    def load(self) -> list[ObjectMesh]:
+        """The objects, normalised, in the order of ``names``. Source units are taken to be metres."""
+        digests = self.digests()
+        return [load_file(path, name, digests[name]) for name, path in self._files.items()]
+
+
+def folder_of(root: str | Path) -> Path:
+    """Raises ``ValueError`` where there is no such folder."""
+    path = Path(root)
+    if not path.is_dir():
+        raise ValueError(f"objects.root: {path} is not a folder")
+    return path
+
+
+def _companions(path: Path) -> list[Path]:
+    """Files a mesh may refer to. In a folder of many meshes each depends on all of them: too much, never too little."""
+    if path.suffix.lower() in (".glb", ".stl"):
+        return []
+    return sorted(other for other in path.parent.iterdir() if other.suffix.lower() in COMPANIONS)

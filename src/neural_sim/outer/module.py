@@ -12,7 +12,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator
-from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, SplitLoss, hypergradient
+from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.certificate import certify
 from neural_sim.outer.checked import CheckedSteps
@@ -117,7 +117,7 @@ class SimulatorModule(OuterLoop):
         )
         device = self.inner.device
         inner = InnerProblem(
-            trainable, SplitLoss(cached.outputs, cached.losses_of), weights.to(device),
+            trainable, cached.losses, weights.to(device),
             proximal=self.inner.detector.proximal, anchor=self.inner.warm_start,
             subset=None if subset is None else subset.to(device),
         )  # fmt: skip

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params, Probes
-from neural_sim.gradient.hypergradient import InnerProblem, SplitLoss
+from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.stratified import importance_weights
 from neural_sim.solver.hvp import Term
@@ -181,7 +181,7 @@ def binned_problem(
     rows = torch.arange(sum(sizes)).split(sizes)
     held = [Probes(row, part.bins) for row, part in zip(rows, chosen, strict=True)]
     weight, centre = merged_anchor([(weight, as_double(anchor)) for weight, anchor in pulls])
-    return BinnedProblem(SplitLoss(few.outputs, few.losses_of), held, log_probabilities, weight, centre)
+    return BinnedProblem(few.losses, held, log_probabilities, weight, centre)
 
 
 def as_double(params: Params) -> Params:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import ClassVar
 
+import numpy as np
+import torch
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.supersampling import straight_alpha
+from neural_sim.renderer.surface import Surface, shaded_surface
 from neural_sim.types import PinholeCamera
 
 
@@ -24,7 +29,6 @@ class MeshRenderer(ABC):
         self.supersample = supersample
         self.lighting = Lighting() if lighting is None else lighting
 
-    @abstractmethod
     def render(
         self,
         mesh: trimesh.Trimesh,
@@ -36,3 +40,19 @@ class MeshRenderer(ABC):
 
         ``lighting`` is that of these views; None: the renderer's own.
         """
+        size = (camera.width * self.supersample, camera.height * self.supersample)
+        drawn = self._draw(
+            shaded_surface(mesh, lighting or self.lighting),
+            PinholeCamera(*size, camera.field_of_view),
+            camera_to_world.detach().cpu().double().numpy(),
+        )
+        images = [straight_alpha(premultiplied, self.supersample) for premultiplied in drawn]
+        if not images:
+            return torch.zeros(0, camera.height, camera.width, 4)
+        return torch.from_numpy(np.stack(images))
+
+    @abstractmethod
+    def _draw(
+        self, surface: Surface, camera: PinholeCamera, poses: Float64[np.ndarray, "n 4 4"]
+    ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
+        """Premultiplied RGBA at every sample, pose by pose."""

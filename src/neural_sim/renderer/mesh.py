@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+from collections.abc import Iterator
 
 import numpy as np
 import pyrender
-import torch
-import trimesh
-from jaxtyping import Float
+from jaxtyping import Float32, Float64
 from pyrender.constants import GLTF
-from torch import Tensor
 
 from neural_sim.renderer.base import MeshRenderer
-from neural_sim.renderer.lighting import Lighting
-from neural_sim.renderer.supersampling import straight_alpha
-from neural_sim.renderer.surface import Surface, shaded_surface
+from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
 
 with contextlib.suppress(ImportError):
@@ -38,29 +34,20 @@ class PyrenderRenderer(MeshRenderer):
 
     name = "pyrender"
 
-    def render(
-        self,
-        mesh: trimesh.Trimesh,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
-    ) -> Float[Tensor, "n h w 4"]:
+    def _draw(
+        self, surface: Surface, camera: PinholeCamera, poses: Float64[np.ndarray, "n 4 4"]
+    ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
         scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
-        scene.add(_primitives(shaded_surface(mesh, lighting or self.lighting)))
+        scene.add(_primitives(surface))
         lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)
         eye = scene.add(lens, pose=np.eye(4))
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
-        width, height = camera.width * self.supersample, camera.height * self.supersample
-        context = _shared_context(width, height)
-        images = []
-        for pose in camera_to_world.detach().cpu().double().numpy():
+        context = _shared_context(camera.width, camera.height)
+        for pose in poses:
             scene.set_pose(eye, pose)
             # Returns colour and depth, or None for flags that are not used here.
             rendered = context.render(scene, flags=flags)[0]  # pyright: ignore[reportOptionalSubscript]
-            images.append(straight_alpha(np.asarray(rendered) / np.float32(255.0), self.supersample))
-        if not images:
-            return torch.zeros(0, camera.height, camera.width, 4)
-        return torch.from_numpy(np.stack(images))
+            yield np.asarray(rendered) / np.float32(255.0)
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:

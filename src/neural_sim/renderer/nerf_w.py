@@ -11,7 +11,7 @@ from torch import Tensor
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
 from neural_sim.field.quadrature import composite
-from neural_sim.field.rendering import sample_points
+from neural_sim.field.samples import sample_points
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import Maps, PinholeCamera, Rays
 
@@ -104,12 +104,12 @@ def _checked(
         raise ValueError(
             f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"
         )
-    anchors = len(field.mixing)
+    anchors = len(field.anchors)
     if weights is None:
-        return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.codes.dtype)
+        return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.anchors.dtype)
     if weights.shape != (count, anchors):
         raise ValueError(f"nerf_w: want weights of shape ({count}, {anchors}), got {tuple(weights.shape)}")
-    return field, weights.to(field.codes.dtype)
+    return field, weights.to(field.anchors.dtype)
 
 
 def _groups(

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 
 from neural_sim.cameras import focal_length, rays
 from neural_sim.renderer.base import MeshRenderer
-from neural_sim.renderer.lighting import Lighting
-from neural_sim.renderer.supersampling import straight_alpha
-from neural_sim.renderer.surface import Surface, shaded_surface
+from neural_sim.renderer.surface import Surface
 from neural_sim.renderer.texture_sampling import Pyramid
 from neural_sim.types import PinholeCamera
 
@@ -26,26 +26,13 @@ class RaycastRenderer(MeshRenderer):
 
     name = "raycast"
 
-    def render(
-        self,
-        mesh: trimesh.Trimesh,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
-    ) -> Float[Tensor, "n h w 4"]:
-        surface = shaded_surface(mesh, lighting or self.lighting)
+    def _draw(
+        self, surface: Surface, camera: PinholeCamera, poses: Float64[np.ndarray, "n 4 4"]
+    ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
         bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         pyramid = None if surface.texture is None else Pyramid(surface.texture)
-        fine = PinholeCamera(
-            camera.width * self.supersample, camera.height * self.supersample, camera.field_of_view
-        )
-        images = []
-        for pose in camera_to_world.detach().cpu().double():
-            premultiplied = _cast(bare, surface, pyramid, fine, pose)
-            images.append(straight_alpha(premultiplied, self.supersample))
-        if not images:
-            return torch.zeros(0, camera.height, camera.width, 4)
-        return torch.from_numpy(np.stack(images))
+        for pose in torch.from_numpy(poses):
+            yield _cast(bare, surface, pyramid, camera, pose)
 
 
 def _cast(

@@ -19,8 +19,28 @@ WHICH = ("ns", "learned", "matched")
 FILES = ("results.json", "detections.json")
 
 
+class Recorded:
+    """What a results.json says of its run."""
+
+    results: Mapping[str, Any]
+
+    @property
+    def method(self) -> str:
+        return self.results["method"]
+
+    @property
+    def seed(self) -> int:
+        return self.results["seed"]
+
+    @property
+    def setting(self) -> str:
+        """The experiment, with its gap unless that is the experiment's own."""
+        gap = self.results["gap"]
+        return self.results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
+
+
 @dataclass(frozen=True)
-class Candidate:
+class Candidate(Recorded):
     """A run found in MLflow: its results.json, or why there is none to compare (``unusable``).
 
     ``detections`` fetches its detections.json.
@@ -33,49 +53,17 @@ class Candidate:
     detections: Callable[[], Path] = Path
     unusable: str | None = None
 
-    @property
-    def method(self) -> str:
-        return self.results["method"]
-
-    @property
-    def seed(self) -> int:
-        return self.results["seed"]
-
-    @property
-    def setting(self) -> str:
-        """The experiment, with its gap unless that is the experiment's own."""
-        return setting_of(self.results)
-
 
 @dataclass(frozen=True)
-class FinishedRun:
+class FinishedRun(Recorded):
     """One run's results.json, and the matches of its biased objects for each detector of ``WHICH``."""
 
     results: Mapping[str, Any]
     matches: Mapping[str, Sequence[Matches]]
 
-    @property
-    def method(self) -> str:
-        return self.results["method"]
-
-    @property
-    def seed(self) -> int:
-        return self.results["seed"]
-
-    @property
-    def setting(self) -> str:
-        """The experiment, with its gap unless that is the experiment's own."""
-        return setting_of(self.results)
-
     def spent(self, key: str) -> float:
         """What the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
         return float(self.results["curve"][-1][key])
-
-
-def setting_of(results: Mapping[str, Any]) -> str:
-    """The experiment of a results.json, with its gap unless that is the experiment's own."""
-    gap = results["gap"]
-    return results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
 
 
 def candidates(uri: str, experiments: Sequence[str]) -> list[Candidate]:

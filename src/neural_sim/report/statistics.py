@@ -160,14 +160,8 @@ def _at_equal_cost(
     }
     ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
-    random, found = np.random.default_rng(seed), {}
-    chosen = random.integers(len(seeds), size=(draws, len(seeds)))
-    for method in methods:
-        reached = np.asarray([ap_at(*curves[method, s], budgets[s]) for s in seeds])
-        found[method] = _estimates(reached.mean(keepdims=True), reached[chosen].mean(1, keepdims=True))[0]
-        if len(seeds) == 1:
-            found[method] = Estimate(found[method].value)
-    return found, _mean(budgets.values())
+    reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
+    return _over_seeds(reached, draws, seed), _mean(budgets.values())
 
 
 def _areas(
@@ -184,13 +178,18 @@ def _areas(
     if not starts or min(starts) >= max(ends):
         return {}
     areas = {key: area_under(*curve, min(starts), max(ends)) for key, curve in curves.items()}
-    random = np.random.default_rng(seed)
-    chosen = random.integers(len(seeds), size=(draws, len(seeds)))
+    ahead = {m: [areas[methods[0], s] - areas[m, s] for s in seeds] for m in methods[1:]}
+    return _over_seeds(ahead, draws, seed)
+
+
+def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
+    """Means over seeds, resampled alone: images on the way are scored, their detections not kept."""
     found = {}
-    for method in methods[1:]:
-        ahead = np.asarray([areas[methods[0], s] - areas[method, s] for s in seeds])
-        found[method] = _estimates(ahead.mean(keepdims=True), ahead[chosen].mean(1, keepdims=True))[0]
-        if len(seeds) == 1:  # images on the way are scored, their detections not kept
+    for method, each in values.items():
+        numbers, random = np.asarray(each), np.random.default_rng(seed)
+        chosen = random.integers(len(each), size=(draws, len(each)))
+        found[method] = _estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
+        if len(each) == 1:
             found[method] = Estimate(found[method].value)
     return found
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from neural_sim.solver.base import LinearSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import Damped, Damping, LanczosDamping
-from neural_sim.solver.gauss_newton import CompositeTerm, GaussNewtonOperator
 from neural_sim.solver.hvp import HessianOperator, Mode, Term
 from neural_sim.solver.operator import Matvec, Shifted
 from neural_sim.solver.solution import Solution, Status
@@ -41,13 +40,12 @@ class Adjoint:
 
 @dataclass(frozen=True)
 class AdjointSolver:
-    """Solves ``(H + lambda I) v = b`` for H the Hessian (or Gauss-Newton matrix) of a sum of loss terms.
+    """Solves ``(H + lambda I) v = b`` for H the Hessian of a sum of loss terms.
 
     Args:
         linear: the linear solver.
-        damping: the choice of lambda; a Gauss-Newton one also swaps the operator and wants every term a
-            ``CompositeTerm``.
-        mode: how Hessian products are made, see ``HessianOperator``; Gauss-Newton products know one way only.
+        damping: the choice of lambda.
+        mode: how Hessian products are made, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
         max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never is).
@@ -73,8 +71,6 @@ class AdjointSolver:
     ) -> Adjoint:
         """v for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds a random
         Lanczos start.
-
-        Raises ``ValueError`` for a Gauss-Newton damping on terms that are not ``CompositeTerm`` s.
         """
         began = time.perf_counter()
         operator = self.operator(terms, params)
@@ -102,13 +98,5 @@ class AdjointSolver:
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
-        """The undamped curvature operator that the damping asks for."""
-        if self.damping.curvature == "hessian":
-            return HessianOperator(terms, params, self.mode, self.retain_graph)
-        composite = [term for term in terms if isinstance(term, CompositeTerm)]
-        if len(composite) < len(terms):
-            raise ValueError(
-                "solver.damping: Gauss-Newton needs every loss term as outputs and loss of outputs (CompositeTerm), "
-                f"got {len(terms) - len(composite)} of {len(terms)} without"
-            )
-        return GaussNewtonOperator(composite, params, self.retain_graph)
+        """Products with the undamped Hessian."""
+        return HessianOperator(terms, params, self.mode, self.retain_graph)

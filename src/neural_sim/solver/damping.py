@@ -1,4 +1,4 @@
-"""The choice of lambda in ``(H + lambda I) v = b``, and of the curvature operator it is added to."""
+"""The choice of lambda in ``(H + lambda I) v = b``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -17,8 +16,6 @@ from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
 from neural_sim.solver.operator import Matvec
 
 logger = logging.getLogger(__name__)
-Curvature = Literal["hessian", "gauss_newton"]
-Start = Literal["rhs", "random"]
 
 
 @dataclass(frozen=True)
@@ -43,9 +40,7 @@ class Damped:
 
 
 class Damping(abc.ABC):
-    """Chooses lambda for an operator; ``curvature`` names the operator that this choice is meant for."""
-
-    curvature: ClassVar[Curvature] = "hessian"
+    """Chooses lambda for an operator."""
 
     @abc.abstractmethod
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
@@ -82,18 +77,16 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    ``start``: from ``rhs``, the Krylov space is the one that conjugate gradients search, which go on from it, and
-    lambda past its smallest Ritz value is what keeps these first steps of theirs from breaking down; ``random`` looks
-    for the spectrum's own ends, but a detector's few negative eigenvalues hide among many near zero: on a
-    tiny RetinaNet 12 steps saw -0.01 where lambda_min was -2.4. Where a longer solve still meets negative
-    curvature, lambda is raised past it.
+    The Krylov space is the right-hand side's, which conjugate gradients search and go on from: lambda past its
+    smallest Ritz value is what keeps these first steps of theirs from breaking down. (From a random start a detector's
+    few negative eigenvalues hide among many near zero: on a tiny RetinaNet 12 steps saw -0.01 where lambda_min was
+    -2.4.) Where a longer solve still meets negative curvature, lambda is raised past it.
     """
 
     margin: float = 0.25
     max_condition: float = 100.0
     minimum: float = 1e-6
     lanczos_steps: int = 14
-    start: Start = "rhs"
 
     def __post_init__(self) -> None:
         _check("lanczos", self.minimum, self.lanczos_steps)
@@ -102,15 +95,11 @@ class LanczosDamping(Damping):
                 "solver.damping (lanczos): want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
                 f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
             )
-        if self.start not in get_args(Start):
-            raise ValueError(
-                f"solver.damping (lanczos): start must be one of {get_args(Start)}, got {self.start!r}"
-            )
 
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         # A zero or non-finite right-hand side has no Krylov space; its solve has a status of its own.
         usable = bool(torch.isfinite(b).all()) and bool(b.any())
-        if self.start == "rhs" and usable:
+        if usable:
             spectrum = lanczos(matvec, b, self.lanczos_steps)
         else:
             spectrum = _estimate(matvec, b, self.lanczos_steps, generator)
@@ -120,9 +109,7 @@ class LanczosDamping(Damping):
             )
             return Damped(self.minimum, spectrum)
         value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
-        if self.start == "random" or not usable or spectrum.krylov is None:
-            return Damped(value, spectrum)
-        return Damped(value, spectrum, spectrum.krylov)
+        return Damped(value, spectrum, spectrum.krylov if usable else None)
 
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0
@@ -131,23 +118,6 @@ class LanczosDamping(Damping):
     def _past(self, low: float, largest: float) -> float:
         bounded = (largest - self.max_condition * low) / (self.max_condition - 1.0)
         return max(self.minimum, (1.0 + self.margin) * max(0.0, -low), bounded)
-
-
-@dataclass(frozen=True)
-class GaussNewtonDamping(Damping):
-    """The Gauss-Newton operator in the Hessian's place, whose curvature is non-negative where the loss is
-    convex in the model's outputs, with a fixed lambda.
-    """
-
-    curvature: ClassVar[Curvature] = "gauss_newton"
-    value: float
-    lanczos_steps: int = 12
-
-    def __post_init__(self) -> None:
-        _check("gauss_newton", self.value, self.lanczos_steps)
-
-    def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
 def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generator) -> Spectrum | None:

@@ -17,14 +17,13 @@ from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.operator import columns, norm
 
 Term = Callable[[dict[str, Tensor]], Tensor]
-Mode = Literal["reverse_over_reverse", "forward_over_reverse", "central_difference"]
+Mode = Literal["reverse_over_reverse", "central_difference"]
 
 
 class HessianOperator:
     """``vector -> H vector`` for ``H`` the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
 
-    Vectors are flattened in the order of ``params``. Modes: ``reverse_over_reverse`` (any twice
-    differentiable operation), ``forward_over_reverse`` (less memory; needs forward-mode rules),
+    Vectors are flattened in the order of ``params``. Modes: ``reverse_over_reverse`` (exact) and
     ``central_difference`` (two gradients at ``theta +- h v``; error of relative order eps^(2/3)).
     ``retain_graph`` keeps the first gradient's graph of all terms for reverse_over_reverse: a product falls
     to one backward pass, memory grows to all chunks. Raises ``ValueError`` without terms or for an unknown
@@ -61,8 +60,6 @@ class HessianOperator:
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         if self._mode == "central_difference":
             return self._central_difference(vector)
-        if self._mode == "forward_over_reverse":
-            return self._forward_over_reverse(vector)
         return self._reverse_over_reverse(vector)
 
     def dense(self, batch: int = 64) -> Float[Tensor, "n n"]:
@@ -98,13 +95,6 @@ class HessianOperator:
             if slope.requires_grad:  # a linear term's gradient is constant
                 (part,) = torch.autograd.grad(slope, point, vector, retain_graph=kept, materialize_grads=True)
                 total += part
-        return total
-
-    def _forward_over_reverse(self, vector: Tensor) -> Tensor:
-        total = torch.zeros_like(self._point)
-        for term in self._terms:
-            slope = torch.func.grad(lambda point, term=term: term(unflatten(point, self._params)))
-            total += torch.func.jvp(slope, (self._point,), (vector,))[1]
         return total
 
     def _central_difference(self, vector: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ class Status(enum.Enum):
     APPROXIMATE = "a fixed approximation, not iterated to a tolerance: read the residual"
     MAX_STEPS = "step budget spent: raise max_steps or damping"
     STAGNATED = "residual stopped falling: the limit of this arithmetic, raise damping or precision"
-    NEGATIVE_CURVATURE = "operator is not positive definite: raise damping or use the Gauss-Newton operator"
+    NEGATIVE_CURVATURE = "operator is not positive definite: raise damping"
     LEAST_SQUARES = "singular and inconsistent: the value minimises the residual, which cannot vanish"
     SINGULAR = "operator is singular to rounding: the value is the minimum-norm solution on its range"
     DIVERGED = "residual grew: lower the step scale or raise damping"

@@ -239,6 +239,7 @@ def grazing_rays(scope: Scope) -> Checks:
     away = torch.tensor([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for label, field in (("grid", block(1e8, colour=3.0)), ("network", ball(1e8))):
         leaves = origins.clone().requires_grad_(), away.clone().requires_grad_()
-        total = sum(values.sum() for values in EXACT.render_rays(field, Rays(*leaves)))
+        rgb, opacity = EXACT.render_rays(field, Rays(*leaves))
+        total = rgb.sum() + opacity.sum()
         found = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
         yield Check(f"rays that miss, and their derivatives: {label}", worst(total, *found), 0.0)
