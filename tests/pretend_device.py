@@ -197,6 +197,9 @@ class _Module(_DummyBackendModule):
     def is_available(self) -> bool:
         return bool(ledgers)
 
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return []
+
     def synchronize(self, device: Any = None) -> None:
         if ledgers:
             ledgers[-1].note("wait", "synchronize")

@@ -41,7 +41,8 @@ class PosedViews:
 
     ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
     (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
-    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views.
+    ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or lights that
+    nobody knows (photographs).
     """
 
     images: Float[Tensor, "views height width 4"]

@@ -96,7 +96,7 @@ def test_overlap_is_torchvisions():
 
 
 def scattered(generator: torch.Generator, count: int) -> tuple[LabelledImages, Best, list[dict]]:
-    """Images with no, one or two boxes of two classes, and the same detections as the detector and as COCO sees them."""
+    """Images with no, one or two boxes of two classes; the same detections as the detector and as COCO sees them."""
     boxes, labels = torch.zeros(count, 2, 4), torch.full((count, 2), -1)
     rows, predictions = [], []
     for image in range(count):

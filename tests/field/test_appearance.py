@@ -22,10 +22,10 @@ def random_field(generator: torch.Generator, view_dependent: bool = False) -> Ap
     field = AppearanceField(features=4, head_width=8, code_size=5, view_dependent=view_dependent).double()
     occupied = torch.rand(5, 5, 5, generator=generator) < 0.7
     field.grid.reset(occupied, torch.full((3,), -1.0, dtype=DOUBLE), 0.4)
-    field.reset_codes(3, generator)
+    field.reset_codes(torch.softmax(normal(generator, 3, 7), 1), generator)
     with torch.no_grad():
         field.grid.table[:-1] = normal(generator, *field.grid.table[:-1].shape)
-        field.anchors.copy_(normal(generator, 3, 5))
+        field.codes.copy_(normal(generator, 7, 5))
     return field.eval().requires_grad_(False)
 
 
@@ -57,6 +57,7 @@ def test_the_fields_own_query_is_under_the_mean_anchor(generator: torch.Generato
     field, positions = random_field(generator), 0.9 * normal(generator, 40, 3)
     expected = field.lit(field.anchors.mean(0)).query(positions, positions)
     torch.testing.assert_close(field.query(positions, positions), expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(field.anchors, field.mixing @ field.codes)
 
 
 def test_one_gain_for_all_samples_equals_a_gain_each(generator: torch.Generator) -> None:

@@ -1,5 +1,6 @@
 """Fields on another device: the CPU's numbers bit for bit, with few trips between host and device."""
 
+import dataclasses
 import math
 from functools import partial
 
@@ -39,8 +40,14 @@ def _grid(device):
 
 
 def _grid_w(device):
-    field = AppearanceField(code_size=4, head_width=8, anchors=3).to(device)
+    field = AppearanceField(code_size=4, head_width=8, learned=3, anchors=3).to(device)
     return AppearanceFitting(field, GRID)
+
+
+def _photographs(device):
+    """Codes of the views' own, fitted to held-out views too, and transients in front of the object."""
+    field = AppearanceField(code_size=4, head_width=8, view_dependent=True).to(device)
+    return AppearanceFitting(field, GRID, shared_lights=False, anchors=2, transients=True)
 
 
 def _network(device):
@@ -59,9 +66,11 @@ def same_pieces(monkeypatch):
     monkeypatch.setattr(devices, "CACHES", 1)
 
 
-@pytest.mark.parametrize("make", [_grid, _grid_w, _network])
+@pytest.mark.parametrize("make", [_grid, _grid_w, _photographs, _network])
 def test_a_field_is_fitted_as_on_the_cpu(lit_ball, pretend, same_pieces, make):
     views, steps = lit_ball(14, 0), 10 if make is _network else 24
+    if make is _photographs:
+        views = dataclasses.replace(views, light_weights=None)
     here, there = (_fit(views, device, make, held_out=2, steps=steps) for device in (CPU, DEVICE))
     for (name, want), got in zip(here.state_dict().items(), there.state_dict().values(), strict=True):
         assert got.device.type == "pretend" or name.endswith("cell")

@@ -184,5 +184,5 @@ def test_p_values_are_those_of_the_chi_square_and_uniform_under_noise():
     ],
 )
 def test_settings_out_of_range_are_refused(bad):
-    with pytest.raises(ValueError, match="outer.checks"):
+    with pytest.raises(ValueError, match=r"outer\.checks"):
         Checks(**bad)

@@ -37,13 +37,13 @@ DETECTOR = {"anchors": Anchors(sizes=((10,), (18,)), reference=32), "head": Head
 
 def _field(seed, dtype=torch.float32):
     generator = torch.Generator().manual_seed(seed)
-    field = AppearanceField(anchors=ANCHORS).eval()
+    field = AppearanceField(learned=ANCHORS, anchors=ANCHORS).eval()
     field.grid.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
     with torch.no_grad():
         for parameter in field.parameters():
             parameter.copy_(0.7 * torch.randn(parameter.shape, generator=generator))
         field.grid.table[:, 0] += 1.0
-    field.reset_codes(ANCHORS, generator)
+    field.reset_codes(torch.eye(ANCHORS), generator)
     return field.to(dtype).requires_grad_(False)
 
 

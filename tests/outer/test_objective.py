@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tests.small_loop import TINY
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
@@ -9,7 +10,7 @@ from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.outer.objective import Objective
 from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import gradient
-from tests.small_loop import TINY
+from neural_sim.synthesis.scene import join
 
 
 @pytest.fixture
@@ -17,8 +18,6 @@ def made(scene, generator):
     """An objective in float64, and a detector's trained part after a little noise."""
 
     def make(kind):
-        from neural_sim.synthesis.scene import join
-
         detector = RetinaNet(**TINY)
         images = join(scene.training_set(torch.zeros(2, 4), 5, generator))
         backbone, trainable = detector.split(detector.init(generator))

@@ -23,12 +23,12 @@ def field(generator: torch.Generator) -> AppearanceField:
     field = AppearanceField(features=5, head_width=8, code_size=6, step_cells=0.5, density_gain=1.0).double()
     field.grid.reset(torch.ones(12, 12, 12, dtype=torch.bool), torch.full((3,), -1.2, dtype=DOUBLE), 0.2)
     place = torch.meshgrid(*[torch.linspace(-1.2, 1.2, 13, dtype=DOUBLE)] * 3, indexing="ij")
-    field.reset_codes(4, generator)
+    field.reset_codes(torch.eye(4, dtype=DOUBLE), generator)
     with torch.no_grad():
         radius = torch.stack(place, -1).flatten(0, 2).norm(dim=-1)
         field.grid.table[:-1, 0] = (6.0 - 12.0 * radius).clamp_min(-40.0)
         field.grid.table[:-1, 1:] = torch.randn(13**3, 5, generator=generator, dtype=DOUBLE)
-        field.anchors.copy_(torch.randn(4, 6, generator=generator, dtype=DOUBLE))
+        field.codes.copy_(torch.randn(4, 6, generator=generator, dtype=DOUBLE))
     return field.eval().requires_grad_(False)
 
 
@@ -52,7 +52,7 @@ def test_views_have_the_colour_of_their_weights_and_one_opacity(
     renderer, weights = NerfWRenderer(), some_weights(generator, 3)[[0, 1, 0]]
     rgb, opacity = renderer.render(field, CAMERA, poses(), weights=weights)
     for i in range(3):
-        code = weights[i] @ field.anchors
+        code = weights[i] @ field.codes
         alone, _ = super(NerfWRenderer, renderer).render_rays(
             field.lit(code), flat(cameras.rays(CAMERA, poses()[i]))
         )

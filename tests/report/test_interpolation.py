@@ -21,10 +21,10 @@ def field(generator):
     torch.manual_seed(0)
     field = AppearanceField(features=4, head_width=8, code_size=4)
     field.grid.reset(torch.rand(6, 6, 6, generator=generator) < 0.5, torch.full((3,), -0.6), 0.2)
-    field.reset_codes(3, generator)
+    field.reset_codes(torch.eye(3), generator)
     with torch.no_grad():
         field.grid.table[:-1] = torch.randn(field.grid.table[:-1].shape, generator=generator)
-        field.anchors.copy_(torch.randn(3, 4, generator=generator))
+        field.codes.copy_(torch.randn(3, 4, generator=generator))
     return field.eval().requires_grad_(False)
 
 

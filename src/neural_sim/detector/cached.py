@@ -57,8 +57,11 @@ class CachedSet:
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
         """Losses of the images ``index``."""
-        features = tuple(level[index] for level in self.features)
-        return self.detector.per_image_loss(params, features, self.targets.select(index))
+        return self.detector.losses_of(self.outputs(params, index), self.targets.select(index))
+
+    def outputs(self, params: Parameters, index: Tensor) -> Outputs:
+        """The detector's outputs on the images ``index``."""
+        return self.detector.outputs(params, tuple(level[index] for level in self.features))
 
     @property
     def inputs(self) -> tuple[Tensor, ...]:

@@ -1,9 +1,9 @@
 """A smooth average precision: what the psi loop differentiates in the place of the validation loss.
 
 The detections are those of the forward pass, after non-maximum suppression; which anchors they come from is fixed,
-their scores and boxes are differentiated. Two steps of COCO's definition are made smooth. A detection is a true positive
-by a sigmoid of its overlap, not by a threshold. And it ranks below another by a sigmoid of the difference of their logits
-(Brown et al. 2020, Smooth-AP, Eq. 6), not by which is larger.
+their scores and boxes are differentiated. Two steps of COCO's definition are made smooth. A detection is a true
+positive by a sigmoid of its overlap, not by a threshold. And it ranks below another by a sigmoid of the difference of
+their logits (Brown et al. 2020, Smooth-AP, Eq. 6), not by which is larger.
 """
 
 from __future__ import annotations

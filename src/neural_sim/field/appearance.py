@@ -28,9 +28,10 @@ class AppearanceField(RadianceField):
     """``GridField`` for density and features, and a colour head of one hidden layer that sees features and a code.
 
     The first three features also pass straight to the colour's logits, so that the head has only the light to learn.
-    The ``anchors`` are codes of ``code_size`` numbers, one for each light that an illumination weighs.
-    ``view_dependent`` shows the head the viewing direction; Lambertian objects need none. Queried without a code, the
-    field is under its anchors' mean.
+    ``learned`` codes of ``code_size`` numbers are fitted, one for each light of the training views or one for each
+    view; the ``anchors`` are those k affine combinations of them that an illumination weighs: rows of ``mixing``
+    (k, learned) add up to 1. ``view_dependent`` shows the head the viewing direction; Lambertian objects need none.
+    Queried without a code, the field is under its anchors' mean.
     """
 
     def __init__(
@@ -42,20 +43,23 @@ class AppearanceField(RadianceField):
         step_cells: float = 1.0,
         initial_density: float = -3.0,
         density_gain: float = 2.0,
+        learned: int = 1,
         anchors: int = 1,
     ) -> None:
         super().__init__()
-        if min(head_width, code_size, anchors) < 1:
+        if min(head_width, code_size, learned, anchors) < 1:
             raise ValueError(
-                "AppearanceField: head_width, code_size and anchors must be at least 1, got "
-                f"{head_width}, {code_size}, {anchors}"
+                "AppearanceField: head_width, code_size, learned and anchors must be at least 1, got "
+                f"{head_width}, {code_size}, {learned}, {anchors}"
             )
         self.grid = GridField(features, 0, step_cells, initial_density, density_gain)
         self.directed = view_dependent
         self.into = nn.Linear(features + 3 * view_dependent, head_width)
         self.code = nn.Linear(code_size, head_width, bias=False)
         self.out = nn.Linear(head_width, 3)
-        self.anchors = nn.Parameter(torch.zeros(anchors, code_size))
+        self.codes = nn.Parameter(torch.zeros(learned, code_size))
+        self.register_buffer("mixing", torch.full((anchors, learned), 1.0 / learned))
+        self.mixing: Tensor
 
     def settings(self) -> dict[str, object]:
         return {
@@ -66,14 +70,21 @@ class AppearanceField(RadianceField):
             "step_cells": self.grid.step_cells,
             "initial_density": self.grid.initial_density,
             "density_gain": self.grid.density_gain,
-            "anchors": len(self.anchors),
+            "learned": len(self.codes),
+            "anchors": len(self.mixing),
         }
 
-    def reset_codes(self, count: int, generator: torch.Generator) -> None:
-        """``count`` random anchors."""
-        shape = (count, self.code.in_features)
+    def reset_codes(self, mixing: Float[Tensor, "k learned"], generator: torch.Generator) -> None:
+        """Random codes, and how the anchors combine them."""
+        shape = (mixing.shape[1], self.code.in_features)
         drawn = INITIAL_CODE * torch.randn(shape, generator=generator, device=generator.device)
-        self.anchors = nn.Parameter(drawn.to(self.anchors))
+        self.codes = nn.Parameter(drawn.to(self.codes))
+        self.mixing = mixing.to(self.codes)
+
+    @property
+    def anchors(self) -> Float[Tensor, "k code"]:
+        """The codes that an illumination weighs."""
+        return self.mixing @ self.codes
 
     def lit(self, code: Float[Tensor, "code"], rates: Float[Tensor, "q code"] | None = None) -> LitField:
         """This field under one code, which moves at ``rates`` (None: it does not)."""

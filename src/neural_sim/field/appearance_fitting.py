@@ -9,22 +9,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.field.appearance import AppearanceField
+from neural_sim.field.appearance_scores import fit_codes, render_lit, right_half
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.objective import Fitting, Rendering
+from neural_sim.field.objective import Fitting, Rendering, expected_error
 from neural_sim.field.quadrature import composite
-from neural_sim.field.rendering import render_views
 from neural_sim.field.samples import sample_points
 from neural_sim.field.scores import compare
+from neural_sim.field.transient import TransientHead, composite_both, uncertain_error
 from neural_sim.types import PosedViews
 
 
 class AppearanceFitting(Fitting):
     """``GridFitting`` for density and features; head and codes learn beside it, at rates of their own.
 
-    Views share the codes of the anchor lights in the proportions of their light weights: what a side looks like under
-    one light is learned from all views of that side. ``grid`` makes the fitting of the field's grid. ``start`` and
-    ``score`` raise ``ValueError`` for views of unknown light.
+    Args:
+        grid: makes the fitting of the field's grid.
+        shared_lights: views whose light weights are known share the anchors' codes in these proportions; then what a
+            side looks like under one light is learned from all views of that side. Otherwise, and for photographs,
+            each view learns a code of its own (NeRF in the Wild).
+        anchors: how many views' codes become the anchors where no light weights are known, evenly spread.
+        transients: learn what single views show in front of the object, and how uncertain each pixel is; for
+            photographs, where somebody walks through the picture. Rendered views have none. They join when the grid's
+            cells were first refined or pruned: before, they would explain the object itself.
+        transient_penalty: lambda_u of NeRF in the Wild, on the transients' optical depth.
     """
 
     field: AppearanceField
@@ -35,59 +43,95 @@ class AppearanceFitting(Fitting):
         grid: Callable[[GridField], GridFitting],
         code_learning_rate: float = 0.02,
         head_learning_rate: float = 0.03,
+        shared_lights: bool = True,
+        anchors: int = 6,
+        transients: bool = False,
+        transient_penalty: float = 0.01,
     ) -> None:
         self.grid = grid(field.grid)
         super().__init__(field, self.grid.batch_rays)
+        if anchors < 1:
+            raise ValueError(f"AppearanceFitting: anchors must be at least 1, got {anchors}")
+        if not transient_penalty >= 0.0:
+            raise ValueError(
+                f"AppearanceFitting: transient_penalty must be at least 0, got {transient_penalty}"
+            )
         self.code_learning_rate, self.head_learning_rate = code_learning_rate, head_learning_rate
+        self.shared_lights, self.anchors = shared_lights, anchors
+        self.transients, self.transient_penalty = transients, transient_penalty
+        self._transient: TransientHead | None = None
+        self._settled = not (self.grid.refine_steps or self.grid.prune_steps)
 
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
-        self._view_weights = _light_of(views)
-        self.field.reset_codes(self._view_weights.shape[1], generator)
+        self._view_weights, mixing = self._codes_of(views)
+        self.field.reset_codes(mixing, generator)
+        if self.transients:
+            self._transient = TransientHead(len(views)).to(self.field.codes)
+            self._transient.reset(generator)
         self.grid.start(views, generator)
 
+    def _codes_of(
+        self, views: PosedViews
+    ) -> tuple[Float[Tensor, "views learned"], Float[Tensor, "k learned"]]:
+        """How each view's code, and each anchor, combines the learned codes."""
+        weights = views.light_weights
+        if weights is not None and self.shared_lights:
+            return weights, torch.eye(weights.shape[1]).to(weights)
+        own = torch.eye(len(views)).to(views.images)
+        if (
+            weights is not None
+        ):  # least squares: the anchors whose mixtures come closest to the views' own codes
+            return own, torch.linalg.pinv(weights.double()).to(weights)
+        if self.anchors > len(views):
+            raise ValueError(f"AppearanceFitting: want {self.anchors} anchors of {len(views)} views")
+        return own, own[torch.linspace(0, len(views) - 1, self.anchors).long()]
+
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
+        (sigma, rgb), samples, _, _, pixels = self._decode_batch()
+        return [composite(sigma, rgb, samples)], pixels
+
+    def loss(self) -> Float[Tensor, ""]:
+        static, samples, positions, seen_by, pixels = self._decode_batch()
+        if self._transient is None or not self._settled:
+            return expected_error(composite(*static, samples), pixels)
+        transient = self._transient(positions, seen_by, self.field.grid.step)
+        rendering, beta = composite_both(static, transient, samples)
+        return uncertain_error(rendering, pixels, beta, transient[0] * samples.width, self.transient_penalty)
+
+    def _decode_batch(self):
         rays, samples, cells = self.grid.next_batch()
         positions, directions = sample_points(rays.rays, samples)
         seen_by = rays.view.index_select(0, samples.ray)
-        gain = self.field.gain(self._view_weights @ self.field.anchors).index_select(0, seen_by)
-        decoded = self.field.decode(self.field.grid.raw(positions, cells), directions, gain)
-        return [composite(*decoded, samples)], rays.pixels
+        gain = self.field.gain(self._view_weights @ self.field.codes).index_select(0, seen_by)
+        static = self.field.decode(self.field.grid.raw(positions, cells), directions, gain)
+        return static, samples, positions, seen_by, rays.pixels
 
     def advance(self, step: int) -> bool:
-        return self.grid.advance(step)
+        changed = self.grid.advance(step)
+        self._settled = self._settled or changed
+        return changed
 
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
         field = self.field
         head = [p for part in (field.into, field.code, field.out) for p in part.parameters()]
-        codes = ([field.anchors], self.code_learning_rate)
-        return [*self.grid.learning_rates(), (head, self.head_learning_rate), codes]
+        groups = [
+            *self.grid.learning_rates(),
+            (head, self.head_learning_rate),
+            ([field.codes], self.code_learning_rate),
+        ]
+        if self._transient is not None:
+            groups.append((list(self._transient.parameters()), self.head_learning_rate / 3.0))
+        return groups
 
     def score(self, views: PosedViews, termination: float, rays_per_chunk: int) -> dict[str, float]:
-        """Whole views under their lights, which shows the anchors and their mixtures."""
-        codes = _light_of(views) @ self.field.anchors
-        return compare(render_lit(self.field, codes, views, termination, rays_per_chunk), views.images)
+        """Whole views under their known lights, which shows the anchors and their mixtures.
 
-
-@torch.no_grad()
-def render_lit(
-    field: AppearanceField,
-    codes: Float[Tensor, "views code"],
-    views: PosedViews,
-    termination: float,
-    rays_per_chunk: int,
-) -> Float[Tensor, "views height width 4"]:
-    """Premultiplied RGBA from the views' cameras, each under its own code."""
-    poses = views.camera_to_world
-    rendered = [
-        render_views(field.lit(code), views.camera, poses[i : i + 1], termination, rays_per_chunk)
-        for i, code in enumerate(codes)
-    ]
-    return torch.cat(rendered)
-
-
-def _light_of(views: PosedViews) -> Float[Tensor, "views k"]:
-    if views.light_weights is None:
-        raise ValueError(
-            "field=grid_w: want views under varied light (renderer=nerf_w), got views of one light"
-        )
-    return views.light_weights
+        Views of unknown light: codes are fitted to each view's left half and its right half is scored, as in NeRF in
+        the Wild.
+        """
+        if views.light_weights is not None:
+            codes = views.light_weights @ self.field.anchors
+            return compare(render_lit(self.field, codes, views, termination, rays_per_chunk), views.images)
+        codes = fit_codes(self.field, views, termination)
+        rendered = render_lit(self.field, codes, views, termination, rays_per_chunk)
+        return compare(right_half(rendered), right_half(views.images))

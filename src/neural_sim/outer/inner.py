@@ -47,7 +47,7 @@ class InnerLoop:
     target set, anywhere; no step sees any other real image. ``draws`` says how the method wants images drawn. Relaxed
     ones, and those under a light that moves, are always rendered anew, all others come from a pool of every bin.
     The batch size and the decay of its steps are those of ``training``.
-    With ``common_numbers`` all draws and trainings use the same random numbers, so that two of them differ by psi alone.
+    With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
     ``images`` and ``steps`` count labelled images made and optimiser steps; ``cpu_begun`` is the processor time at
     which the pool was begun.
     """

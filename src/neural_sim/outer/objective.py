@@ -56,8 +56,7 @@ class Objective:
         if self.kind == "average_precision":
             return self.smooth_ap(params).cpu()
         outputs, labels = self.outputs(params), self.images.labels.cpu()
-        rows = torch.arange(len(self.cached), device=self.cached.device)
-        losses = self.cached.losses_of(outputs, rows).cpu()
+        losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()
         classes = range(outputs[0].shape[-1])
         return torch.stack([-losses[(labels == number).any(1)].mean() for number in classes])
 

@@ -104,12 +104,12 @@ def _checked(
         raise ValueError(
             f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"
         )
-    anchors = len(field.anchors)
+    anchors = len(field.mixing)
     if weights is None:
-        return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.anchors.dtype)
+        return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.codes.dtype)
     if weights.shape != (count, anchors):
         raise ValueError(f"nerf_w: want weights of shape ({count}, {anchors}), got {tuple(weights.shape)}")
-    return field, weights.to(field.anchors.dtype)
+    return field, weights.to(field.codes.dtype)
 
 
 def _groups(

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import Detector
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
@@ -154,7 +155,7 @@ def extreme_boxes(scope: Scope) -> Checks:
     finite; also without any box, where every anchor is background.
     """
     side = 32.0
-    network = Detector(3, 32, anchor_sizes=((10,), (18,)), anchor_reference=32, channels=8, head_convs=1)
+    network = RetinaNet(3, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     params = {name: value.double() for name, value in network.init(scope.generator()).items()}
     backbone, head = network.split(params)
     pixels = torch.rand(1, 3, 32, 32, generator=scope.generator(), dtype=DOUBLE)
