@@ -31,13 +31,18 @@ FREE = {
 """The paper's: steps as they come, of the loss, by the implicit derivative."""
 
 
-def small_loop(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, **outer):
+def small_loop(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, update=None, **outer):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
     validation = join(scene.training_set(psi, 3, generator))
     settings = Outer(
-        Mirror(), iterations=iterations, images_per_object=6, epochs=1, curvature_images=6, **(FREE | outer)
+        update or Mirror(),
+        iterations=iterations,
+        images_per_object=6,
+        epochs=1,
+        curvature_images=6,
+        **(FREE | outer),
     )
     inner = InnerLoop(
         scene,

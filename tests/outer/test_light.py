@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from small_loop import FREE
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
@@ -150,7 +151,7 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
     light_update = Mirror(0.6, max_step=1.0, shrink=False)
     settings = Outer(
         Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update,
-        train_first=adjoint == "unrolled", adjoint=adjoint,
+        **FREE | {"train_first": adjoint == "unrolled", "adjoint": adjoint},
     )  # fmt: skip
     inner = InnerLoop(
         scene,

@@ -15,6 +15,7 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.settings import Outer, Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
@@ -185,8 +186,9 @@ def test_cached_losses_equal_losses_from_images(scene):
 def test_every_factor_of_a_product_is_learned(scene, estimator):
     joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
     scene = dataclasses.replace(scene, distribution=joint)
-    module = small_loop(scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2)
-    module.settings = dataclasses.replace(module.settings, update=Mirror(shrink=False))
+    module = small_loop(
+        scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2, update=Mirror(shrink=False)
+    )
     learned = learn_psi(module, progress=False)
     assert set(learned.records[0].probabilities) == {"pose", "zoom"}
     certificate = learned.records[0].certificate
@@ -194,6 +196,72 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
         assert set(certificate.p_values[name]) == set(certificate.actions[name]) == {"pose", "zoom"}
         assert all(0.0 < p <= 1.0 for p in certificate.p_values[name].values())
     assert all((part.abs().amax(-1) > 0.0).all() for part in joint.split(learned.last).values())
+
+
+CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
+
+
+def checked_loop(scene, iterations=3, **outer):
+    return small_loop(
+        scene, StratifiedEstimator(probes_per_bin=2), iterations, pool_per_bin=2, **(CHECKED | outer)
+    )
+
+
+def test_checked_trainings_differ_by_psi_alone(scene):
+    inner = checked_loop(scene).inner
+    psi = torch.zeros(2, 4)
+    first, second = (join(inner.draw(psi)).images for _ in range(2))
+    assert torch.equal(first, second)
+    moved = join(inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]]))).images
+    assert torch.equal(moved[:6], first[:6]) and not torch.equal(moved[6:], first[6:])
+    thetas = []
+    for _ in range(2):
+        inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
+        thetas.append(inner.trainable)
+    assert all(torch.equal(thetas[0][name], value) for name, value in thetas[1].items())
+    inner.renew()
+    assert not torch.equal(join(inner.draw(psi)).images, first)
+
+
+def test_methods_that_are_not_checked_get_new_random_numbers(scene):
+    inner = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2).inner
+    first, second = (join(inner.draw(torch.zeros(2, 4))).images for _ in range(2))
+    assert not torch.equal(first, second)
+
+
+def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    learned = learn_psi(module, progress=False)
+    first, middle, last = learned.records
+    assert first.verdicts == {} and first.certificate and middle.certificate
+    # The last training judges and takes no derivative.
+    assert last.certificate is None and "hypergradient" not in last.seconds
+    assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
+    tried = learned.trajectory[-2]
+    for label, name in enumerate(("a", "b")):
+        if name in last.verdicts:
+            wanted = tried if last.verdicts[name].accepted else None
+            assert wanted is None or torch.equal(learned.last[label], wanted[label])
+    assert torch.equal(learned.last, module.steps.reported)
+    for record, psi in zip(learned.records, learned.trajectory, strict=False):
+        p = module.scene.distribution.probabilities(psi)["pose"]
+        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), p)
+
+
+def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    falling = iter(range(10))
+    module.inner.scores = lambda: torch.full((2,), -float(next(falling)))
+    learned = learn_psi(module, progress=False)
+    assert any(record.verdicts for record in learned.records)
+    assert not any(v.accepted for record in learned.records for v in record.verdicts.values())
+    assert torch.equal(learned.last, learned.trajectory[0])
+
+
+@pytest.mark.parametrize("bad", [{"train_first": False}, {"start": "previous"}, {"epochs": 0}])
+def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
+    with pytest.raises(ValueError, match="outer"):
+        Outer(Mirror(), **bad)
 
 
 def test_the_pool_holds_every_combination_of_bins(scene):

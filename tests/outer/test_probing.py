@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from small_loop import FREE
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
@@ -99,7 +100,9 @@ def test_the_loop_draws_a_part_of_its_probes_anew(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = join(scene.training_set(torch.zeros(1, 4), 2, generator))
-    settings = Outer(Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2)
+    settings = Outer(
+        Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2, **FREE
+    )
     inner = InnerLoop(
         scene,
         detector,
@@ -127,7 +130,9 @@ def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = join(two.training_set(psi, 2, generator))
-    settings = Outer(Mirror(shrink=False), 2, 2, epochs=1, curvature_images=2, pool_per_bin=2, learned=("b",))
+    settings = Outer(
+        Mirror(shrink=False), 2, 2, epochs=1, curvature_images=2, pool_per_bin=2, learned=("b",), **FREE
+    )
     inner = InnerLoop(
         two,
         detector,

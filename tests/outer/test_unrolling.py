@@ -42,7 +42,7 @@ def _module(scene, estimator, psi=None, **outer):
     params = detector.init(generator)
     settings = {
         "iterations": 2, "images_per_object": 6, "epochs": 2, "train_first": True, "adjoint": "unrolled",
-        "pool_per_bin": 2,
+        "pool_per_bin": 2, "steps": "free", "objective": "loss", "on_untrusted": "shrink",
     }  # fmt: skip
     validation = join(scene.training_set(psi, 3, generator))
     chosen = Outer(Mirror(shrink=False), **(settings | outer))
@@ -154,6 +154,6 @@ def test_a_training_that_was_not_recorded_is_refused(scene):
 @pytest.mark.parametrize("settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2}])
 def test_unrolling_wants_a_training_in_every_iteration(settings):
     with pytest.raises(ValueError, match=r"outer\.adjoint=unrolled wants"):
-        Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True} | settings))
+        Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True, "steps": "free"} | settings))
     with pytest.raises(ValueError, match=r"outer\.adjoint must be one of"):
         Outer(Mirror(), adjoint="explicit")

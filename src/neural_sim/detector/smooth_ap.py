@@ -44,6 +44,8 @@ class SmoothAP:
         temperature: of a rank, in logits. AP's own ranks are the limit at 0.
         width: of a true positive, in overlap. AP's own are the limit at 0.
         per_class: the best detections of an image that count for each class.
+        loss: what the loss of training counts beside it. A class that is never found has an AP of zero whatever psi
+            does, and only its loss tells the way.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -52,13 +54,16 @@ class SmoothAP:
     temperature: float = 0.2
     width: float = 0.1
     per_class: int = 5
+    loss: float = 0.1
 
     def __post_init__(self) -> None:
         for key in ("temperature", "width"):
             if not getattr(self, key) > 0.0:
                 raise ValueError(f"smooth_ap.{key} must be above 0, got {getattr(self, key)}")
-        if self.per_class < 1:
-            raise ValueError(f"smooth_ap.per_class must be at least 1, got {self.per_class}")
+        if self.per_class < 1 or not self.loss >= 0.0:
+            raise ValueError(
+                f"smooth_ap: want per_class of at least 1 and loss of at least 0, got {self.per_class} and {self.loss}"
+            )
 
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages

@@ -21,8 +21,9 @@ from neural_sim.types import LabelledImages
 class Objective:
     """L_val as a function of the parameters.
 
-    ``loss`` is the training loss of the validation images ``cached``, as in the paper. ``average_precision`` is one
-    minus the mean over classes of the ``smooth`` average precision, which needs the boxes of ``images``, the same ones.
+    ``loss`` is the mean loss of the validation images ``cached``, as in the paper. ``average_precision`` is one minus
+    the mean over classes of the ``smooth`` average precision, plus ``smooth.loss`` times that loss; it needs the boxes
+    of ``images``, the same ones.
     """
 
     cached: CachedSet
@@ -32,13 +33,16 @@ class Objective:
 
     def terms(self) -> list[Term]:
         """L_val as a sum of terms; the smooth average precision, which ranks all images, is one."""
+        losses = self.cached.mean_terms()
         if self.kind == "loss":
-            return self.cached.mean_terms()
-        return [lambda params: 1.0 - self.smooth_ap(params).nanmean()]
+            return losses
+        weight = self.smooth.loss
+        weighed = [lambda params, term=term: weight * term(params) for term in losses] if weight else []
+        return [lambda params: 1.0 - self.smooth_ap(self.outputs(params)).nanmean(), *weighed]
 
-    def smooth_ap(self, params: Parameters) -> Float[Tensor, "classes"]:
+    def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes"]:
         """The smooth average precision of every class; nan for a class without a box."""
-        return self.smooth(self.cached.detector, self.outputs(params), self.images)
+        return self.smooth(self.cached.detector, outputs, self.images)
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
         """The detector's outputs on all images. Only these stay in memory for a derivative, not what led to them."""
@@ -51,14 +55,14 @@ class Objective:
 
     @torch.no_grad()
     def scores(self, params: Parameters) -> Float[Tensor, "classes"]:
-        """How good the detector is for each class, more is better: the smooth average precision, or minus the mean loss
-        of the images with a box of the class; nan for a class without one. On the CPU."""
-        if self.kind == "average_precision":
-            return self.smooth_ap(params).cpu()
+        """How good the detector is for each class, more is better: L_val's part of it with the other sign, without the
+        one. Losses are those of the images with a box of the class; nan for a class without one. On the CPU."""
         outputs, labels = self.outputs(params), self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()
-        classes = range(outputs[0].shape[-1])
-        return torch.stack([-losses[(labels == number).any(1)].mean() for number in classes])
+        own = [losses[(labels == number).any(1)].mean() for number in range(outputs[0].shape[-1])]
+        if self.kind == "loss":
+            return -torch.stack(own)
+        return self.smooth_ap(outputs).cpu() - self.smooth.loss * torch.stack(own)
 
     def double(self) -> Objective:
         """The same in float64."""

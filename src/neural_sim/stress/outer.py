@@ -200,7 +200,7 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
     validation = join(scene.training_set(psi, 2, generator))
     settings = Outer(
         Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
-        on_untrusted=choice,
+        on_untrusted=choice, objective="loss", adjoint="implicit", steps="free", train_first=False,
     )  # fmt: skip
     inner = InnerLoop(
         scene,
