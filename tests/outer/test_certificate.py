@@ -12,7 +12,6 @@ from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import certify, line, untrusted
-from neural_sim.outer.retrained import Check, FiniteDifference
 from neural_sim.outer.settings import Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
@@ -37,13 +36,8 @@ def result(gradient=(1.0, -1.0), p_values=(0.01, 0.04), status=Status.CONVERGED,
     return dataclasses.replace(made, **changes)
 
 
-def checked(cosine):
-    return Check(cosine, 0, FiniteDifference(torch.zeros(2), True, 1e-9, 3, 100))
-
-
-def judge(found, cosine=None, trust=STRICT, on_untrusted="shrink"):
-    check = None if cosine is None else checked(cosine)
-    return certify(found, found.p_values, ("a", "b"), ("pose",), check, trust, on_untrusted)
+def judge(found, cosine=math.nan, trust=STRICT, on_untrusted="shrink"):
+    return certify(found, found.p_values, ("a", "b"), ("pose",), cosine, trust, on_untrusted)
 
 
 def actions(certificate):
@@ -66,10 +60,10 @@ def test_a_good_step_is_kept_with_everything_recorded():
 @pytest.mark.parametrize(
     ("found", "cosine", "doubt"),
     [
-        (result(residual=0.2, status=Status.MAX_STEPS), None, "residual"),
-        (result(status=Status.NEGATIVE_CURVATURE), None, "solver"),
-        (result(stationarity=2.1), None, "stationarity"),
-        (result(sensitivity=0.6), None, "sensitivity"),
+        (result(residual=0.2, status=Status.MAX_STEPS), math.nan, "residual"),
+        (result(status=Status.NEGATIVE_CURVATURE), math.nan, "solver"),
+        (result(stationarity=2.1), math.nan, "stationarity"),
+        (result(sensitivity=0.6), math.nan, "sensitivity"),
         (result(), 0.4, "cosine"),
     ],
 )
@@ -111,7 +105,7 @@ def test_an_object_without_signal_holds_up_no_other(p_values, on_untrusted, expe
 def test_each_factor_is_judged_by_itself():
     found = result()
     found.p_values["a"]["zoom"], found.p_values["b"]["zoom"] = 0.5, 0.02
-    certificate = certify(found, found.p_values, ("a", "b"), ("pose", "zoom"), None, STRICT, "skip")
+    certificate = certify(found, found.p_values, ("a", "b"), ("pose", "zoom"), math.nan, STRICT, "skip")
     assert certificate.actions == {
         "a": {"pose": "kept", "zoom": "skipped"},
         "b": {"pose": "kept", "zoom": "kept"},
@@ -120,7 +114,7 @@ def test_each_factor_is_judged_by_itself():
 
 def test_only_objects_that_move_have_actions_and_what_was_not_tested_is_kept():
     found = dataclasses.replace(result(), p_values={})
-    certificate = certify(found, found.p_values, ("b",), ("pose",), None, STRICT, "shrink")
+    certificate = certify(found, found.p_values, ("b",), ("pose",), math.nan, STRICT, "shrink")
     assert certificate.actions == {"b": {"pose": "kept"}} and certificate.p_values == {}
 
 
@@ -155,7 +149,7 @@ def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(gene
             psi_gradients={name: part.value for name, part in zip(names, estimates, strict=True)},
             p_values={name: part.p_values for name, part in zip(names, estimates, strict=True)},
         )
-        certificate = certify(found, found.p_values, names, ("pose",), None, Trust(level=level), "shrink")
+        certificate = certify(found, found.p_values, names, ("pose",), math.nan, Trust(level=level), "shrink")
         assert certificate.doubts == []
         kept.update(name for name in names if certificate.actions[name]["pose"] == "kept")
     wrongly = sum(kept[name] for name in names[:-1])

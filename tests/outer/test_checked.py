@@ -37,7 +37,9 @@ def proposed(steps, gradient, error, level=0.05):
     result = hypergradient(gradient, error)
     p_values = steps.observe(result)
     factors = steps.distribution.names
-    return steps.next(certify(result, p_values, NAMES, factors, None, Trust(level=level), "skip")), p_values
+    return steps.next(
+        certify(result, p_values, NAMES, factors, math.nan, Trust(level=level), "skip")
+    ), p_values
 
 
 def gradients(target, psi):

@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 import torch
+from small_loop import FREE
 from trips import counted
 
 from neural_sim import devices
@@ -18,7 +19,7 @@ from neural_sim.gradient.unrolled import Examples
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.settings import Outer
+from neural_sim.outer.settings import Outer, Trust
 from neural_sim.parameter.update import Mirror
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
@@ -51,7 +52,7 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
         epochs=epochs,
         curvature_images=4,
         pool_per_bin=2,
-        **outer,
+        **(FREE | outer),
     )
     params = devices.placed(detector.init(generator), torch.device(device))
     inner = InnerLoop(
@@ -152,3 +153,17 @@ def test_images_and_features_stay_on_the_device(scene, pretend):
         module.training_step(0, 0)
     back = sum(size for (kind, _, _), size in ledger.moved.items() if kind == "to_host")
     assert back < 3 * 32 * 32 * 4
+
+
+def test_the_checked_loop_of_average_precision_is_the_cpus(scene, pretend, monkeypatch):
+    monkeypatch.setattr(devices, "CACHES", 1)
+    found, checked = [], {"steps": "checked", "objective": "average_precision", "adjoint": "unrolled"}
+    for device in ("cpu", "pretend"):
+        module = _module(
+            scene, StratifiedEstimator(probes_per_bin=1), device, epochs=2, train_first=True, trust=Trust(level=None),
+            **checked,
+        )  # fmt: skip
+        found.append(learn_psi(module, progress=False))
+    assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
+    scores = [[record.scores for record in learned.records] for learned in found]
+    assert scores[1][0] == pytest.approx(scores[0][0], rel=1e-4)

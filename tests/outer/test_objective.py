@@ -69,4 +69,6 @@ def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
     scores = fewer.scores(params)
     assert bool(scores[1].isnan()) and bool(scores[0].isfinite())
     with torch.no_grad():
-        assert float(sum(term(params) for term in fewer.terms())) == pytest.approx(1.0 - float(scores[0]), abs=1e-12)
+        assert float(sum(term(params) for term in fewer.terms())) == pytest.approx(
+            1.0 - float(scores[0]), abs=1e-12
+        )

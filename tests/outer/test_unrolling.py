@@ -98,8 +98,8 @@ def _trained(scene, estimator, **settings):
 def test_the_loops_stratified_gradient_is_that_of_its_recorded_training(scene):
     """The same sums over the steps, and by hand the derivative of sum_b p_b s_b / objects."""
     module, rendered, images, cached = _trained(scene, StratifiedEstimator(2), unrolled=EXACT)
-    module._draw_probes()
-    found = module._hypergradient(rendered, images, cached)
+    module._prepare()
+    found = module._derivative(rendered, images, cached)
     inner, probed = module.inner, module._probes
     slope = gradient(inner.validation.mean_terms(), inner.trainable)
     tables = [part["pose"].index.view(4, 2) for part in probed.probes]
@@ -133,9 +133,9 @@ def test_forward_and_reverse_mode_agree_through_the_training(scene, label_gradie
     synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
     scene = dataclasses.replace(scene, synthesizer=synthesizer)
     module, rendered, images, cached = _trained(scene, PathwiseEstimator(), unrolled=EXACT)
-    forward = module._hypergradient(rendered, images, cached)
+    forward = module._derivative(rendered, images, cached)
     bare = [dataclasses.replace(part, tangents=None) for part in rendered]
-    reverse = module._hypergradient(bare, images, cached)
+    reverse = module._derivative(bare, images, cached)
     for name in scene.names:
         one, other = forward.psi_gradients[name], reverse.psi_gradients[name]
         assert float((one - other).norm()) < 1e-3 * float(other.norm())
@@ -148,10 +148,14 @@ def test_a_training_that_was_not_recorded_is_refused(scene):
     cached = CachedSet.of(module.inner.detector, module.inner.backbone, images)
     module.inner.train(cached)
     with pytest.raises(ValueError, match="was not recorded"):
-        module._hypergradient(rendered, images, cached)
+        module._derivative(rendered, images, cached)
 
 
-@pytest.mark.parametrize("settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2}])
+@pytest.mark.parametrize(
+    "settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2, "certify": "retrained"}]
+)
+    "settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2, "certify": "retrained"}]
+)
 def test_unrolling_wants_a_training_in_every_iteration(settings):
     with pytest.raises(ValueError, match=r"outer\.adjoint=unrolled wants"):
         Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True, "steps": "free"} | settings))

@@ -70,6 +70,19 @@ class HypergradientLoop:
     name: str
 
 
+@dataclass(frozen=True)
+class Response:
+    """psi moves by the measured response of training, without a derivative: a training for each bin, in which ``part``
+    of every object's images moves to it (:mod:`outer.response`)."""
+
+    name: str
+    part: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.part <= 1.0:
+            raise ValueError(f"baseline.part must lie in (0, 1], got {self.part}")
+
+
 def positive(**values: float) -> None:
     """Raises ``ValueError`` for a value that is not positive, by its key."""
     for key, value in values.items():

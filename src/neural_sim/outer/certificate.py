@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.retrained import Check
 from neural_sim.outer.settings import OnUntrusted, Trust
 from neural_sim.solver.solution import Status
 
@@ -34,11 +33,11 @@ class Certificate:
     ``stationarity`` is ``|dL_train/dtheta|`` and ``validation_norm`` ``|dL_val/dtheta|``. ``curvature_min`` and
     ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` that of the damped one (nan
     where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the hypergradient's
-    relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with a retrained finite
-    difference, nan where none was made. ``doubts`` names what speaks against all steps. ``p_values``, by object and
-    factor, are those of the null that a derivative is zero: this iteration's, or, where steps are checked, its average
-    with those of earlier iterations, which steps follow. ``actions`` has the objects whose psi moves; a step without
-    doubt and with a significant derivative is kept.
+    relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with what
+    ``outer.certify`` measured, nan where it did not. ``doubts`` names what speaks against all steps. ``p_values``, by
+    object and factor, are those of the null that a derivative is zero: this iteration's, or, where steps are checked,
+    its average with those of earlier iterations, which steps follow. ``actions`` has the objects whose psi moves; a
+    step without doubt and with a significant derivative is kept.
     """
 
     stationarity: float
@@ -74,7 +73,7 @@ def certify(
     p_values: Mapping[str, Mapping[str, float]],
     names: Sequence[str],
     factors: Sequence[str],
-    check: Check | None,
+    cosine: float,
     trust: Trust,
     on_untrusted: OnUntrusted,
 ) -> Certificate:
@@ -85,7 +84,7 @@ def certify(
     where nothing was tested, nothing speaks against it.
     """
     finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())
-    found = _doubts(result, check, trust) + ([] if finite else ["not finite"])
+    found = _doubts(result, cosine, trust) + ([] if finite else ["not finite"])
     if found:
         action = _ACTIONS[on_untrusted]
         if not finite and action in ("shrunk", "kept"):
@@ -106,7 +105,7 @@ def certify(
         curvature_max=spectrum.largest if spectrum else math.nan,
         condition=result.damping.condition,
         sensitivity=result.sensitivity,
-        cosine=check.cosine if check else math.nan,
+        cosine=cosine,
         doubts=found,
         p_values={name: dict(found) for name, found in p_values.items()},
         actions=actions,
@@ -133,12 +132,11 @@ def _by_signal(
     return actions
 
 
-def _doubts(result: Hypergradient, check: Check | None, trust: Trust) -> list[str]:
+def _doubts(result: Hypergradient, cosine: float, trust: Trust) -> list[str]:
     """Names of the demands on all steps that the hypergradient fails; a number that does not exist fails none."""
     solution = result.solution
     # An approximation that was never iterated (solver=identity) was asked for knowing its residual.
     residual = 0.0 if solution.status is Status.APPROXIMATE else solution.residual
-    cosine = check.cosine if check else math.nan
     failed = {
         "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE, Status.DIVERGED),
         "residual": _above(residual, trust.max_residual),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,20 +15,18 @@ from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.outer.binding import bound_losses, object_images
-from neural_sim.outer.certificate import certify
-from neural_sim.outer.checked import CheckedSteps
-from neural_sim.outer.inner import InnerLoop, timed
-from neural_sim.outer.loop import OuterLoop
+from neural_sim.outer.descent import GradientLoop
+from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.probing import ProbeSet
-from neural_sim.outer.retrained import Check, as_double, binned_problem, check
-from neural_sim.outer.steps import FreeSteps, Steps
+from neural_sim.outer.response import agreement
+from neural_sim.outer.retrained import as_double, binned_problem, check
 from neural_sim.outer.unrolling import through_training
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.synthesis.scene import RenderedObject, join
+from neural_sim.synthesis.scene import RenderedObject
 from neural_sim.types import LabelledImages
 
 
-class SimulatorModule(OuterLoop):
+class SimulatorModule(GradientLoop):
     """psi moved by the hypergradient, with a certificate for every step."""
 
     def __init__(
@@ -37,75 +36,16 @@ class SimulatorModule(OuterLoop):
         estimator: Estimator,
         solver: AdjointSolver,
     ) -> None:
-        super().__init__(inner, psi, inner.settings.iterations)
+        super().__init__(inner, psi)
         self.estimator, self.solver = estimator, solver
-        wanted, names = inner.settings.learned, self.scene.names
-        self._learned = [i for i, name in enumerate(names) if wanted is None or name in wanted]
-        self._names = [names[label] for label in self._learned]
-        self.steps = self._begin()
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
         # A generator of its own, so that being certified does not change a run.
         self._check_generator = torch.Generator().manual_seed(inner.generator.initial_seed() + 1)
-        self._recording = self.settings.unrolled.recording if self.settings.adjoint == "unrolled" else None
-        self._stopped = False
+        if self.settings.adjoint == "unrolled":
+            self._recording = self.settings.unrolled.recording
 
-    def _begin(self) -> Steps:
-        psi, distribution = self.psi[self._learned], self.scene.distribution
-        if self.settings.steps == "free":
-            return FreeSteps(self.settings, distribution, self._names, psi)
-        self.inner.common_numbers = True
-        shrink = self.settings.trust.shrink
-        return CheckedSteps(self.settings.checks, shrink, distribution, self._names, self._learned, psi)
-
-    def training_step(self, batch: int, batch_idx: int) -> None:
-        seconds: dict[str, float] = {}
-        with timed(seconds, "render", self.inner.device):
-            rendered = self.inner.draw(self.psi)
-            images = join(rendered)
-        last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
-        with timed(seconds, "probes", self.inner.device):
-            if not last:
-                self._draw_probes()
-        with timed(seconds, "features", self.inner.device):
-            cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
-        with timed(seconds, "train", self.inner.device):
-            # The warm start has trained on this psi already, on more images and for longer than an iteration would.
-            arrived = not self.records and not self.settings.train_first
-            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached, self._recording)
-        with timed(seconds, "judge", self.inner.device):
-            scores = self.inner.scores()
-            verdicts = self.steps.judge(scores)
-        if last:
-            self.record(self.psi, images, training_loss, seconds, scores=scores, verdicts=verdicts)
-            self._go_to(self.steps.reported)
-            return
-        with timed(seconds, "hypergradient", self.inner.device):
-            result = self._hypergradient(rendered, images, cached)
-        seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
-        with timed(seconds, "certify", self.inner.device):
-            check = self._check(result)
-        p_values, factors = self.steps.observe(result), self.scene.distribution.names
-        trust, otherwise = self.settings.trust, self.settings.on_untrusted
-        certificate = certify(result, p_values, self._names, factors, check, trust, otherwise)
-        norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
-        self.record(
-            self.psi, images, training_loss, seconds, certificate, norms, _products(result), scores, verdicts
-        )
-        self._stopped = certificate.stopped
-        psi = self.steps.next(certificate)
-        if not self.steps.moved:
-            self.inner.renew()  # the same training again would say nothing new
-        self._go_to(psi)
-
-    def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
-        self.psi.data[self._learned] = psi
-        self.trajectory.append(self.psi.detach().clone())
-
-    def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
-        return -1 if self._stopped else None
-
-    def _hypergradient(
+    def _derivative(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
     ) -> Hypergradient:
         trainable = self.inner.trainable
@@ -158,7 +98,7 @@ class SimulatorModule(OuterLoop):
         trainable = self.inner.trainable
         return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
 
-    def _draw_probes(self) -> None:
+    def _prepare(self) -> None:
         """New probes, or a part of them, so that what is peculiar to some does not push psi the same way for ever."""
         every = self.estimator.probes_per_bin
         if not every:
@@ -179,8 +119,15 @@ class SimulatorModule(OuterLoop):
         inner.images += len(probed.cached)
         return probed
 
-    def _check(self, result: Hypergradient) -> Check | None:
-        """Every ``certify_every`` steps, one object's gradient of one factor against a retrained problem, in turn.
+    def _cosine(self, result: Hypergradient) -> float:
+        """The mean over objects and factors of the cosine with the response of training itself; or, in turn, one
+        object's and factor's with a problem retrained to its end."""
+        if self.settings.certify == "response":
+            return agreement(self.inner, self.psi, result, self._learned)
+        return self._retrained(result) if self.scene.distribution.binned else math.nan
+
+    def _retrained(self, result: Hypergradient) -> float:
+        """One object's gradient of one factor against finite differences of a retrained problem.
 
         That problem is the one of this step's probes, with the proximal term whose exact derivative the step's solve
         took: its damping, held at the parameters of this step, beside the detector's own. Estimators without probes
@@ -188,8 +135,6 @@ class SimulatorModule(OuterLoop):
         """
         every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
         done = len(self.records) + 1
-        if every == 0 or done % every or not self.scene.distribution.binned:
-            return None
         probed = self._probes
         objects = range(len(self.scene.names))
         if probed is None or probed.per_bin < per_bin or len(self._learned) < len(objects):
@@ -205,10 +150,4 @@ class SimulatorModule(OuterLoop):
         validation = self.inner.objective.double().terms()
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
-        return check(problem, validation, psi, label, as_double(trainable), gradient)
-
-
-def _products(result: Hypergradient) -> int:
-    """Hessian products of the solve and of the damping before it."""
-    spectrum = result.damping.spectrum
-    return result.solution.products + (spectrum.products if spectrum else 0)
+        return check(problem, validation, psi, label, as_double(trainable), gradient).cosine

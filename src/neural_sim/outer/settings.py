@@ -15,6 +15,7 @@ from neural_sim.renderer.nerf import Quality
 ObjectiveKind = Literal["average_precision", "loss"]
 Start = Literal["previous", "warm", "fresh"]
 AdjointKind = Literal["implicit", "unrolled"]
+CertifyKind = Literal["response", "retrained"]
 StepKind = Literal["checked", "free"]
 OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
@@ -122,8 +123,9 @@ class Outer:
     ``on_untrusted`` is what happens to a step that fails ``trust``: the step of one factor of one object where its
     derivative is not significant, of all where the doubt is about all. ``keep`` takes it whole, as the paper does;
     ``stop`` skips the former, and ends the loop at the latter or where no object is left. Every ``certify_every`` steps
-    (0: never) one object's gradient, in turn, is compared with finite differences of a problem retrained on
-    ``certify_per_bin`` images of every bin: 2 k - 1 trainings to stationarity.
+    (0: never) the hypergradient is compared: with the ``response`` of training itself at this psi, a training for each
+    bin (:mod:`outer.response`), or with finite differences of a problem ``retrained`` to stationarity on
+    ``certify_per_bin`` images of every bin, one object in turn, 2 k - 1 such trainings.
     """
 
     update: Update
@@ -148,6 +150,7 @@ class Outer:
     on_untrusted: OnUntrusted = "skip"
     learned: tuple[str, ...] | None = None
     light_update: Update = field(default_factory=lambda: Mirror(learning_rate=0.6, max_step=1.0))
+    certify: CertifyKind = "response"
     certify_every: int = 0
     certify_per_bin: int = 1
 
@@ -173,7 +176,12 @@ class Outer:
             raise ValueError(
                 f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
             )
-        for key, kinds in (("adjoint", AdjointKind), ("objective", ObjectiveKind), ("steps", StepKind)):
+        for key, kinds in (
+            ("adjoint", AdjointKind),
+            ("objective", ObjectiveKind),
+            ("steps", StepKind),
+            ("certify", CertifyKind),
+        ):
             if getattr(self, key) not in get_args(kinds):
                 raise ValueError(
                     f"outer.{key} must be one of {', '.join(get_args(kinds))}, got {getattr(self, key)!r}"
@@ -183,8 +191,9 @@ class Outer:
                 "outer.steps=checked compares trainings: want train_first=true, start=fresh or warm and epochs of at "
                 f"least 1, got {self.train_first}, {self.start} and {self.epochs}"
             )
-        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or self.certify_every):
+        retrained = self.certify_every > 0 and self.certify == "retrained"
+        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or retrained):
             raise ValueError(
-                "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and certify_every=0, got "
-                f"{self.train_first}, {self.epochs} and {self.certify_every}"
+                "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and no certify=retrained, got "
+                f"{self.train_first}, {self.epochs} and certify_every={self.certify_every} of {self.certify}"
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
+from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.field.grid import GridField
 from neural_sim.outer.inner import pooled
 from neural_sim.stages.account import Omission
@@ -43,13 +43,13 @@ def _loop(graph: Graph) -> Iterator[Omission]:
     if isinstance(method, Fixed):
         yield Omission("psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0)
         return
-    searched = not isinstance(method, HypergradientLoop)
-    if searched:
-        yield Omission("psi", "hypergradients", f"baseline={method.name} sees rewards only", 1.0)
-    else:
+    follows = isinstance(method, HypergradientLoop)
+    if follows:
         yield from _hypergradient(x, objects)
+    else:
+        yield Omission("psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0)
     if pooled(outer, graph.learned.draws, x.imaging.distribution):
-        yield _pooled(x, method, searched)
+        yield _pooled(x, getattr(method, "rounds", 1) * outer.iterations, follows)
     if outer.quality not in (None, x.imaging.renderer.quality):
         yield Omission(
             "psi", "fine renders in the loop", f"outer.quality={outer.quality}; the scored images are fine"
@@ -75,18 +75,17 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
             "psi", "probes and second derivatives", "outer.learned fixes the other objects' psi", share
         )
     images = objects * outer.images_per_object
-    if 0 < outer.curvature_images < images:
+    if outer.adjoint == "implicit" and 0 < outer.curvature_images < images:
         share = 1.0 - outer.curvature_images / images
         yield Omission("psi", "images in Hessian products", "outer.curvature_images stand for all", share)
 
 
-def _pooled(x: Experiment, method: HypergradientLoop | RewardMethod, searched: bool) -> Omission:
+def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
     """Renders that a pool of every bin spares, of all that the loop's images would take."""
     factors, outer = x.imaging.distribution.binned, x.loop.outer
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
-    rounds = getattr(method, "rounds", 1) * outer.iterations
     probes = 0.0
-    if not searched:
+    if follows:
         anew = 1.0 + (rounds - 1) * outer.refresh
         probes = anew * x.loop.gradient.probes_per_bin * sum(factor.bins for factor in factors)
     wanted = rounds * outer.images_per_object + probes

@@ -11,13 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.baseline.base import Fixed, HypergradientLoop, RewardMethod
+from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.outer.cost import Cost
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.loop import OuterLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.records import IterationRecord, LearnedPsi, record_of
+from neural_sim.outer.response import ResponseLoop
 from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
@@ -27,7 +28,7 @@ from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.synthesis.scene import Draws, HardDraws
 
-Method = Fixed | HypergradientLoop | RewardMethod
+Method = Fixed | HypergradientLoop | Response | RewardMethod
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,8 @@ class PsiStage(Stage[LearnedPsi]):
         )  # fmt: skip
         if self.parts is not None:
             return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver)
+        if isinstance(method, Response):
+            return ResponseLoop(inner, self.initial, method.part)
         if isinstance(method, (Fixed, HypergradientLoop)):
             raise ValueError(f"baseline={method.name} has no outer loop")
         return RewardLoop(inner, self.initial, method)

@@ -1,0 +1,112 @@
+"""The psi loop whose steps follow a derivative, wherever that comes from: draw, train, judge, derive, step."""
+
+from __future__ import annotations
+
+import math
+
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.trajectory import Recording
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.outer.certificate import certify
+from neural_sim.outer.checked import CheckedSteps
+from neural_sim.outer.inner import InnerLoop, timed
+from neural_sim.outer.loop import OuterLoop
+from neural_sim.outer.steps import FreeSteps, Steps
+from neural_sim.synthesis.scene import RenderedObject, join
+from neural_sim.types import LabelledImages
+
+
+class GradientLoop(OuterLoop):
+    """One training step is one outer iteration. A subclass says in :meth:`_derivative` where the derivative comes from.
+
+    Where steps are checked, the last iteration trains only to judge the last step.
+    """
+
+    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> None:
+        super().__init__(inner, psi, inner.settings.iterations)
+        wanted, names = inner.settings.learned, self.scene.names
+        self._learned = [i for i, name in enumerate(names) if wanted is None or name in wanted]
+        self._names = [names[label] for label in self._learned]
+        self.steps = self._begin()
+        self._recording: Recording | None = None
+        self._stopped = False
+
+    def _begin(self) -> Steps:
+        psi, distribution = self.psi[self._learned], self.scene.distribution
+        if self.settings.steps == "free":
+            return FreeSteps(self.settings, distribution, self._names, psi)
+        self.inner.common_numbers = True
+        shrink = self.settings.trust.shrink
+        return CheckedSteps(self.settings.checks, shrink, distribution, self._names, self._learned, psi)
+
+    def training_step(self, batch: int, batch_idx: int) -> None:
+        seconds: dict[str, float] = {}
+        with timed(seconds, "render", self.inner.device):
+            rendered = self.inner.draw(self.psi)
+            images = join(rendered)
+        last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
+        if not last:
+            with timed(seconds, "probes", self.inner.device):
+                self._prepare()
+        with timed(seconds, "features", self.inner.device):
+            cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+        with timed(seconds, "train", self.inner.device):
+            # The warm start has trained on this psi already, on more images and for longer than an iteration would.
+            recording = None if last else self._recording
+            arrived = not self.records and not self.settings.train_first
+            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached, recording)
+        with timed(seconds, "judge", self.inner.device):
+            scores = self.inner.scores()
+            verdicts = self.steps.judge(scores)
+        if last:
+            self.record(self.psi, images, training_loss, seconds, scores=scores, verdicts=verdicts)
+            self._go_to(self.steps.reported)
+            return
+        with timed(seconds, "hypergradient", self.inner.device):
+            result = self._derivative(rendered, images, cached)
+        seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
+        with timed(seconds, "certify", self.inner.device):
+            every = self.settings.certify_every
+            due = every > 0 and (len(self.records) + 1) % every == 0
+            cosine = self._cosine(result) if due else math.nan
+        p_values, factors = self.steps.observe(result), self.scene.distribution.names
+        trust, otherwise = self.settings.trust, self.settings.on_untrusted
+        certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
+        norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
+        self.record(
+            self.psi, images, training_loss, seconds, certificate, norms, _products(result), scores, verdicts
+        )
+        self._stopped = certificate.stopped
+        psi = self.steps.next(certificate)
+        if not self.steps.moved:
+            self.inner.renew()  # the same training again would say nothing new
+        self._go_to(psi)
+
+    def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
+        self.psi.data[self._learned] = psi
+        self.trajectory.append(self.psi.detach().clone())
+
+    def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
+        return -1 if self._stopped else None
+
+    def _prepare(self) -> None:
+        """Make what the derivative needs beside the iteration's training."""
+
+    def _derivative(
+        self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
+    ) -> Hypergradient:
+        """dL_val/dpsi of the objects that are learned, zeros for others."""
+        raise NotImplementedError
+
+    def _cosine(self, result: Hypergradient) -> float:
+        """Of the derivative with an independent one; nan where there is none."""
+        return math.nan
+
+
+def _products(result: Hypergradient) -> int:
+    """Hessian products of the solve and of the damping before it."""
+    spectrum = result.damping.spectrum
+    return result.solution.products + (spectrum.products if spectrum else 0)
