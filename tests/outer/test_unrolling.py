@@ -154,8 +154,6 @@ def test_a_training_that_was_not_recorded_is_refused(scene):
 @pytest.mark.parametrize(
     "settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2, "certify": "retrained"}]
 )
-    "settings", [{"train_first": False}, {"epochs": 0}, {"certify_every": 2, "certify": "retrained"}]
-)
 def test_unrolling_wants_a_training_in_every_iteration(settings):
     with pytest.raises(ValueError, match=r"outer\.adjoint=unrolled wants"):
         Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True, "steps": "free"} | settings))
