@@ -68,7 +68,10 @@ def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     assert isinstance(auto_sim.loop.gradient, ReinforceEstimator)
     for group in ("solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
-    steps = {"train_first": True, "update": Mirror(2.0, max_step=1.0)}
+    steps = {
+        "objective": "loss", "adjoint": "implicit", "steps": "free", "on_untrusted": "shrink",
+        "update": Mirror(2.0, max_step=1.0),
+    }  # fmt: skip
     assert auto_sim.loop.outer == dataclasses.replace(plain.loop.outer, **steps)
     assert experiment("baseline=auto_sim", "outer.update.max_step=2").loop.outer.update == Mirror(
         2.0, max_step=2.0

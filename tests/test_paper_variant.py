@@ -142,7 +142,7 @@ def test_another_method_gets_everything_but_the_method(name, baseline):
     # And the method itself is the one that it is without the variant.
     for group in ("baseline", "gradient", "solver"):
         assert other[group] == plain[group]
-    training = {"outer.epochs", "outer.start", "outer.learning_rate"}
+    training = {"outer.epochs", "outer.start", "outer.steps", "outer.learning_rate"}
     outer = {key for key in _differences(plain, other) if key.startswith("outer.")}
     assert outer <= training
     assert all(value(other, key) == value(paper, key) for key in training)
