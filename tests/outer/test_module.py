@@ -237,15 +237,16 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     # The last training judges and takes no derivative.
     assert last.certificate is None and "hypergradient" not in last.seconds
     assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
-    tried = learned.trajectory[-2]
-    for label, name in enumerate(("a", "b")):
-        if name in last.verdicts:
-            wanted = tried if last.verdicts[name].accepted else None
-            assert wanted is None or torch.equal(learned.last[label], wanted[label])
-    assert torch.equal(learned.last, module.steps.reported)
-    for record, psi in zip(learned.records, learned.trajectory, strict=False):
-        p = module.scene.distribution.probabilities(psi)["pose"]
-        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), p)
+    assert torch.equal(learned.trajectory[1], learned.trajectory[0])  # nothing was judged yet
+    distribution = module.scene.distribution
+    for number, record in enumerate(learned.records[1:], 1):
+        tried = torch.tensor(record.probabilities["pose"], dtype=torch.float64)
+        before, after = (
+            distribution.probabilities(psi)["pose"] for psi in learned.trajectory[number : number + 2]
+        )
+        for label, name in enumerate(("a", "b")):
+            accepted = name in record.verdicts and record.verdicts[name].accepted
+            torch.testing.assert_close(after[label], (tried if accepted else before)[label])
 
 
 def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):

@@ -87,7 +87,9 @@ class GradientLoop(OuterLoop):
 
     def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
         self.psi.data[self._learned] = psi
-        self.trajectory.append(self.psi.detach().clone())
+        reported = self.psi.detach().clone()
+        reported[self._learned] = self.steps.reported
+        self.trajectory.append(reported)
 
     def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
         return -1 if self._stopped else None

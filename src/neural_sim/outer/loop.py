@@ -27,7 +27,7 @@ class OuterLoop(pl.LightningModule):
     """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
 
     ``inner`` draws the images of an iteration and trains the detector on them. A subclass's ``training_step`` ends with
-    :meth:`record` and, after psi has moved, ``trajectory.append``.
+    :meth:`record` and, after psi has moved, ``trajectory.append``: what the method would report if it ended there.
     """
 
     def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], rounds: int) -> None:

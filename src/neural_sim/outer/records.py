@@ -64,8 +64,9 @@ def record_of(stored: Mapping[str, Any]) -> IterationRecord:
 
 @dataclass(frozen=True)
 class LearnedPsi:
-    """The loop's outcome. ``trajectory`` is psi before the first iteration and after each: its last is what the
-    method reports. ``before`` is what was spent before the first: on the warm start, whose backbone every loop has."""
+    """The loop's outcome. ``trajectory`` is what the method would report before the first iteration and after each; a
+    checked step is in it from the training on that accepted it. ``before`` is what was spent before the first: on the
+    warm start, whose backbone every loop has."""
 
     trajectory: Float[Tensor, "iterations+1 objects K"]
     records: list[IterationRecord]
