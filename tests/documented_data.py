@@ -91,7 +91,9 @@ def coco(path: Path) -> Path:
             Image.fromarray(picture).save(path.parent / name)
             images.append({"id": len(images), "file_name": name, "width": 120, "height": 90, "scene": video})
     categories = [{"id": label, "name": name} for label, name in enumerate(names)]
-    path.write_text(json.dumps({"images": images, "annotations": annotations, "categories": categories}))
+    camera = {"width": 120, "height": 90, "fx": 150.0, "fy": 150.0, "cx": 59.5, "cy": 44.5}
+    document = {"images": images, "annotations": annotations, "categories": categories, "camera": camera}
+    path.write_text(json.dumps(document))
     return path
 
 

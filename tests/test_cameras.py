@@ -81,7 +81,43 @@ def test_sphere_span_hits_misses_and_starts_inside():
     assert (near == 0).all() and (far > 0.4).all()
 
 
-@pytest.mark.parametrize("bad", [(0, 8, 0.5), (8, 0, 0.5), (8, 8, 0.0), (8, 8, 3.2)])
+MATRIX = torch.tensor([[70.0, 0.0, 20.0], [0.0, 55.0, 9.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+OFF_CENTRE = cameras.opencv_camera(48, 32, 70.0, 55.0, 20.0, 9.5)
+
+
+@pytest.mark.parametrize("magnification", [1.0, 1.7])
+def test_rays_project_back_onto_their_pixels(magnification):
+    """OpenCV's projection, K [R | t] X, of points on the rays of an off-centre camera."""
+    pose, size = _pose(0.7, rho=0.3), torch.tensor([magnification], dtype=torch.float64)
+    bundle = cameras.pixel_rays(OFF_CENTRE, pose[None], torch.arange(48 * 32), size)
+    points = bundle.origins + 2.5 * bundle.directions
+    local = (points - pose[:3, 3]) @ pose[:3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    matrix = MATRIX.clone()
+    matrix[:2, :2] *= magnification
+    pixel = local @ matrix.T
+    expected = torch.stack([torch.arange(48 * 32) % 48, torch.arange(48 * 32) // 48], -1).double()
+    torch.testing.assert_close(pixel[:, :2] / pixel[:, 2:], expected, atol=1e-11, rtol=0.0)
+
+
+def test_a_resized_camera_sees_the_same_directions():
+    """Corners of the image are corners of the image whatever the number of pixels between them."""
+    small = cameras.resized(OFF_CENTRE, 24, 8)
+    assert cameras.focal_lengths(small) == pytest.approx((35.0, 13.75), rel=1e-14)
+    assert cameras.principal_point(small) == pytest.approx((10.25, 2.5), rel=1e-14)
+    again = cameras.resized(small, 48, 32)
+    assert cameras.focal_lengths(again) == pytest.approx((70.0, 55.0), rel=1e-14)
+
+
+def test_distances_in_metres_are_distances_in_radii():
+    number = [torch.tensor(x, dtype=torch.float64) for x in (0.4, 0.2)]
+    metres, radii = (torch.tensor(x, dtype=torch.float64) for x in (0.3, 3.0))
+    torch.testing.assert_close(cameras.orbit(*number, metres, radius=0.1), cameras.orbit(*number, radii))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [(0, 8, 0.5), (8, 0, 0.5), (8, 8, 0.0), (8, 8, 3.2), (8, 8, 0.5, 0.0), (8, 8, 0.5, 1.0, (math.nan, 4.0))],
+)
 def test_impossible_cameras_are_refused(bad):
     with pytest.raises(ValueError, match="camera"):
         PinholeCamera(*bad)

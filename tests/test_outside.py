@@ -39,8 +39,8 @@ def test_each_is_built_from_its_group():
     target = with_turn.probabilities(with_turn.psi("target", ["mug"]))["turn"][0]
     torch.testing.assert_close(target, torch.tensor([0.02, 0.94, 0.02, 0.02], dtype=torch.float64))
     assert build(composed(MINE["gradient"])).loop.gradient.chunk_size == 8
-    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=32)
-    assert len(detector.anchors) == 16
+    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
+    assert len(detector.anchors) == 24
 
 
 @pytest.mark.parametrize(

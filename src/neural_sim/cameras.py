@@ -13,28 +13,65 @@ from neural_sim.types import PinholeCamera, Rays
 
 
 def orbit(
-    phi: Float[Tensor, "*n"], rho: Float[Tensor, "*n"], distance: Float[Tensor, "*n"]
+    phi: Float[Tensor, "*n"], rho: Float[Tensor, "*n"], distance: Float[Tensor, "*n"], *, radius: float = 1.0
 ) -> Float[Tensor, "*n 4 4"]:
     """Camera-to-world poses that look at the origin, differentiable in all three arguments.
 
     The object stands upright along world +z. ``phi`` goes once round the great circle through the poles: 0 above,
     pi/2 beside (world +x), pi below, 3 pi/2 on the other side (world -x). ``rho`` turns that circle about the
-    vertical axis. Angles in radians, distance in object radii. The up vector is carried along the circle (it is
+    vertical axis. Angles in radians; positions are in object radii, distance in the unit of ``radius``, the object's
+    (its own radius by default). The up vector is carried along the circle (it is
     the derivative of position by -phi), so nothing is singular at the poles, where a world-up ``look_at`` is.
     """
     sin_phi, cos_phi, sin_rho, cos_rho = phi.sin(), phi.cos(), rho.sin(), rho.cos()
     backward = torch.stack([sin_phi * cos_rho, sin_phi * sin_rho, cos_phi], -1)
     up = torch.stack([-cos_phi * cos_rho, -cos_phi * sin_rho, sin_phi], -1)
     right = torch.stack([-sin_rho, cos_rho, torch.zeros_like(rho)], -1)
-    pose = torch.stack([right, up, backward, backward * distance[..., None]], -1)
+    pose = torch.stack([right, up, backward, backward * (distance / radius)[..., None]], -1)
     bottom = torch.zeros_like(pose[..., :1, :])
     bottom[..., 0, 3] = 1.0
     return torch.cat([pose, bottom], -2)
 
 
 def focal_length(camera: PinholeCamera) -> float:
-    """Focal length in pixels."""
+    """Vertical focal length in pixels."""
     return 0.5 * camera.height / math.tan(0.5 * camera.field_of_view)
+
+
+def focal_lengths(camera: PinholeCamera) -> tuple[float, float]:
+    """Horizontal and vertical focal length in pixels."""
+    vertical = focal_length(camera)
+    return camera.aspect * vertical, vertical
+
+
+def principal_point(camera: PinholeCamera) -> tuple[float, float]:
+    """The principal point (x, y) in pixels from the image's upper left corner: half a pixel more than OpenCV's."""
+    return (0.5 * camera.width, 0.5 * camera.height) if camera.centre is None else camera.centre
+
+
+def opencv_camera(
+    width: int, height: int, fx: float, fy: float, cx: float | None = None, cy: float | None = None
+) -> PinholeCamera:
+    """The camera of an OpenCV camera matrix, in pixels.
+
+    OpenCV's origin is the centre of the upper left pixel, so that ``cx`` of a centred camera is (width - 1) / 2, which
+    None stands for. Raises ``ValueError`` for sizes or focal lengths that are not positive and finite.
+    """
+    if not (0.0 < fx < math.inf and 0.0 < fy < math.inf):
+        raise ValueError(f"camera: fx and fy must be positive and finite, got {fx} and {fy}")
+    centred = cx is None and cy is None
+    across, down = (0.5 * side if c is None else c + 0.5 for side, c in ((width, cx), (height, cy)))
+    field_of_view = 2.0 * math.atan(0.5 * height / fy)
+    return PinholeCamera(width, height, field_of_view, fx / fy, None if centred else (across, down))
+
+
+def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
+    """The camera whose images are this one's, stretched to another size."""
+    x, y = principal_point(camera)
+    (fx, fy), across, down = focal_lengths(camera), width / camera.width, height / camera.height
+    centre = None if camera.centre is None else (across * x, down * y)
+    aspect = camera.aspect if width * camera.height == height * camera.width else across * fx / (down * fy)
+    return PinholeCamera(width, height, camera.field_of_view, aspect, centre)
 
 
 def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
@@ -66,11 +103,15 @@ def pixel_rays(
     camera's own. Values and derivatives are of one arithmetic: a sample that lands in another cell has another
     derivative.
     """
-    per_view, focal = camera.height * camera.width, focal_length(camera)
+    per_view, (fx, fy), (cx, cy) = (
+        camera.height * camera.width,
+        focal_lengths(camera),
+        principal_point(camera),
+    )
     inside, view = pixel % per_view, torch.div(pixel, per_view, rounding_mode="floor")
     row = torch.div(inside, camera.width, rounding_mode="floor")
-    x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - 0.5 * camera.width) / focal
-    y = (row.to(camera_to_world.dtype) + 0.5 - 0.5 * camera.height) / focal
+    x = ((inside % camera.width).to(camera_to_world.dtype) + 0.5 - cx) / fx
+    y = (row.to(camera_to_world.dtype) + 0.5 - cy) / fy
     if magnification is not None:
         x, y = x / magnification[view], y / magnification[view]
     local = torch.stack([x, -y, -torch.ones_like(x)], -1)

@@ -39,8 +39,8 @@ _log = logging.getLogger(__name__)
 
 # Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
 _PARTS = (
-    "objects", "views", "field", "renderer", "synthesis", "target", "detector", "solver", "baseline", "gradient",
-    "outer", "training", "unlearned",
+    "objects", "views", "field", "renderer", "synthesis", "target", "camera", "detector", "solver", "baseline",
+    "gradient", "outer", "training", "unlearned",
 )  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         score_at=tuple(plain["score_at"]),
     )
     images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
-    imaging = Imaging(**images, distribution=_product(parameters, parts))
+    imaging = Imaging(**images, camera=_camera(parts), distribution=_product(parameters, parts))
     loop = Loop(parts["baseline"], parts["outer"], parts["gradient"], parts["solver"])
     return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain)
 
@@ -123,6 +123,15 @@ def _is_step(node: Any) -> bool:
     return isinstance(node, Mapping) and "_target_" in node and callable(
         getattr(hydra.utils.get_object(node["_target_"]), "run", None)
     )  # fmt: skip
+
+
+def _camera(parts: Mapping[str, Any]) -> Any:
+    """Of synthesised and of rendered target images."""
+    views = parts["views"]
+    try:
+        return parts["camera"].camera(parts["training"].image_size, views.field_of_view_deg, parts["target"])
+    except ValueError as error:
+        raise UserError(_first_line(error)) from error
 
 
 def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:

@@ -19,20 +19,29 @@ class Rays:
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A square-pixel pinhole camera without distortion; the principal point is the image's centre.
+    """A pinhole camera without distortion and skew.
 
-    ``width`` and ``height`` in pixels, ``field_of_view`` (vertical) in radians.
+    ``width`` and ``height`` in pixels; ``field_of_view`` in radians is the vertical one of an image of this height
+    about the principal point, 2 atan(height / (2 f_y)). ``aspect`` is f_x / f_y, 1 for square pixels. ``centre`` is the
+    principal point (x, y) in pixels from the image's upper left corner, whose first pixel has its centre at (0.5, 0.5);
+    None: the image's centre. :func:`neural_sim.cameras.opencv_camera` makes one from a camera matrix.
     """
 
     width: int
     height: int
     field_of_view: float
+    aspect: float = 1.0
+    centre: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"camera: width and height must be at least 1, got {self.width} x {self.height}")
         if not 0.0 < self.field_of_view < torch.pi:
             raise ValueError(f"camera: field_of_view must lie in (0, pi) radians, got {self.field_of_view}")
+        if not 0.0 < self.aspect < float("inf"):
+            raise ValueError(f"camera: aspect (f_x / f_y) must be positive and finite, got {self.aspect}")
+        if self.centre is not None and not torch.tensor(self.centre).isfinite().all():
+            raise ValueError(f"camera: the principal point must be finite, got {self.centre}")
 
 
 @dataclass(frozen=True)
@@ -121,11 +130,12 @@ class LabelledImages:
 class SceneDraw:
     """Scene parameters V of one object's images, drawn from p_psi (paper, Sec. 3.1, Tool 1).
 
-    ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the
-    origin in object radii, ``magnification`` its focal length in units of the camera's own (None: 1). ``bins`` are
-    the indices of the drawn (or largest relaxed) bins from 0, a column for each binned factor of p_psi. ``weights`` are
-    those of the anchor lights (None: the light is fixed), ``explored`` the Gaussian draws whose projections they are,
-    where they were drawn. The numbers may carry gradients with respect to psi.
+    ``phi`` and ``rho`` are the two pose angles in radians, ``distance`` the camera's distance from the origin, in the
+    unit of ``radius``, the object's: object radii where that is 1, metres where it is the object's size.
+    ``magnification`` is its focal length in units of the camera's own (None: 1). ``bins`` are the indices of the drawn
+    (or largest relaxed) bins from 0, a column for each binned factor of p_psi. ``weights`` are those of the anchor
+    lights (None: the light is fixed), ``explored`` the Gaussian draws whose projections they are, where they were
+    drawn. The numbers may carry gradients with respect to psi.
     """
 
     phi: Float[Tensor, "images"]
@@ -135,10 +145,12 @@ class SceneDraw:
     magnification: Float[Tensor, "images"] | None = None
     weights: Float[Tensor, "images lights"] | None = None
     explored: Float[Tensor, "images lights"] | None = None
+    radius: float = 1.0
 
     def __len__(self) -> int:
         return self.phi.shape[0]
 
     def select(self, index: Tensor | slice) -> SceneDraw:
-        held = {f.name: getattr(self, f.name) for f in fields(SceneDraw)}
-        return SceneDraw(**{name: value[index] for name, value in held.items() if value is not None})
+        held = {f.name: getattr(self, f.name) for f in fields(SceneDraw) if f.name != "radius"}
+        chosen = {name: value[index] for name, value in held.items() if value is not None}
+        return SceneDraw(**chosen, radius=self.radius)

@@ -16,6 +16,7 @@ from neural_sim.types import PinholeCamera, Rays
 
 DOUBLE = torch.float64
 CAMERA = PinholeCamera(24, 18, math.radians(40.0))
+OFF_CENTRE = cameras.opencv_camera(30, 20, 40.0, 25.0, 3.0, 15.0)
 
 
 def shell(generator: torch.Generator, head_width: int = 0, dtype: torch.dtype = DOUBLE) -> GridField:
@@ -68,16 +69,34 @@ def test_the_fused_render_keeps_the_digits_of_single_precision(generator: torch.
     assert float(difference.sort().values[:-3].max()) < 1e-5
 
 
+@pytest.mark.parametrize("camera", [CAMERA, OFF_CENTRE], ids=["centred", "off centre"])
 @pytest.mark.parametrize("chunk", [50, 400, 65536])
 @pytest.mark.parametrize("termination", [0.0, 1e-2])
 def test_no_pixel_changes_where_pixels_or_empty_space_are_left_out(
-    chunk: int, termination: float, generator: torch.Generator
+    camera: PinholeCamera, chunk: int, termination: float, generator: torch.Generator
 ) -> None:
     field = shell(generator)
-    every = render_views(field, CAMERA, poses(), termination, chunk, cull=False, skip_empty=False)
+    every = render_views(field, camera, poses(), termination, chunk, cull=False, skip_empty=False)
     for cull, skip_empty in ((True, False), (False, True), (True, True)):
-        some = render_views(field, CAMERA, poses(), termination, chunk, cull, skip_empty)
+        some = render_views(field, camera, poses(), termination, chunk, cull, skip_empty)
         torch.testing.assert_close(some, every, atol=1e-12, rtol=0.0)
+
+
+@pytest.mark.parametrize("distance", [2.4, 6.0])
+def test_an_off_centre_camera_casts_fewer_rays(distance: float, generator: torch.Generator) -> None:
+    """As seen from far away, the object is at the principal point, in the image's lower left."""
+    field, camera = shell(generator), cameras.opencv_camera(60, 40, 80.0, 50.0, 6.0, 30.0)
+    pose = cameras.orbit(*torch.tensor([[0.8], [0.2], [distance]], dtype=DOUBLE))
+    every = render_views(field, camera, pose, 0.0, 1000, cull=False)
+    torch.testing.assert_close(render_views(field, camera, pose, 0.0, 1000), every, atol=1e-12, rtol=0.0)
+    opacity = every[0, ..., 3]
+    at = (
+        (opacity.sum(0) * torch.arange(60)).sum() / opacity.sum(),
+        (opacity.sum(1) * torch.arange(40)).sum() / opacity.sum(),
+    )
+    assert float(at[0]) < 20 and float(at[1]) > 24
+    cast = sum(len(seen.pixel) for seen in seen_pixels(field, camera, pose, 1000))
+    assert distance < 5 or cast < 0.5 * 60 * 40
 
 
 def test_blocks_of_a_large_image_miss_no_pixel(generator: torch.Generator) -> None:

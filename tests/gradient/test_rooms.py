@@ -9,11 +9,13 @@ import scipy.optimize
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from neural_sim import cameras
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import input_cotangents, scores
 from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents, psi_contributions
 from neural_sim.outer.binding import rendered_path
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
@@ -106,6 +108,40 @@ def test_the_focal_length_of_every_image_against_central_differences(rooms, mode
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
     part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
     assert len(part.draw.magnification.unique()) == COUNT
+    maps = Maps(
+        *(torch.randn(value.shape, generator=generator, dtype=DOUBLE) for value in (part.rgb, part.opacity))
+    )
+    path = rendered_path(scene, 0, part)
+    along = contract(part.tangents or {}, maps)
+    along = along or draw_cotangents(path.render_rays, scene.camera, part.draw, maps, 500)
+    found = psi_contributions(path.relaxed, psi, along).sum(0)
+
+    def energy(psi):
+        again = scene.render(0, path.relaxed(psi), part.noise, torch.Generator())
+        return float((again.rgb * maps.rgb).sum() + (again.opacity * maps.opacity).sum())
+
+    steps = 1e-6 * torch.eye(3, dtype=DOUBLE)
+    expected = torch.tensor([(energy(psi + e) - energy(psi - e)) / 2e-6 for e in steps], dtype=DOUBLE)
+    assert float(expected.norm()) > 0.1
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize("by", ["distance", "focal_length"])
+def test_an_off_centre_camera_and_metres_against_central_differences(rooms, mode, by, generator):
+    """From psi to random cotangents of maps; the camera is not square, off centre, of unequal focal lengths, and the
+    object's radius is 0.2 m."""
+    ranges = {"distance": (0.5, 0.9), "focal_length": (0.6, 1.8)}
+    zoom = Zoom(bins=3, by=by, range=ranges[by], temperature=0.8, unit="metres")
+    distribution = SceneDistribution.of([zoom], Unlearned(distance=(0.5, 0.7), distance_unit="metres"))
+    camera = cameras.opencv_camera(36, 24, 40.0, 30.0, 14.0, 13.5)
+    renderer = NerfRenderer(termination=0.0)
+    scene = Scene(("block",), (rooms.field,), renderer, camera, rooms.synthesizer, distribution,
+                  radii=distribution.radii({"block": 0.2}))  # fmt: skip
+    psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
+    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    distance = scene._poses(0, part.draw)[:, :3, 3].norm(dim=-1)
+    torch.testing.assert_close(distance, part.draw.distance / 0.2)
     maps = Maps(
         *(torch.randn(value.shape, generator=generator, dtype=DOUBLE) for value in (part.rgb, part.opacity))
     )

@@ -9,11 +9,11 @@ from neural_sim.detector.targets import IGNORED, assign_anchors
 
 
 class Cells:
-    def __init__(self, num_classes: int, image_size: int = 64, cell: int = 8, proximal: float = 0.0):
-        if image_size % cell:
+    def __init__(self, num_classes: int, image_size: tuple[int, int], cell: int = 8, proximal: float = 0.0):
+        if any(side % cell for side in image_size):
             raise ValueError(f"detector.cell must divide the image's {image_size} pixels, got {cell}")
         self.num_classes, self.image_size, self.cell, self.proximal = num_classes, image_size, cell, proximal
-        corner = torch.cartesian_prod(*[torch.arange(0.0, image_size, cell)] * 2).flip(-1)
+        corner = torch.cartesian_prod(*(torch.arange(0.0, side, cell) for side in image_size)).flip(-1)
         self.anchors = torch.cat([corner - cell, corner + 2 * cell], -1)
 
     def init(self, generator):

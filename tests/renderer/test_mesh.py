@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from neural_sim.cameras import orbit
+from neural_sim.cameras import opencv_camera, orbit
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB
 from neural_sim.renderer.lighting import Light, Lighting
@@ -34,9 +34,9 @@ def poses(generator):
     return orbit(2.0 * math.pi * phi, math.pi * (0.5 * rho - 0.25), 2.4 + 1.6 * distance)
 
 
-def compare(renderers, mesh, poses):
+def compare(renderers, mesh, poses, camera=CAMERA):
     """Least silhouette IoU, and the mean and 99th percentile of the colour difference inside both."""
-    ours, theirs = (renderer.render(mesh, CAMERA, poses) for renderer in renderers)
+    ours, theirs = (renderer.render(mesh, camera, poses) for renderer in renderers)
     first, second = ours[..., 3] > 0.5, theirs[..., 3] > 0.5
     iou = ((first & second).sum((1, 2)) / (first | second).sum((1, 2))).min().item()
     difference = (ours - theirs)[..., :3][first & second].abs()
@@ -52,6 +52,12 @@ MEAN_TOLERANCE, EDGE_TOLERANCE = 1.0 / 255.0, 0.1
 @pytest.mark.parametrize("name", ["pitcher", "mug", "drill"])
 def test_both_renderers_agree_on_the_embedded_objects(renderers, poses, name):
     iou, mean, edge = compare(renderers, Procedural([name]).load()[0].mesh, poses)
+    assert iou > 0.98 and mean < MEAN_TOLERANCE and edge < EDGE_TOLERANCE, (iou, mean, edge)
+
+
+def test_both_renderers_agree_off_centre(renderers, poses):
+    camera = opencv_camera(96, 64, 110.0, 80.0, 30.0, 40.0)
+    iou, mean, edge = compare(renderers, Procedural(["mug"]).load()[0].mesh, poses, camera)
     assert iou > 0.98 and mean < MEAN_TOLERANCE and edge < EDGE_TOLERANCE, (iou, mean, edge)
 
 

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from neural_sim.cameras import orbit
+from neural_sim.cameras import opencv_camera, orbit
 from neural_sim.renderer.lighting import Light, Lighting, lambert
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.renderer.supersampling import straight_alpha
@@ -54,6 +54,20 @@ def test_sphere_covers_the_solid_angle_of_its_cone():
     focal = 0.5 * CAMERA.height / math.tan(0.5 * CAMERA.field_of_view)
     outline = focal * radius / math.sqrt(distance**2 - radius**2)
     assert view[..., 3].sum().item() == pytest.approx(math.pi * outline**2, rel=0.01)
+
+
+def test_a_sphere_off_centre_lies_about_the_principal_point():
+    """Its cone round the optical axis cuts the image plane in an ellipse of half-axes f_x and f_y times its slope."""
+    sphere = painted(trimesh.creation.icosphere(subdivisions=5), (255, 255, 255))
+    camera = opencv_camera(90, 60, 80.0, 50.0, 49.5, 24.5)
+    alpha = RaycastRenderer(4).render(sphere, camera, camera_at(1.1, 0.3, 3.0))[0, ..., 3]
+    slope = 1.0 / math.sqrt(3.0**2 - 1.0)
+    assert alpha.sum().item() == pytest.approx(math.pi * slope**2 * 80.0 * 50.0, rel=0.005)
+    columns, rows = torch.arange(90) + 0.5, torch.arange(60) + 0.5
+    middle = (alpha.sum(0) * columns).sum() / alpha.sum(), (alpha.sum(1) * rows).sum() / alpha.sum()
+    assert [float(m) for m in middle] == pytest.approx([50.0, 25.0], abs=0.02)
+    wide, high = (float(alpha.amax(axis).sum()) for axis in (0, 1))
+    assert (wide, high) == pytest.approx((2.0 * 80.0 * slope, 2.0 * 50.0 * slope), abs=0.7)
 
 
 def test_colour_is_albedo_times_light_on_both_sides():

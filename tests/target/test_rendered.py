@@ -8,7 +8,9 @@ from torch import Tensor
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
@@ -52,6 +54,14 @@ def synthesizer() -> Synthesizer:
     return Synthesizer(ProceduralClutter(octaves=1, contrast=0.0, shapes=0, grain=0.0), shift=0.0)
 
 
+def named(meshes: dict[str, ObjectMesh], renderer: MeshRenderer | None = None) -> dict[str, MeshSubject]:
+    return {name: MeshSubject(item, renderer or Sphere()) for name, item in meshes.items()}
+
+
+def subjects(meshes: dict[str, ObjectMesh], renderer: MeshRenderer | None = None) -> list[MeshSubject]:
+    return list(named(meshes, renderer).values())
+
+
 def draw_at(distances: list[float]) -> SceneDraw:
     distance = torch.tensor(distances)
     zero = torch.zeros_like(distance)
@@ -62,7 +72,7 @@ def test_images_boxes_and_labels_of_spheres(
     meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
 ) -> None:
     draws = [draw_at([2.5, 3.0, 4.0]), draw_at([3.5])]
-    made = render_target(list(meshes.values()), Sphere(), draws, CAMERA, synthesizer, generator)
+    made = render_target(subjects(meshes), draws, CAMERA, synthesizer, generator)
     replayed = torch.Generator().manual_seed(0)
     plain = torch.cat([synthesizer.draw_nuisance(n, CAMERA, replayed).backgrounds for n in (3, 1)])
     assert made.labels[:, 0].tolist() == [0, 0, 0, 1]
@@ -82,7 +92,7 @@ def test_many_views_come_in_chunks_and_lost_objects_without_boxes(
 ) -> None:
     renderer = Sphere()
     draws = [draw_at([3.0] * 70), draw_at([500.0])]
-    made = render_target(list(meshes.values()), renderer, draws, CAMERA, synthesizer, generator)
+    made = render_target(subjects(meshes, renderer), draws, CAMERA, synthesizer, generator)
     assert renderer.calls == [64, 6, 1]
     assert made.labels[:, 0].tolist() == [0] * 70 + [-1]
 
@@ -91,7 +101,7 @@ def test_a_draw_per_object_is_wanted(
     meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
 ) -> None:
     with pytest.raises(ValueError, match="got 1 draws for 2 objects"):
-        render_target(list(meshes.values()), Sphere(), [draw_at([3.0])], CAMERA, synthesizer, generator)
+        render_target(subjects(meshes), [draw_at([3.0])], CAMERA, synthesizer, generator)
 
 
 def test_sets_follow_the_target_distribution_and_share_nothing(
@@ -99,9 +109,9 @@ def test_sets_follow_the_target_distribution_and_share_nothing(
 ) -> None:
     pose = SceneDistribution.of([Pose(biased={"mug": {"target": {"dominant": 3}}})])
     target = RenderedTarget(val_per_object=30, test_per_object=20, test_per_biased_object=40)
-    made = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)
-    again = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 5)
-    other = target.sets(meshes, Sphere(), pose, CAMERA, synthesizer, 6)
+    made = target.sets(named(meshes), pose, CAMERA, synthesizer, 5)
+    again = target.sets(named(meshes), pose, CAMERA, synthesizer, 5)
+    other = target.sets(named(meshes), pose, CAMERA, synthesizer, 6)
     assert (len(made["val"]), len(made["test"])) == (60, 20 + 40)
     assert torch.equal(made["test"].images, again["test"].images)
     assert not torch.equal(made["val"].images, other["val"].images)

@@ -36,7 +36,8 @@ class Detector(Protocol):
 
     Its parameters are those of a backbone, which the psi loop freezes, and of what stands on its features. ``proximal``
     is lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm start. A class is
-    made with ``num_classes`` and ``image_size`` by name, the rest comes from its file in ``conf/detector``.
+    made with ``num_classes`` and ``image_size``, (height, width) in pixels, by name, the rest comes from its file in
+    ``conf/detector``.
     """
 
     proximal: float

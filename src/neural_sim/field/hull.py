@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neural_sim.cameras import focal_length
+from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.field.occupancy import subdivide
 from neural_sim.types import PosedViews
 
@@ -54,14 +54,15 @@ def visual_hull(
 def pixels_across(views: PosedViews, length: float) -> int:
     """How many pixels a length of the unit sphere covers at most in any view, one more for where pixels begin."""
     nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
-    return math.ceil(focal_length(views.camera) * length / nearest) + 1
+    return math.ceil(max(focal_lengths(views.camera)) * length / nearest) + 1
 
 
 def _inside_all(
     views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
 ) -> Bool[Tensor, "cells"]:
     """Whether every view that sees a centre finds object within ``radius`` of it; unseen centres stay."""
-    camera, focal, reach = views.camera, focal_length(views.camera), pixels_across(views, radius)
+    camera, reach = views.camera, pixels_across(views, radius)
+    (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     mask = (views.images[..., 3] > alpha_threshold).to(centres.dtype)[:, None]
     mask = functional.max_pool2d(mask, (2 * reach + 1, 1), 1, (reach, 0))
     mask = functional.max_pool2d(mask, (1, 2 * reach + 1), 1, (0, reach))[:, 0] > 0
@@ -70,8 +71,8 @@ def _inside_all(
     for pose, silhouette in zip(views.camera_to_world, mask, strict=True):
         local = (centres[remaining] - pose[:3, 3]) @ pose[:3, :3]
         depth = (-local[:, 2]).clamp_min(1e-6)
-        column = (focal * local[:, 0] / depth + 0.5 * camera.width).floor().long()
-        row = (-focal * local[:, 1] / depth + 0.5 * camera.height).floor().long()
+        column = (fx * local[:, 0] / depth + cx).floor().long()
+        row = (-fy * local[:, 1] / depth + cy).floor().long()
         seen = (
             (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] < 0)
         )

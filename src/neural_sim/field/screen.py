@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.cameras import focal_length
+from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.field.base import Span
 from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.types import PinholeCamera
@@ -49,7 +49,8 @@ def screen_span(
     slope = radius * (1.0 + torch.maximum(across.abs(), down.abs())) / (-z - radius)
     ahead, largest = torch.stack([(-z > 1.01 * radius).all().to(slope.dtype), slope.amax()]).tolist()
     largest = largest if ahead else math.inf
-    focal = focal_length(camera)
+    (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
+    focal = max(fx, fy)
     if focal * largest > max(camera.width, camera.height):
         whole = x.new_zeros(size[0] * size[1])
         return Span(whole, whole + math.inf)
@@ -57,8 +58,8 @@ def screen_span(
     block = max(1, reach // BLOCKS)
     margin = math.ceil(reach / block)
     high, wide = (math.ceil(pixels / block) + 2 * margin for pixels in size)
-    column = ((focal * across + 0.5 * camera.width) / block + margin).clamp(0, wide - 1)
-    row = ((focal * down + (0.5 * camera.height - rows.start)) / block + margin).clamp(0, high - 1)
+    column = ((fx * across + cx) / block + margin).clamp(0, wide - 1)
+    row = ((fy * down + (cy - rows.start)) / block + margin).clamp(0, high - 1)
     cell = torch.add(column.long(), row.long(), alpha=wide)
     distance = torch.sqrt(x * x + y * y + z * z)
     bounds = x.new_full((2, high * wide), -math.inf)

@@ -188,7 +188,7 @@ def draw_cotangents(
     for pixels in live.split(patch_size) if len(live) else ():
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}
         with torch.enable_grad():
-            poses = cameras.orbit(*(leaves[name] for name in RIGID))
+            poses = cameras.orbit(*(leaves[name] for name in RIGID), radius=draw.radius)
             rendered = render_rays(cameras.pixel_rays(camera, poses, pixels, leaves.get("magnification")))
         parts = torch.autograd.grad(
             rendered, list(leaves.values()), (rgb[pixels], opacity[pixels]), materialize_grads=True

@@ -26,6 +26,11 @@ class ObjectMesh:
     transform: Float[np.ndarray, "4 4"]
     digest: str
 
+    @property
+    def radius(self) -> float:
+        """Of the object's sphere, in metres."""
+        return float(abs(np.linalg.det(self.transform[:3, :3])) ** (1.0 / 3.0))
+
 
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
     """Centre the bounding box and scale to the unit sphere. ``mesh`` in metres; it is copied, not changed.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from neural_sim.objects import household
@@ -21,8 +23,10 @@ class Procedural:
     """Six textured household objects, two blue and four red, or those named.
 
     ``seed`` draws their small print only; shapes and marks are fixed. An object does not depend on which others
-    are made. Raises ``ValueError`` for unknown names.
+    are made. Their size means nothing. Raises ``ValueError`` for unknown names.
     """
+
+    metric: ClassVar[bool] = False
 
     def __init__(self, names: list[str] | None = None, seed: int = 0) -> None:
         chosen = list(DESIGNS) if names is None else list(names)

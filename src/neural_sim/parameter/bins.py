@@ -57,6 +57,14 @@ def gumbel(
     return -(-(uniform.clamp(1e-12, 1.0 - 1e-12)).log()).log().to(dtype)
 
 
+def exponential(shape: tuple[int, int, int], generator: torch.Generator, dtype: torch.dtype) -> Tensor | None:
+    """Standard exponential noise of (draws, conditional, bins) for :func:`conditional_gumbel`; None for none of it."""
+    if not shape[1]:
+        return None
+    empty = torch.empty(shape, dtype=torch.float64)
+    return empty.exponential_(generator=generator).clamp_min(1e-30).to(dtype)
+
+
 def conditional_gumbel(
     log_p: Float[Tensor, "k"], chosen: Int[Tensor, "n"], exponential: Float[Tensor, "n draws k"]
 ) -> Float[Tensor, "n draws k"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +13,7 @@ from torch.nn.functional import one_hot
 
 from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
+from neural_sim.parameter.distances import Unit, radii_in_metres
 from neural_sim.parameter.factor import COORDINATES, BinnedFactor, BinNoise, Factor, Relaxation
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.unlearned import Unlearned
@@ -50,12 +51,15 @@ class SceneNoise:
 class SceneDistribution:
     """p_psi = the product of the factors' distributions; psi is one vector an object, factor after factor.
 
+    ``ranges`` are of coordinates that no factor draws; distances are in ``distance_unit``.
+
     Raises:
         ValueError: no factor, two factors of one name, or two of one coordinate.
     """
 
     factors: tuple[Factor, ...]
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=lambda: Unlearned().ranges)
+    distance_unit: Unit = "radii"
 
     def __post_init__(self) -> None:
         names = [factor.name for factor in self.factors]
@@ -69,10 +73,22 @@ class SceneDistribution:
     def of(parameters: Iterable[Parameter], unlearned: Unlearned | None = None) -> SceneDistribution:
         """The product of configured parameters."""
         parameters = tuple(parameters)
-        ranges = (Unlearned() if unlearned is None else unlearned).ranges
+        unlearned = Unlearned() if unlearned is None else unlearned
+        ranges, unit = unlearned.ranges, unlearned.distance_unit
         for parameter in parameters:
             ranges |= parameter.ranges
-        return SceneDistribution(tuple(f for parameter in parameters for f in parameter.factors), ranges)
+            if any(getattr(factor, "coordinate", None) == "distance" for factor in parameter.factors):
+                unit = cast(Unit, getattr(parameter, "unit", "radii"))
+        return SceneDistribution(
+            tuple(f for parameter in parameters for f in parameter.factors), ranges, unit
+        )
+
+    def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
+        """The objects' radii of ``sizes`` where distances are in metres, see :func:`radii_in_metres`; else None."""
+        if self.distance_unit == "radii":
+            return None
+        nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
+        return radii_in_metres(nearest, sizes)
 
     @property
     def binned(self) -> tuple[BinnedFactor, ...]:
@@ -95,7 +111,8 @@ class SceneDistribution:
     @property
     def drawn(self) -> dict[str, Any]:
         """What hard draws of given probabilities depend on, without how they are relaxed and from which logits."""
-        return {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
+        drawn = {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
+        return drawn | {"distance_unit": self.distance_unit}
 
     # --- psi ---
 
@@ -166,7 +183,7 @@ class SceneDistribution:
         drawn = [c for c in COORDINATES if c != "magnification" or c in learned]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
         noise = {
-            f.name: BinNoise(gumbel[f.name], _exponential(n, conditional, f.bins, generator, dtype))
+            f.name: BinNoise(gumbel[f.name], binned.exponential((n, conditional, f.bins), generator, dtype))
             for f in self.binned
         }
         light = None
@@ -281,12 +298,3 @@ class SceneDistribution:
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
     """Bins side by side, none as no column."""
     return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)
-
-
-def _exponential(
-    n: int, conditional: int, bins: int, generator: torch.Generator, dtype: torch.dtype
-) -> Tensor | None:
-    if not conditional:
-        return None
-    empty = torch.empty(n, conditional, bins, dtype=torch.float64)
-    return empty.exponential_(generator=generator).clamp_min(1e-30).to(dtype)

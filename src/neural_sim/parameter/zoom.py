@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from neural_sim.parameter.distances import NEAREST, Unit, check_unit
 from neural_sim.parameter.distributions import Specification
 from neural_sim.parameter.factor import Beliefs, BinnedFactor, Coordinate, Gap
 
 By = Literal["distance", "focal_length"]
-NEAREST = 1.05
-"""Object radii: a camera any closer is inside the object."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +21,9 @@ class Zoom:
         bins: k.
         by: ``distance`` moves the camera; ``focal_length`` magnifies its image from where it stands, without a change
             of perspective.
-        range: nearest and farthest distance in object radii; or smallest and largest focal length in units of the
-            camera's own. Bin 1 is the nearest, or the smallest magnification.
+        range: nearest and farthest distance; or smallest and largest focal length in units of the camera's own. Bin 1
+            is the nearest, or the smallest magnification.
+        unit: of the distances, ``radii`` of each object or ``metres``; has no meaning for a focal length.
         temperature, floor: see :class:`BinnedFactor`.
         initial, target, biased, gap: see :class:`Beliefs`.
 
@@ -34,6 +34,7 @@ class Zoom:
     bins: int = 4
     by: By = "distance"
     range: tuple[float, float] = (2.2, 8.5)
+    unit: Unit = "radii"
     temperature: float = 0.1
     floor: float = 0.005
     initial: Specification = "uniform"
@@ -44,8 +45,9 @@ class Zoom:
     def __post_init__(self) -> None:
         if self.by not in get_args(By):
             raise ValueError(f"parameter.zoom.by must be one of {get_args(By)}, got {self.by!r}")
+        check_unit(self.unit, "parameter.zoom.unit")
         near, far = self.range
-        smallest = NEAREST if self.by == "distance" else 0.0
+        smallest = NEAREST if self.by == "distance" and self.unit == "radii" else 0.0
         if not smallest < near < far:
             raise ValueError(
                 f"parameter.zoom.range must be ordered and above {smallest}, got {list(self.range)}"

@@ -12,6 +12,7 @@ import trimesh
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
+from neural_sim.cameras import resized
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.supersampling import straight_alpha
 from neural_sim.renderer.surface import Surface, shaded_surface
@@ -43,7 +44,7 @@ class MeshRenderer(ABC):
         size = (camera.width * self.supersample, camera.height * self.supersample)
         drawn = self._draw(
             shaded_surface(mesh, lighting or self.lighting),
-            PinholeCamera(*size, camera.field_of_view),
+            resized(camera, *size),
             camera_to_world.detach().cpu().double().numpy(),
         )
         images = [straight_alpha(premultiplied, self.supersample) for premultiplied in drawn]

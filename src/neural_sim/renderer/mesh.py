@@ -11,6 +11,7 @@ import pyrender
 from jaxtyping import Float32, Float64
 from pyrender.constants import GLTF
 
+from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
@@ -39,7 +40,9 @@ class PyrenderRenderer(MeshRenderer):
     ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
         scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
         scene.add(_primitives(surface))
-        lens = pyrender.PerspectiveCamera(yfov=camera.field_of_view, znear=NEAR, zfar=FAR)
+        lens = pyrender.IntrinsicsCamera(
+            *focal_lengths(camera), *principal_point(camera), znear=NEAR, zfar=FAR
+        )
         eye = scene.add(lens, pose=np.eye(4))
         flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
         context = _shared_context(camera.width, camera.height)

@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 
-from neural_sim.cameras import focal_length, rays
+from neural_sim.cameras import focal_lengths, rays
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.renderer.texture_sampling import Pyramid
@@ -44,8 +44,9 @@ def _cast(
     image = _trace(mesh, surface, pyramid, camera, origins, directions)
     edge = _silhouette(image[:, 3].reshape(camera.height, camera.width) > 0.0).reshape(-1)
     image[edge] = 0.0
+    fx, fy = focal_lengths(camera)
     for x, y in EDGE_SAMPLES:
-        shifted = _shifted(directions[edge], pose.numpy(), x / focal_length(camera), y / focal_length(camera))
+        shifted = _shifted(directions[edge], pose.numpy(), x / fx, y / fy)
         image[edge] += _trace(mesh, surface, pyramid, camera, origins[edge], shifted) / len(EDGE_SAMPLES)
     return image.reshape(camera.height, camera.width, 4)
 
@@ -103,7 +104,7 @@ def _colours(
         first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
         uv_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
         texels = uv_area * pyramid.texels / np.maximum(area, 1e-12)
-        sample = distance / focal_length(camera)
+        sample = distance / min(focal_lengths(camera))
         # OpenGL's isotropic filter takes the longer side of the footprint, which a slanted face stretches.
         texels_a_side = np.sqrt(texels) * sample / np.maximum(np.abs(cosine), 0.05)
         colour = colour * pyramid.sample(np.einsum("nk,nkc->nc", weights, uv), np.log2(texels_a_side + 1e-12))

@@ -214,6 +214,7 @@ def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], fo
     named = ("phi", "rho", "distance", "magnification", "bins")
     held = {key: [getattr(part.draw, key) for part in parts] for key in named}
     poses = {key: torch.cat(values) for key, values in held.items() if values[0] is not None}
+    poses["distance"] = torch.cat([part.draw.distance / part.draw.radius for part in parts])  # object radii
     poses["camera_to_world"] = orbit(poses["phi"], poses["rho"], poses["distance"])
     return write_coco(join(parts), list(names), folder, poses)
 

@@ -58,7 +58,8 @@ class DetectorStage(Stage[TrainedDetector]):
 
     def build(self) -> Detector:
         """The detector's shape, without parameters."""
-        return self.detector(num_classes=len(self.scene.names), image_size=self.training.image_size)
+        camera = self.scene.camera
+        return self.detector(num_classes=len(self.scene.names), image_size=(camera.height, camera.width))
 
     def images(self, scene: Scene, generator: torch.Generator | None = None) -> list[RenderedObject]:
         """The images that it trains on, equal in every call."""

@@ -19,6 +19,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.meshes import ObjectSource
 from neural_sim.stages.psi import Method
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Run:
 
 @dataclass(frozen=True)
 class Imaging:
-    """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target."""
+    """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target. ``camera``
+    is that of synthesised and of rendered target images."""
 
     objects: ObjectSource
     views: Views
@@ -44,6 +46,7 @@ class Imaging:
     renderer: NerfRenderer
     synthesis: Synthesizer
     target: Any
+    camera: PinholeCamera
     distribution: SceneDistribution
 
 

@@ -66,7 +66,13 @@ class Graph:
     @property
     def camera(self) -> PinholeCamera:
         """Of synthesised and of rendered target images."""
-        return self.experiment.imaging.views.camera(self.experiment.training.image_size)
+        return self.experiment.imaging.camera
+
+    @cached_property
+    def radii(self) -> tuple[float, ...] | None:
+        """Of the objects in metres, where distances are; objects are not read where these are in radii."""
+        distribution = self.experiment.imaging.distribution
+        return None if distribution.distance_unit == "radii" else distribution.radii(self.meshes.radii)
 
     # --- images ---
 
@@ -85,7 +91,7 @@ class Graph:
         imaging = self.experiment.imaging
         return SceneStage(
             self.names, self.fields, imaging.renderer, self.camera, imaging.synthesis,
-            imaging.distribution.drawn, imaging.distribution,
+            imaging.distribution.drawn, self.radii, imaging.distribution,
         )  # fmt: skip
 
     @cached_property

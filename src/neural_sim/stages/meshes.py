@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.subject import MeshSubject
 from neural_sim.renderer.views import choose_mesh_renderer
 
 
@@ -42,6 +43,16 @@ class Meshes:
     @cached_property
     def items(self) -> dict[str, ObjectMesh]:
         return {item.name: item for item in self.source.load()}
+
+    @cached_property
+    def radii(self) -> dict[str, float | None]:
+        """Of the objects, in metres; None of objects whose source knows no unit (``metric`` is False)."""
+        known = getattr(self.source, "metric", True)
+        return {name: item.radius if known else None for name, item in self.items.items()}
+
+    def subject(self, name: str) -> MeshSubject:
+        """An object as target sets see it."""
+        return MeshSubject(self.items[name], self.renderer, self.radii[name])
 
     @cached_property
     def renderer(self) -> MeshRenderer:

@@ -17,7 +17,8 @@ from neural_sim.types import PinholeCamera
 @dataclass(frozen=True)
 class SceneStage(Stage[Scene]):
     """Of ``distribution`` the key holds what draws of given probabilities depend on (``drawn``): methods that relax
-    draws in different ways share all that is made from hard ones."""
+    draws in different ways share all that is made from hard ones. ``radii`` are the objects' in metres, None where
+    distances are in radii."""
 
     name: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"
@@ -29,6 +30,7 @@ class SceneStage(Stage[Scene]):
     camera: PinholeCamera
     synthesizer: Synthesizer
     drawn: Any
+    radii: tuple[float, ...] | None
     distribution: SceneDistribution = field(metadata=UNKEYED)
 
     @property
@@ -37,4 +39,5 @@ class SceneStage(Stage[Scene]):
 
     def make(self, results: Results) -> Scene:
         fields = tuple(results(stage).field for stage in self.fields)
-        return Scene(self.names, fields, self.renderer, self.camera, self.synthesizer, self.distribution)
+        made = self.renderer, self.camera, self.synthesizer, self.distribution
+        return Scene(self.names, fields, *made, radii=self.radii)

@@ -31,6 +31,6 @@ class SymmetryStage(Stage[list[list[int]]]):
         return f"symmetry of {self.object}"
 
     def make(self, results: Results) -> list[list[int]]:
-        item, renderer = self.meshes.items[self.object], self.meshes.renderer
-        groups = equivalent_bins(item, renderer, self.distribution, self.angle, self.camera)
+        item = self.meshes.subject(self.object)
+        groups = equivalent_bins(item, self.distribution, self.angle, self.camera)
         return [[b + 1 for b in group] for group in groups]

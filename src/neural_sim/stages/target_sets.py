@@ -46,9 +46,9 @@ class TargetSetsStage(Stage[TargetSets]):
         return "target sets"
 
     def make(self, results: Results) -> TargetSets:
-        meshes = self.meshes
+        objects = {name: self.meshes.subject(name) for name in self.meshes.names}
         drawn = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
-        return TargetSets(**self.target.sets(meshes.items, meshes.renderer, *drawn))
+        return TargetSets(**self.target.sets(objects, *drawn))
 
     def pack(self, value: TargetSets) -> dict[str, dict[str, Tensor]]:
         return {part.name: _packed(getattr(value, part.name)) for part in fields(TargetSets)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -38,12 +39,11 @@ class ViewsStage(Stage[PosedViews]):
         return {
             "images": to_bytes(value.images),
             "camera_to_world": value.camera_to_world.cpu(),
-            "camera": [camera.width, camera.height, camera.field_of_view],
+            "camera": list(dataclasses.astuple(camera)),
             "light_weights": None if weights is None else weights.cpu(),
         }
 
     def unpack(self, stored: Mapping[str, Any]) -> PosedViews:
-        width, height, field_of_view = stored["camera"]
-        camera = PinholeCamera(int(width), int(height), float(field_of_view))
+        camera = PinholeCamera(*stored["camera"])
         images = from_bytes(stored["images"])
         return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"])

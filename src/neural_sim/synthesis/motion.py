@@ -57,8 +57,8 @@ def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"
     def rate(name: str) -> Float[Tensor, "n 4 4"]:
         if name == "magnification":
             shrink = torch.tensor(SHRINK).to(numbers["phi"]) / drawn[name].detach()[:, None, None]
-            return cameras.orbit(**numbers) * shrink
+            return cameras.orbit(**numbers, radius=draw.radius) * shrink
         one = {**still, name: torch.ones_like(numbers[name])}
-        return torch.func.jvp(lambda moved: cameras.orbit(**moved), (numbers,), (one,))[1]
+        return torch.func.jvp(lambda moved: cameras.orbit(**moved, radius=draw.radius), (numbers,), (one,))[1]
 
     return torch.stack([rate(name) for name in names])

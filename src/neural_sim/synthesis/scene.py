@@ -84,7 +84,8 @@ class RenderedObject:
 
 @dataclass(frozen=True)
 class Scene:
-    """The objects' fields, in the order of their class labels, and how their images are made."""
+    """The objects' fields, in the order of their class labels, and how their images are made. ``radii`` are the
+    objects' in metres, where distances are."""
 
     names: tuple[str, ...]
     fields: tuple[RadianceField, ...]
@@ -92,11 +93,16 @@ class Scene:
     camera: PinholeCamera
     synthesizer: Synthesizer
     distribution: SceneDistribution
+    radii: tuple[float, ...] | None = None
+
+    def _sized(self, label: int, draw: SceneDraw) -> SceneDraw:
+        return draw if self.radii is None else replace(draw, radius=self.radii[label])
 
     def render(
         self, label: int, draw: SceneDraw, noise: SceneNoise, generator: torch.Generator
     ) -> RenderedObject:
         """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
+        draw = self._sized(label, draw)
         maps = self._maps(label, draw)
         nuisance = self._nuisance(label, len(draw), generator)
         return self._compose(label, draw, noise, maps, nuisance)
@@ -141,7 +147,9 @@ class Scene:
         return next(self.fields[label].parameters()).device
 
     def _poses(self, label: int, draw: SceneDraw) -> Float[Tensor, "n 4 4"]:
-        return orbit(draw.phi, draw.rho, draw.distance).to(self.device(label), self.dtype(label))
+        return orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius).to(
+            self.device(label), self.dtype(label)
+        )
 
     def _nuisance(self, label: int, count: int, generator: torch.Generator) -> Nuisance:
         return self.synthesizer.draw_nuisance(count, self.camera, generator, self.device(label))
@@ -194,7 +202,7 @@ class Scene:
             return self.distribution.relaxed(psi, noise, relaxed.relaxation)
 
         with torch.no_grad():
-            draw = replay(logits)
+            draw = self._sized(label, replay(logits))
         names = moved_by(replay, logits) if relaxed.tangents else ()
         moving = names or draw.weights is not None
         maps, tangents = (
@@ -227,6 +235,7 @@ class Scene:
         """
         dtype = self.dtype(label)
         draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
+        draw = self._sized(label, draw)
         nuisance = self._nuisance(label, int(scenes.max()) + 1, generator).select(scenes)
         return self._compose(label, draw, None, self._maps(label, draw), nuisance)
 

@@ -16,11 +16,11 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from neural_sim.objects.files import content_digest
-from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.rig import LightRig
+from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.near_duplicates import near_duplicates, thumbnail
@@ -117,14 +117,31 @@ class CocoTarget:
         names = [str(entry["file_name"]) for entry in self._document["images"]]
         return content_digest({"": self._file, **{name: self._folder / name for name in names}})
 
+    def camera(self) -> PinholeCamera:
+        """Of the file's entry ``camera``, see :func:`neural_sim.target.camera.camera_of_entry`.
+
+        Raises:
+            ValueError: a file without one, or photographs whose listed size is another one.
+        """
+        if "camera" not in self._document:
+            raise ValueError(
+                f"{self._file}: camera=from_target wants an entry 'camera' with width, height, fx, fy, cx, cy"
+            )
+        camera = camera_of_entry(self._document["camera"], f"{self._file}: camera")
+        size = {"width": camera.width, "height": camera.height}
+        for entry in self._entries:
+            other = {key: entry[key] for key in size if entry.get(key, size[key]) != size[key]}
+            if other:
+                raise ValueError(f"{self._file}: {entry['file_name']} has {other}, its camera {size}")
+        return camera
+
     def digest(self) -> str:
         """SHA-256 of the contents of annotations and photographs, for store keys."""
         return self._digest
 
     def sets(
         self,
-        meshes: Mapping[str, ObjectMesh],
-        renderer: MeshRenderer,
+        objects: Mapping[str, Subject],
         distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,
@@ -132,7 +149,7 @@ class CocoTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
-        photos = self._photos(list(meshes), camera.height, camera.width)
+        photos = self._photos(list(objects), camera.height, camera.width)
         pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
         groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
         val, test = split(groups, self.val_fraction, torch.Generator().manual_seed(seed))

@@ -1,4 +1,4 @@
-"""Labelled images rendered from the meshes themselves, at given scene parameters."""
+"""Labelled images rendered from the objects themselves, at given scene parameters."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.cameras import cameras_of, orbit
-from neural_sim.objects.mesh import ObjectMesh
-from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.rig import LightRig
+from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
@@ -24,8 +23,7 @@ CHUNK = 64
 
 
 def render_target(
-    objects: Sequence[ObjectMesh],
-    renderer: MeshRenderer,
+    objects: Sequence[Subject],
     draws: Sequence[SceneDraw],
     camera: PinholeCamera,
     synthesizer: Synthesizer,
@@ -45,7 +43,7 @@ def render_target(
     for label, (item, draw) in enumerate(zip(objects, draws, strict=True)):
         for start in range(0, len(draw), CHUNK):
             here = draw.select(slice(start, start + CHUNK))
-            rgb, opacity = _premultiplied(renderer, item, camera, here, rig)
+            rgb, opacity = _premultiplied(item, camera, here, rig)
             nuisance = synthesizer.draw_nuisance(len(here), camera, generator)
             parts.append(synthesizer.compose(rgb, opacity, nuisance, label, _label(here)))
     images = LabelledImages.concatenate(parts)
@@ -70,15 +68,14 @@ def _lighting(draw: SceneDraw, rig: LightRig | None) -> Lighting | None:
 
 
 def _premultiplied(
-    renderer: MeshRenderer,
-    item: ObjectMesh,
+    item: Subject,
     camera: PinholeCamera,
     draw: SceneDraw,
     rig: LightRig | None,
 ) -> tuple[Float[Tensor, "n h w 3"], Float[Tensor, "n h w"]]:
     with torch.no_grad():
-        poses = orbit(draw.phi, draw.rho, draw.distance)
+        poses = orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius)
         lighting = _lighting(draw, rig)
         taken = cameras_of(camera, draw.magnification)
-        rgba = torch.cat([renderer.render(item.mesh, own, poses[rows], lighting) for own, rows in taken])
+        rgba = torch.cat([item.render(own, poses[rows], lighting) for own, rows in taken])
     return rgba[..., :3] * rgba[..., 3:], rgba[..., 3]

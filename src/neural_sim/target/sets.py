@@ -1,16 +1,15 @@
-"""The target set of a controlled experiment: meshes rendered at the target distribution, in two disjoint parts."""
+"""The target set of a controlled experiment: objects rendered at the target distribution, in two disjoint parts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
-from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.rig import LightRig
+from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
 from neural_sim.types import LabelledImages, PinholeCamera
@@ -34,8 +33,7 @@ class RenderedTarget:
 
     def sets(
         self,
-        meshes: Mapping[str, ObjectMesh],
-        renderer: MeshRenderer,
+        objects: Mapping[str, Subject],
         distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,
@@ -43,16 +41,16 @@ class RenderedTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
-        biased, target = set(distribution.biased), distribution.psi("target", list(meshes)).float()
+        biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
+        radii = distribution.radii({name: item.radius for name, item in objects.items()})
         made = {}
         for part, name in enumerate(("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
             draws = []
-            for item, psi in zip(meshes.values(), target, strict=True):
+            for label, (item, psi) in enumerate(zip(objects.values(), target, strict=True)):
                 test_count = self.test_per_biased_object if item.name in biased else self.test_per_object
                 count = test_count if name == "test" else self.val_per_object
-                draws.append(distribution.hard(psi, distribution.draw_noise(count, generator)))
-            made[name] = render_target(
-                list(meshes.values()), renderer, draws, camera, synthesizer, generator, rig
-            )
+                drawn = distribution.hard(psi, distribution.draw_noise(count, generator))
+                draws.append(drawn if radii is None else replace(drawn, radius=radii[label]))
+            made[name] = render_target(list(objects.values()), draws, camera, synthesizer, generator, rig)
         return made

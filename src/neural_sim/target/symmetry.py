@@ -10,16 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.cameras import orbit
-from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.parameter.factor import COORDINATES, BinNoise
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
-from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.subject import Subject
 from neural_sim.types import PinholeCamera, SceneDraw
 
 
 def equivalent_bins(
-    item: ObjectMesh,
-    renderer: MeshRenderer,
+    item: Subject,
     distribution: SceneDistribution,
     factor: str,
     camera: PinholeCamera,
@@ -35,7 +33,7 @@ def equivalent_bins(
     what the factor does not draw is at the middle of its range.
     """
     count = next(f.bins for f in distribution.binned if f.name == factor)
-    views = [_views(item, renderer, distribution, factor, camera, b, samples) for b in range(count)]
+    views = [_views(item, distribution, factor, camera, b, samples) for b in range(count)]
     groups: list[list[int]] = []
     for b in range(count):
         home = next((group for group in groups if _same(views[group[0]][0], views[b], tolerance)), None)
@@ -47,8 +45,7 @@ def equivalent_bins(
 
 
 def _views(
-    item: ObjectMesh,
-    renderer: MeshRenderer,
+    item: Subject,
     distribution: SceneDistribution,
     factor: str,
     camera: PinholeCamera,
@@ -59,10 +56,11 @@ def _views(
     offsets = (torch.arange(samples) + 0.5) / samples
     other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
     turns = (0.0, 0.5) if _second_goes_round(distribution, factor) else (0.0,)
+    radius = (distribution.radii({item.name: item.radius}) or (1.0,))[0]
     made = []
     for within, second, turn in itertools.product((offsets, 1.0 - offsets), (other, 1.0 - other), turns):
         draw = _at(distribution, factor, bin_index, within, (second + turn) % 1.0)
-        rgba = renderer.render(item.mesh, camera, orbit(draw.phi, draw.rho, draw.distance))
+        rgba = item.render(camera, orbit(draw.phi, draw.rho, draw.distance, radius=radius))
         made.append(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1))
     return made
 

@@ -1,0 +1,120 @@
+"""The camera of synthesis and of rendered target images: as given, or the one that took the target's photographs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+from neural_sim.cameras import opencv_camera, resized
+from neural_sim.types import PinholeCamera
+
+
+class CameraSource(Protocol):
+    """What a configured camera is made from."""
+
+    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
+        """``image_size`` (pixels) is the side of a square image where no size is given, ``field_of_view_deg`` what is
+        taken where neither a field of view nor a focal length is; ``target`` is the run's target."""
+        ...
+
+
+@dataclass(frozen=True)
+class GivenCamera:
+    """A camera by its field of view or by its OpenCV camera matrix.
+
+    Args:
+        width, height: in pixels; null, both of them: those of a square image of the training's size.
+        field_of_view_deg: the vertical one, for square pixels and a principal point in the image's centre; null, where
+            no focal length is given: that of the objects' views.
+        fx, fy: focal lengths in pixels; ``fy`` null: square pixels.
+        cx, cy: the principal point in pixels from the centre of the upper left pixel, as OpenCV counts; null: the
+            image's centre, (width - 1) / 2 and (height - 1) / 2.
+
+    Raises:
+        ValueError: one of width and height alone, a focal length beside a field of view, ``fy``, ``cx`` or ``cy``
+            without ``fx``, a number out of its range.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    field_of_view_deg: float | None = None
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.width is None) != (self.height is None):
+            raise ValueError(f"camera: want width and height or neither, got {self.width} and {self.height}")
+        if self.fx is None and any(value is not None for value in (self.fy, self.cx, self.cy)):
+            raise ValueError(f"camera: fy, cx and cy want fx, got fy={self.fy}, cx={self.cx}, cy={self.cy}")
+        if self.fx is not None and self.field_of_view_deg is not None:
+            raise ValueError(
+                f"camera: want fx or field_of_view_deg, got {self.fx} and {self.field_of_view_deg}"
+            )
+        self.camera(64, 40.0, None)  # numbers out of their range are refused here
+
+    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
+        """See :class:`CameraSource`."""
+        width = image_size if self.width is None else self.width
+        height = image_size if self.height is None else self.height
+        if self.fx is not None:
+            fy = self.fx if self.fy is None else self.fy
+            return opencv_camera(width, height, self.fx, fy, self.cx, self.cy)
+        angle = field_of_view_deg if self.field_of_view_deg is None else self.field_of_view_deg
+        return PinholeCamera(width, height, math.radians(angle))
+
+
+@dataclass(frozen=True)
+class TargetCamera:
+    """The camera that took the target's photographs, its images scaled down to a size that the detector is for.
+
+    Args:
+        width: of the detector's images, in pixels, with the height in proportion; null: the photographs' own.
+
+    Raises:
+        ValueError: a width below 1; from :meth:`camera`, a target that knows no camera.
+    """
+
+    width: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.width is not None and self.width < 1:
+            raise ValueError(f"camera.width must be at least 1 or null, got {self.width}")
+
+    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
+        """See :class:`CameraSource`."""
+        read = getattr(target, "camera", None)
+        if not callable(read):
+            raise ValueError(
+                "camera=from_target wants a target with a camera of its own (target=coco, its file with an entry "
+                f"'camera'), got {type(target).__name__}"
+            )
+        own = cast(PinholeCamera, read())
+        if self.width is None:
+            return own
+        return resized(own, self.width, max(1, round(own.height * self.width / own.width)))
+
+
+def camera_of_entry(entry: Any, where: str) -> PinholeCamera:
+    """The camera of a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (OpenCV, pixels).
+
+    Raises:
+        ValueError: a key that is missing, unknown (photographs with distortion have to be undistorted first) or no
+            number; ``where`` says whose it is.
+    """
+    keys = ("width", "height", "fx", "fy", "cx", "cy")
+    got = entry if isinstance(entry, dict) else {}
+    wrong = sorted(
+        {*(set(got) ^ set(keys)), *(k for k in keys if k in got and type(got[k]) not in (int, float))}
+    )
+    if wrong or not isinstance(entry, dict):
+        raise ValueError(
+            f"{where}: want numbers {', '.join(keys)} (OpenCV, pixels) and nothing else, see {wrong}"
+        )
+    try:
+        sides = int(got["width"]), int(got["height"])
+        return opencv_camera(*sides, *(float(got[key]) for key in keys[2:]))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
