@@ -61,7 +61,7 @@ def test_its_settings_are_checked_like_all_others(override, message):
 def test_they_run_together(adjoint, tmp_path):
     config = composed(
         *MINE.values(), "objects.names=[can,mug]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
-        f"outer.adjoint={adjoint}", "outer.train_first=true", "progress=false",
+        f"outer.adjoint={adjoint}", "outer.steps=free", "outer.on_untrusted=keep", "progress=false",
         f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
     )  # fmt: skip
     context, others = context_of(config, tmp_path)

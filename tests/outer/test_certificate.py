@@ -195,10 +195,12 @@ def test_steps_that_were_not_trusted_are_counted():
         judge(result(residual=0.5, p_values=(0.3, 0.01))),
         judge(result(p_values=(0.3, 0.01)), on_untrusted="skip"),
     ]
-    records = [{"certificate": dataclasses.asdict(certificate)} for certificate in certificates]
+    records = [
+        {"certificate": dataclasses.asdict(certificate), "verdicts": {}} for certificate in certificates
+    ]
     assert untrusted(records) == {
         "steps": 8, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
-        "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1}, "cosines": [0.9, 0.1],
+        "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1}, "judged": 0, "undone": 0, "cosines": [0.9, 0.1],
     }  # fmt: skip
     assert untrusted([])["untrusted"] == 0
 

@@ -5,6 +5,7 @@ from torch.nn import functional as F
 from torchvision.models.detection._utils import BoxCoder
 
 from neural_sim.detector.losses import box_loss, focal_loss
+from neural_sim.detector.protocol import Best
 from neural_sim.detector.targets import IGNORED, assign_anchors
 
 
@@ -53,6 +54,14 @@ class Cells:
 
     def per_image_loss(self, trainable, features, targets):
         return self.losses_of(self.outputs(trainable, features), targets)
+
+    def best(self, outputs, per_class):
+        logits, deltas = outputs
+        anchor = logits.detach().topk(1, dim=1).indices[:, 0]  # one of each class in each image
+        image, label = (index.flatten() for index in torch.where(torch.ones_like(anchor, dtype=torch.bool)))
+        anchor = anchor.flatten()
+        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas[image, anchor], self.anchors[anchor])
+        return Best(image, label, logits[image, anchor, label], boxes)
 
     @torch.no_grad()
     def predict(self, params, images, batch_size=64):

@@ -172,7 +172,8 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """How many of the recorded steps, one for each object and factor of an iteration, were not trusted, what was done,
-    and why: doubts about all, or no signal. And every cosine that was measured."""
+    and why: doubts about all, or no signal. How many steps the next training judged, and how many it undid. And every
+    cosine that was measured."""
     held = [record["certificate"] for record in records if record["certificate"]]
     actions = [
         (action, certificate["doubts"] or ["signal"])
@@ -181,10 +182,13 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for action in by_factor.values()
     ]
     doubted = [(action, doubts) for action, doubts in actions if action != "kept"]
+    verdicts = [verdict["accepted"] for record in records for verdict in record["verdicts"].values()]
     return {
         "steps": len(actions),
         "untrusted": len(doubted),
         "actions": dict(Counter(action for action, _ in doubted)),
         "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),
+        "judged": len(verdicts),
+        "undone": verdicts.count(False),
         "cosines": [c["cosine"] for c in held if not math.isnan(c["cosine"])],
     }

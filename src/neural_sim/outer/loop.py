@@ -92,9 +92,9 @@ class OuterLoop(pl.LightningModule):
         self._counted, self._cpu = done, cpu
         number, last = len(self.records), self.records[-1]
         if certificate is None:
-            logger.info("round %d/%d val %.4f", number, self.rounds, last.validation_loss)
+            logger.info("round %d/%d val %.4f%s", number, self.rounds, last.validation_loss, _told(last))
         else:
-            logger.info(line(certificate, number, self.rounds, last.validation_loss))
+            logger.info(line(certificate, number, self.rounds, last.validation_loss) + _told(last))
         return last
 
 
@@ -110,3 +110,14 @@ def learn_psi(
         # psi and its account are a few numbers: they stay on the CPU wherever images and detector are.
         trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records)
+
+
+def _told(record: IterationRecord) -> str:
+    """What became of the steps before, for the log."""
+    named = {True: "gained", False: "undone"}
+    parts = [
+        f"{named[accepted]} {', '.join(name for name, v in record.verdicts.items() if v.accepted == accepted)}"
+        for accepted in (True, False)
+        if any(v.accepted == accepted for v in record.verdicts.values())
+    ]
+    return "; " + "; ".join(parts) if parts else ""

@@ -162,8 +162,10 @@ def _trust_line(held: Mapping[str, Any]) -> str:
     for part in ("actions", "doubts"):
         if held[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in held[part].items())
+    if held["judged"]:
+        text += f"; undone by the next training {held['undone']} of {held['judged']}"
     if held["cosines"]:
-        text += "; cosine with retrained differences " + ", ".join(f"{c:.2f}" for c in held["cosines"])
+        text += "; cosine with what outer.certify measured " + ", ".join(f"{c:.2f}" for c in held["cosines"])
     return text
 
 

@@ -111,6 +111,10 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
             found |= {f"psi/{name}/{factor}/p_value": value for factor, value in p_values.items()}
             found |= {f"psi/{name}/{factor}/trusted": float(a == "kept") for factor, a in actions.items()}
             found[f"psi/{name}/gradient_norm"] = record["gradient_norms"][i]
+        if record["scores"]:
+            found[f"psi/{name}/score"] = record["scores"][i]
+        if name in record["verdicts"]:
+            found[f"psi/{name}/accepted"] = float(record["verdicts"][name]["accepted"])
     found |= {f"psi/{key}": record[key] for key in _COUNTED}
     found |= {f"psi/{key}": certificate[key] for key in (_CERTIFIED if certificate else ())}
     return found | {f"psi/seconds_{phase}": spent for phase, spent in record["seconds"].items()}

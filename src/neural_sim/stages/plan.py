@@ -86,7 +86,8 @@ def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
     probes = 0.0
     if follows:
-        anew = 1.0 + (rounds - 1) * outer.refresh
+        derived = rounds - 1 if outer.steps == "checked" else rounds
+        anew = 1.0 + (derived - 1) * outer.refresh
         probes = anew * x.loop.gradient.probes_per_bin * sum(factor.bins for factor in factors)
     wanted = rounds * outer.images_per_object + probes
     share = max(0.0, 1.0 - rendered / wanted)
