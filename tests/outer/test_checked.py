@@ -33,6 +33,11 @@ def steps_at(psi, factors=(POSE,), labels=(0, 1), **checks):
     return CheckedSteps(Checks(**checks), 0.25, SceneDistribution(factors), NAMES, labels, psi)
 
 
+def scored(*values, images=8):
+    """Scores to which all images add alike, so that their paired differences have no error."""
+    return torch.tensor(values, dtype=torch.float64)[:, None].expand(-1, images) / images
+
+
 def proposed(steps, gradient, error, level=0.05):
     result = hypergradient(gradient, error)
     p_values = steps.observe(result)
@@ -70,7 +75,7 @@ def test_a_step_is_as_long_as_its_radius(factor, start):
 def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order_gain():
     psi = POSE.psi_of(torch.tensor([[0.7, 0.1, 0.1, 0.1], [0.25, 0.25, 0.25, 0.25]], dtype=torch.float64))
     steps = steps_at(psi, radius=0.2)
-    steps.judge(torch.zeros(2))
+    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([2, 3], psi)
     tried, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     p, before = POSE.p_of(tried), POSE.p_of(psi)
@@ -79,7 +84,7 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
         variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0
     )
     assert max(p_values["a"]["pose"], p_values["b"]["pose"]) < 1e-6
-    verdicts = steps.judge(torch.tensor([0.1, 0.1]))
+    verdicts = steps.judge(scored(0.1, 0.1))
     # The score is linear in p: the promise is its change, exactly but for the floor under p.
     for i, name in enumerate(NAMES):
         assert verdicts[name].promised == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
@@ -88,10 +93,10 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
 def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi)
-    steps.judge(torch.tensor([0.5, 0.5, 0.5]))
+    steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], psi)
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(torch.tensor([0.6, 0.45, 0.5]))
+    verdicts = steps.judge(scored(0.6, 0.45, 0.5))
     assert verdicts["a"].accepted and not verdicts["b"].accepted
     assert verdicts["b"].came == pytest.approx(-0.05)
     assert torch.equal(steps.reported, torch.stack([tried[0], psi[1]]))
@@ -99,15 +104,29 @@ def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorte
     # The next step of b sets out from where it was, and is judged against its score there.
     again, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert float(variation(POSE, again, psi)[1]) == pytest.approx(0.2, abs=1e-6)
-    assert steps.judge(torch.tensor([0.7, 0.52, 0.5]))["b"].came == pytest.approx(0.02)
+    assert steps.judge(scored(0.7, 0.52, 0.5))["b"].came == pytest.approx(0.02)
+
+
+def test_a_rise_within_the_error_of_its_images_is_not_believed():
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50
+    noise = noise - noise.mean(1, keepdim=True)
+    error = float(50**0.5 * noise[0].std())
+    for rise, kept in ((0.9 * error, False), (1.1 * error, True)):
+        steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+        steps.judge(torch.zeros(2, 50))
+        proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+        verdict = steps.judge(noise + rise / 50)["a"]
+        assert verdict.accepted == kept
+        assert verdict.error == pytest.approx(error) and verdict.came == pytest.approx(rise)
 
 
 def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_undone():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    steps.judge(torch.tensor([0.5, 0.5, 0.5]))
+    steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], steps.accepted)
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(torch.tensor([0.52, 0.51, 0.3]))
+    verdicts = steps.judge(scored(0.52, 0.51, 0.3))
     assert not any(verdict.accepted for verdict in verdicts.values())
     assert float(steps.reported.abs().max()) == 0.0
 
@@ -115,7 +134,7 @@ def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_undone():
 def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi, momentum=1.0)
-    steps.judge(torch.zeros(2))
+    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([1, 2], psi) * 0.3
     noise = torch.full_like(gradient, 0.03)
     found = []
@@ -123,24 +142,24 @@ def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
         tried, p_values = proposed(steps, gradient, noise, level=0.01)
         found.append(p_values["a"]["pose"])
         if torch.equal(tried, psi):
-            assert steps.judge(torch.zeros(2)) == {} and not steps.moved
+            assert steps.judge(scored(*[0.0] * 2)) == {} and not steps.moved
     assert found[0] > 0.01 > found[-1]
     assert not torch.equal(tried, psi)
 
 
 def test_an_object_whose_radius_is_too_small_rests():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), smallest=0.3)
-    steps.judge(torch.zeros(2))
+    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([1, 2], steps.accepted)
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    steps.judge(torch.tensor([-1.0, -1.0]))
+    steps.judge(scored(-1.0, -1.0))
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert torch.equal(tried, steps.accepted)
 
 
 def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    steps.judge(torch.zeros(2))
+    steps.judge(scored(*[0.0] * 2))
     bad = torch.full((2, 4), math.nan, dtype=torch.float64)
     tried, _ = proposed(steps, bad, bad)
     assert torch.equal(tried, steps.accepted)

@@ -252,7 +252,7 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
 def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
     module = checked_loop(scene, trust=Trust(level=None))
     falling = iter(range(10))
-    module.inner.scores = lambda: torch.full((2,), -float(next(falling)))
+    module.inner.scores = lambda: torch.full((2, 6), -float(next(falling)))
     learned = learn_psi(module, progress=False)
     assert any(record.verdicts for record in learned.records)
     assert not any(v.accepted for record in learned.records for v in record.verdicts.values())

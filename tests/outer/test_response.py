@@ -34,7 +34,7 @@ def linear(inner, scores):
 
     inner.draw = draw
     inner.train = lambda images, recording=None: 0.0
-    inner.scores = lambda: (last["p"] * scores).sum(1)
+    inner.scores = lambda: (last["p"] * scores).sum(1, keepdim=True).expand(-1, 8) / 8
     return inner
 
 
@@ -45,7 +45,7 @@ def test_it_is_what_trainings_run_by_hand_do(inner):
     def scored(p):
         psi = inner.scene.distribution.factors[0].psi_of(p)
         inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
-        return inner.scores()
+        return inner.scores().sum(1)
 
     inner.common_numbers = True
     p = inner.scene.distribution.probabilities(PSI)["pose"]

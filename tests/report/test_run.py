@@ -21,7 +21,7 @@ def results():
     record = {
         "probabilities": {"pose": uniform.tolist()}, "entropies": {"pose": [1.0, 1.0]}, "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
-        "scores": [0.4, 0.2], "verdicts": {"a": {"accepted": False, "promised": 0.1, "came": -0.01}},
+        "scores": [0.4, 0.2], "verdicts": {"a": {"accepted": False, "promised": 0.1, "came": -0.01, "error": 0.02}},
         "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9, "cpu_seconds": 0.4,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,

@@ -67,15 +67,18 @@ class SmoothAP:
 
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
-    ) -> Float[Tensor, "classes"]:
-        """Every class's AP of the detector's outputs on these images; nan for a class without boxes."""
-        found = ranked(detector, outputs, images, self.per_class)
-        return torch.stack(
-            [self.of_class(part) if part.boxes else part.logits.new_tensor(torch.nan) for part in found]
-        )
+    ) -> Float[Tensor, "classes images"]:
+        """What each image adds to every class's AP, which is the sum of a row; nan for a class without boxes."""
+        rows = []
+        for found in ranked(detector, outputs, images, self.per_class):
+            row = found.logits.new_zeros(len(images))
+            rows.append(
+                row.index_add(0, found.image, self.of_class(found)) if found.boxes else row + torch.nan
+            )
+        return torch.stack(rows)
 
-    def of_class(self, found: Ranked) -> Float[Tensor, ""]:
-        """One class's AP, the mean over :data:`THRESHOLDS`; 0 without detections.
+    def of_class(self, found: Ranked) -> Float[Tensor, "m"]:
+        """What each detection adds to one class's AP, the mean over :data:`THRESHOLDS`.
 
         Raises:
             ValueError: for a class without boxes, whose AP does not exist.
@@ -88,7 +91,8 @@ class SmoothAP:
         # A detection ranks above itself by a half; in full it is 1.
         above = above + 0.5 * (candidates[:, None] == torch.arange(len(found.box), device=above.device))
         precision = (above @ true) / above.sum(1, keepdim=True)
-        return (true[candidates] * precision).sum(0).mean() / found.boxes
+        added = (true[candidates] * precision).mean(1) / found.boxes
+        return torch.zeros_like(found.logits).index_add(0, candidates, added)
 
     def true_positives(self, found: Ranked) -> Float[Tensor, "m thresholds"]:
         """How far each detection is a true positive, at each overlap: as far as it overlaps its box, and as far as no

@@ -112,15 +112,18 @@ class CheckedSteps:
         """Whether an object has a step that is not judged yet."""
         return bool(self._moved.any())
 
-    def judge(self, scores: Float[Tensor, "classes"]) -> dict[str, Verdict]:
-        """A step is undone where its object's own score did not rise. Where no own score fell and yet the mean over all
-        classes did, steps harm each other, and all of them are undone."""
+    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
+        """A step is undone where its object's own score did not rise by more than ``errors`` standard errors, of the
+        paired differences of images. Where all own scores rose and yet the mean over all classes fell, steps harm each
+        other, and all of them are undone."""
         scores = scores.double()
         if self._reference is None:
             self._reference = scores
-        came, rest = scores - self._reference, scores[self.labels]
+        change, rest = scores - self._reference, scores[self.labels]
+        came, images = change.sum(1), change.shape[1]
         own, mean = came[self.labels], came.nanmean()
-        rose = own > 0.0
+        error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(own)
+        rose = own > self.settings.errors * error
         if bool(self._moved.any()) and bool(rose[self._moved].all()) and mean < 0.0:
             rose = torch.zeros_like(rose)
         accepted = self._moved & rose
@@ -131,9 +134,9 @@ class CheckedSteps:
         # An object whose step was undone is compared with its last training at the psi that it is back at.
         undone = self._moved & ~accepted
         reference = scores.clone()
-        reference[self.labels] = torch.where(undone, self._reference[self.labels], rest)
+        reference[self.labels] = torch.where(undone[:, None], self._reference[self.labels], rest)
         verdicts = {
-            name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]))
+            name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]), float(error[i]))
             for i, name in enumerate(self.names)
             if self._moved[i]
         }

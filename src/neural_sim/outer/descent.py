@@ -62,7 +62,7 @@ class GradientLoop(OuterLoop):
             scores = self.inner.scores()
             verdicts = self.steps.judge(scores)
         if last:
-            self.record(self.psi, images, training_loss, seconds, scores=scores, verdicts=verdicts)
+            self.record(self.psi, images, training_loss, seconds, scores=scores.sum(1), verdicts=verdicts)
             self._go_to(self.steps.reported)
             return
         with timed(seconds, "hypergradient", self.inner.device):
@@ -77,7 +77,15 @@ class GradientLoop(OuterLoop):
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
         self.record(
-            self.psi, images, training_loss, seconds, certificate, norms, _products(result), scores, verdicts
+            self.psi,
+            images,
+            training_loss,
+            seconds,
+            certificate,
+            norms,
+            _products(result),
+            scores.sum(1),
+            verdicts,
         )
         self._stopped = certificate.stopped
         psi = self.steps.next(certificate)

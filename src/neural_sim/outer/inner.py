@@ -136,6 +136,6 @@ class InnerLoop:
         with torch.no_grad():
             return float(sum(term(self.trainable) for term in self.objective.terms()))
 
-    def scores(self) -> Float[Tensor, "classes"]:
-        """How good theta is on the validation images for each class, more is better."""
+    def scores(self) -> Float[Tensor, "classes images"]:
+        """What each validation image adds to theta's score for each class, more is better."""
         return self.objective.scores(self.trainable)

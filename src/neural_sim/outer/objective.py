@@ -38,10 +38,10 @@ class Objective:
             return losses
         weight = self.smooth.loss
         weighed = [lambda params, term=term: weight * term(params) for term in losses] if weight else []
-        return [lambda params: 1.0 - self.smooth_ap(self.outputs(params)).nanmean(), *weighed]
+        return [lambda params: 1.0 - self.smooth_ap(self.outputs(params)).sum(1).nanmean(), *weighed]
 
-    def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes"]:
-        """The smooth average precision of every class; nan for a class without a box."""
+    def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
+        """What each image adds to the smooth average precision of every class; nan for a class without a box."""
         return self.smooth(self.cached.detector, outputs, self.images)
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
@@ -54,15 +54,18 @@ class Objective:
         return torch.cat(logits), torch.cat(deltas)
 
     @torch.no_grad()
-    def scores(self, params: Parameters) -> Float[Tensor, "classes"]:
-        """How good the detector is for each class, more is better: L_val's part of it with the other sign, without the
-        one. Losses are those of the images with a box of the class; nan for a class without one. On the CPU."""
+    def scores(self, params: Parameters) -> Float[Tensor, "classes images"]:
+        """What each image adds to the score of every class, more is better. A class's score, the sum of its row, is
+        L_val's part of it with the other sign, without the one; losses are the mean over images with a box of the
+        class. nan for a class without one. On the CPU."""
         outputs, labels = self.outputs(params), self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()
-        own = [losses[(labels == number).any(1)].mean() for number in range(outputs[0].shape[-1])]
+        classes = torch.arange(outputs[0].shape[-1])
+        own = (labels == classes[:, None, None]).any(-1).to(losses)
+        parts = -own * losses / own.sum(1, keepdim=True)
         if self.kind == "loss":
-            return -torch.stack(own)
-        return self.smooth_ap(outputs).cpu() - self.smooth.loss * torch.stack(own)
+            return parts
+        return self.smooth_ap(outputs).cpu() + self.smooth.loss * parts
 
     def double(self) -> Objective:
         """The same in float64."""

@@ -128,4 +128,4 @@ def _moved(
 def _scores(inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "classes"]:
     """Of a detector trained on images of ``psi``."""
     inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
-    return inner.scores()
+    return inner.scores().sum(1)

@@ -66,6 +66,7 @@ class Checks:
         radius: of each object's first step by a factor, in total variation (of lights: half the absolute change of the
             weights).
         largest, smallest: radii; under ``smallest`` an object rests.
+        errors: standard errors by which an object's own score must rise for its step to be kept.
         grow, shrink: what an accepted and an undone step multiply the radius by.
         momentum: what an iteration's derivative counts in the next one's average, before noise is weighed.
         max_step: the most by which a step changes a logit (or a weight).
@@ -77,6 +78,7 @@ class Checks:
     radius: float = 0.5
     largest: float = 0.7
     smallest: float = 0.05
+    errors: float = 1.0
     grow: float = 1.3
     shrink: float = 0.4
     momentum: float = 0.5
@@ -89,7 +91,7 @@ class Checks:
                 f"{where}: want 0 < smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
             )
         at_least(where, 1, grow=self.grow)
-        at_least(where, 0, momentum=self.momentum)
+        at_least(where, 0, momentum=self.momentum, errors=self.errors)
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
             raise ValueError(
                 f"{where}: want shrink in (0, 1), momentum in [0, 1] and max_step above 0, got {self.shrink}, "

@@ -28,19 +28,22 @@ class Verdict:
     """What became of an object's step, seen from the next iteration's training.
 
     ``promised`` is the fall of L_val that the hypergradient foretold to first order, ``came`` the rise of the object's
-    own score. A step that was not ``accepted`` was undone.
+    own score, ``error`` the standard error of that rise by validation image. A step that was not ``accepted`` was
+    undone.
     """
 
     accepted: bool
     promised: float
     came: float
+    error: float
 
 
 class Steps(Protocol):
     """Moves psi [objects, K] of the objects that are learned."""
 
-    def judge(self, scores: Float[Tensor, "classes"]) -> dict[str, Verdict]:
-        """What the training on the last step's psi says of it. ``scores`` are those of all classes, more is better."""
+    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
+        """What the training on the last step's psi says of it. ``scores`` are what each validation image adds to the
+        score of each class, more is better."""
         ...
 
     def observe(self, result: Hypergradient) -> PValues:
@@ -81,7 +84,7 @@ class FreeSteps:
         self._gradient = self._error = torch.zeros_like(psi)
         self._done, self.moved = 0, True
 
-    def judge(self, scores: Float[Tensor, "classes"]) -> dict[str, Verdict]:
+    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
         return {}
 
     def observe(self, result: Hypergradient) -> PValues:
