@@ -56,7 +56,7 @@ def field_of(context: Context, name: str) -> FieldStage:
 def fields(context: Context, name: str) -> list[Row]:
     """A field of one object as configured, with rays from every pixel, and with a colour head that sees directions."""
     stage, device = field_of(context, name), torch.device("cpu")
-    views, recipe, held_out = context.results(stage.views), stage.recipe, stage.views.settings.held_out
+    views, recipe, held_out = context.results(stage.views), stage.recipe, stage.views.held_out
 
     def fit(changed: Any) -> dict[str, float]:
         return changed.fit(views, held_out, device)[1][-1]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from captures import capture
 from documented import PAGES, ROOT
 from PIL import Image
 
@@ -106,11 +107,20 @@ def backgrounds(root: Path) -> Path:
     return root
 
 
+def captures(root: Path) -> Path:
+    """Twelve photographs of each of two of the embedded objects, with masks."""
+    root.mkdir(parents=True)
+    for name, kind in (("can", "transforms"), ("mug", "colmap_text")):
+        capture(root, name, count=12, kind=kind, suffix=".jpg")
+    return root
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycb": ycb,
     "../shared/ycb": ycb,
     "/data/models": bop,
     "/data/meshes": meshes,
+    "/data/captures": captures,
     "/data/val.json": coco,
     "/data/backgrounds": backgrounds,
 }

@@ -51,24 +51,30 @@ class PosedViews:
     ``images`` are RGBA with straight (not premultiplied) alpha in [0, 1]; ``camera_to_world`` follows OpenGL
     (x right, y up, looking along -z) in the object's normalised frame (unit sphere round the origin).
     ``light_weights`` are each view's weights over the anchor lights; None: one light for all views, or lights that
-    nobody knows (photographs).
+    nobody knows (photographs). ``known`` are the pixels that a photograph shows, None: all; others have alpha 0, which
+    says nothing.
     """
 
     images: Float[Tensor, "views height width 4"]
     camera_to_world: Float[Tensor, "views 4 4"]
     camera: PinholeCamera
     light_weights: Float[Tensor, "views k"] | None = None
+    known: Bool[Tensor, "views height width"] | None = None
 
     def __len__(self) -> int:
         return self.images.shape[0]
 
     def select(self, index: Tensor) -> PosedViews:
         weights = None if self.light_weights is None else self.light_weights[index]
-        return PosedViews(self.images[index], self.camera_to_world[index], self.camera, weights)
+        known = None if self.known is None else self.known[index]
+        return PosedViews(self.images[index], self.camera_to_world[index], self.camera, weights, known)
 
     def to(self, device: torch.device) -> PosedViews:
         weights = None if self.light_weights is None else self.light_weights.to(device)
-        return PosedViews(self.images.to(device), self.camera_to_world.to(device), self.camera, weights)
+        known = None if self.known is None else self.known.to(device)
+        return PosedViews(
+            self.images.to(device), self.camera_to_world.to(device), self.camera, weights, known
+        )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from neural_sim.field.grid import GridField
 from neural_sim.field.objective import Fitting, Rendering, expected_error
 from neural_sim.field.quadrature import composite
 from neural_sim.field.samples import sample_points
-from neural_sim.field.scores import compare
+from neural_sim.field.scores import compare, where_known
 from neural_sim.field.transient import TransientHead, composite_both, uncertain_error
 from neural_sim.types import PosedViews
 
@@ -133,5 +133,5 @@ class AppearanceFitting(Fitting):
             codes = views.light_weights @ self.field.anchors
             return compare(render_lit(self.field, codes, views, termination, rays_per_chunk), views.images)
         codes = fit_codes(self.field, views, termination)
-        rendered = render_lit(self.field, codes, views, termination, rays_per_chunk)
+        rendered = where_known(render_lit(self.field, codes, views, termination, rays_per_chunk), views)
         return compare(right_half(rendered), right_half(views.images))

@@ -57,6 +57,8 @@ def fit_codes(
         positions, directions = sample_points(rays, samples)
         raw = field.grid.raw(positions)
         weights = render_weights(field.grid.density(raw), samples)[:, None]
+        if views.known is not None:
+            weights = weights * views.known[:, :, :half].reshape(-1).index_select(0, samples.ray)[:, None]
         opacity = sum_rays(weights, samples)[:, 0]
     view = samples.ray // (len(images) // len(views))
     codes = field.anchors.detach().mean(0).repeat(len(views), 1).requires_grad_()

@@ -63,7 +63,8 @@ def _inside_all(
     """Whether every view that sees a centre finds object within ``radius`` of it; unseen centres stay."""
     camera, reach = views.camera, pixels_across(views, radius)
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
-    mask = (views.images[..., 3] > alpha_threshold).to(centres.dtype)[:, None]
+    mask = views.images[..., 3] > alpha_threshold
+    mask = (mask if views.known is None else mask | ~views.known).to(centres.dtype)[:, None]
     mask = functional.max_pool2d(mask, (2 * reach + 1, 1), 1, (reach, 0))
     mask = functional.max_pool2d(mask, (1, 2 * reach + 1), 1, (0, reach))[:, 0] > 0
     inside = torch.ones(len(centres), dtype=torch.bool, device=centres.device)

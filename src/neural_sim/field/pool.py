@@ -45,6 +45,8 @@ def build_pool(views: PosedViews, border: int | None, generator: torch.Generator
     elif border > 0:
         near = functional.max_pool2d(near, (2 * border + 1, 1), 1, (border, 0))
         near = functional.max_pool2d(near, (1, 2 * border + 1), 1, (0, border))
+    if views.known is not None:
+        near = near * views.known[:, None]
     index = near.flatten().nonzero()[:, 0]
     if not len(index):
         raise ValueError(f"build_pool: the alpha of all {len(views)} views is zero, want silhouettes")

@@ -23,7 +23,14 @@ def score_views(
 ) -> dict[str, float]:
     """``compare`` of the field's images with these views."""
     rendered = render_views(field, views.camera, views.camera_to_world, termination, rays_per_chunk)
-    return compare(rendered, views.images)
+    return compare(where_known(rendered, views), views.images)
+
+
+def where_known(
+    premultiplied: Float[Tensor, "views height width 4"], views: PosedViews
+) -> Float[Tensor, "views height width 4"]:
+    """Renders without the pixels that these views do not show."""
+    return premultiplied if views.known is None else premultiplied * views.known[..., None]
 
 
 def compare(

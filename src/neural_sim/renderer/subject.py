@@ -61,6 +61,22 @@ class MeshSubject:
 
 
 @dataclass(frozen=True)
+class Unseen:
+    """An object by its name, for targets that render none."""
+
+    name: str
+    radius: float | None = None
+
+    def render(
+        self,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "n 4 4"],
+        lighting: Lighting | None = None,
+    ) -> Float[Tensor, "n h w 4"]:
+        raise ValueError(f"{self.name}: there is nothing to render here, its field is not asked for")
+
+
+@dataclass(frozen=True)
 class FieldSubject:
     """A field of an object that there is no mesh of, under the light that its views saw."""
 

@@ -11,6 +11,7 @@ from neural_sim.detector.protocol import Detector
 from neural_sim.detector.training import Training
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
+from neural_sim.objects.photos import Photos
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
@@ -40,7 +41,7 @@ class Imaging:
     """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target. ``camera``
     is that of synthesised and of rendered target images."""
 
-    objects: ObjectSource
+    objects: ObjectSource | Photos
     views: Views
     field: FieldRecipe
     renderer: NerfRenderer

@@ -39,8 +39,7 @@ class FieldStage(Stage[FittedField]):
         return f"field of {self.views.object}"
 
     def make(self, results: Results) -> FittedField:
-        held_out = self.views.settings.held_out
-        return FittedField(*self.recipe.fit(results(self.views), held_out, self.device))
+        return FittedField(*self.recipe.fit(results(self.views), self.views.held_out, self.device))
 
     def pack(self, value: FittedField) -> dict[str, Any]:
         return {"field": field_state(value.field), "history": value.history}

@@ -14,12 +14,14 @@ from torch import Tensor
 
 from neural_sim.baseline.base import HypergradientLoop
 from neural_sim.devices import device_of
+from neural_sim.objects.photos import Photos
 from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.stages.captures import Captures, PhotoViewsStage
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
-from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.symmetry import SymmetryStage
@@ -50,14 +52,22 @@ class Graph:
             )
 
     @cached_property
-    def meshes(self) -> Meshes:
-        imaging = self.experiment.imaging
-        return Meshes(imaging.objects, imaging.views.backend, imaging.views.supersample)
+    def objects(self) -> Objects:
+        source, views = self.experiment.imaging.objects, self.experiment.imaging.views
+        return (
+            Captures(source)
+            if isinstance(source, Photos)
+            else Meshes(source, views.backend, views.supersample)
+        )
+
+    def _seen_as(self, *fields: FieldStage) -> tuple[FieldStage, ...]:
+        """The fields, where objects have no meshes."""
+        return fields if isinstance(self.objects, Captures) else ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the objects, in the order of their class labels."""
-        return self.meshes.names
+        return self.objects.names
 
     @cached_property
     def device(self) -> torch.device:
@@ -72,14 +82,15 @@ class Graph:
     def radii(self) -> tuple[float, ...] | None:
         """Of the objects in metres, where distances are; objects are not read where these are in radii."""
         distribution = self.experiment.imaging.distribution
-        return None if distribution.distance_unit == "radii" else distribution.radii(self.meshes.radii)
+        return None if distribution.distance_unit == "radii" else distribution.radii(self.objects.radii)
 
     # --- images ---
 
     @cached_property
     def views(self) -> tuple[ViewsStage, ...]:
-        digests, settings = self.meshes.digests, self.experiment.imaging.views
-        return tuple(ViewsStage(name, digests[name], settings, self.meshes) for name in self.names)
+        digests, settings = self.objects.digests, self.experiment.imaging.views
+        kind = PhotoViewsStage if isinstance(self.objects, Captures) else ViewsStage
+        return tuple(kind(name, digests[name], settings, self.objects) for name in self.names)
 
     @cached_property
     def fields(self) -> tuple[FieldStage, ...]:
@@ -97,17 +108,19 @@ class Graph:
     @cached_property
     def targets(self) -> TargetSetsStage:
         imaging = self.experiment.imaging
+        rendered = self.fields if getattr(imaging.target, "renders", True) else ()
         return TargetSetsStage(
-            imaging.target, self.meshes.digests, imaging.distribution, imaging.synthesis, self.camera,
-            imaging.views.rig, self.experiment.run.seed, self.meshes,
+            imaging.target, self.objects.digests, imaging.distribution, imaging.synthesis, self.camera,
+            imaging.views.rig, self.experiment.run.seed, self._seen_as(*rendered), self.objects,
         )  # fmt: skip
 
     def symmetry(self, name: str, angle: str) -> SymmetryStage:
         """Of an object's bins of an angle."""
         imaging = self.experiment.imaging
         camera = imaging.views.camera(48)
+        fields = self._seen_as(self.fields[self.names.index(name)])
         return SymmetryStage(
-            name, self.meshes.digests[name], angle, imaging.distribution, camera, self.meshes
+            name, self.objects.digests[name], angle, imaging.distribution, camera, fields, self.objects
         )
 
     # --- psi and detectors ---

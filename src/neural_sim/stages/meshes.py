@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, Protocol
 
+from neural_sim.field.base import RadianceField
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.renderer.base import MeshRenderer
-from neural_sim.renderer.subject import MeshSubject
+from neural_sim.renderer.subject import MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
 
 
@@ -22,6 +23,18 @@ class ObjectSource(Protocol):
         ...
 
     def load(self) -> list[ObjectMesh]: ...
+
+
+class Objects(Protocol):
+    """The objects of a run by name, of meshes or of photographs. ``radii`` are in metres, None where unknown."""
+
+    @cached_property
+    def names(self) -> tuple[str, ...]: ...
+    @cached_property
+    def digests(self) -> dict[str, str]: ...
+    @cached_property
+    def radii(self) -> dict[str, float | None]: ...
+    def subject(self, name: str, field: RadianceField | None = None) -> Subject: ...
 
 
 @dataclass(frozen=True)
@@ -50,8 +63,8 @@ class Meshes:
         known = getattr(self.source, "metric", True)
         return {name: item.radius if known else None for name, item in self.items.items()}
 
-    def subject(self, name: str) -> MeshSubject:
-        """An object as target sets see it."""
+    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
+        """An object as target sets see it: its mesh, whatever its field."""
         return MeshSubject(self.items[name], self.renderer, self.radii[name])
 
     @cached_property

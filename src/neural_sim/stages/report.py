@@ -94,4 +94,4 @@ def _identity(context: Context) -> dict[str, Any]:
     scored, learned = graph.scores(graph.psi("initial"), "initial"), graph.learned
     code = {"scoring": scored.description["code"], "method": learned.description["code"]}
     test = context.results(graph.targets).test
-    return identity(context.experiment.config, {"objects": graph.meshes.digests, **read}, code, test)
+    return identity(context.experiment.config, {"objects": graph.objects.digests, **read}, code, test)

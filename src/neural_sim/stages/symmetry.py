@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.meshes import Objects
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import PinholeCamera
@@ -14,7 +15,8 @@ from neural_sim.types import PinholeCamera
 
 @dataclass(frozen=True)
 class SymmetryStage(Stage[list[list[int]]]):
-    """Groups of bins, numbered from 1, that look the same; ``content`` is the digest of the object's mesh."""
+    """Groups of bins, numbered from 1, that look the same; ``content`` is the digest of the object. ``fields`` has the
+    field of an object that there is no mesh of."""
 
     name: ClassVar[str] = "report"
     kind: ClassVar[str] = "symmetry"
@@ -24,13 +26,14 @@ class SymmetryStage(Stage[list[list[int]]]):
     angle: str
     distribution: SceneDistribution
     camera: PinholeCamera
-    meshes: Meshes = field(metadata=UNKEYED)
+    fields: tuple[FieldStage, ...]
+    objects: Objects = field(metadata=UNKEYED)
 
     @property
     def title(self) -> str:
         return f"symmetry of {self.object}"
 
     def make(self, results: Results) -> list[list[int]]:
-        item = self.meshes.subject(self.object)
+        item = self.objects.subject(self.object, *(results(stage).field for stage in self.fields))
         groups = equivalent_bins(item, self.distribution, self.angle, self.camera)
         return [[b + 1 for b in group] for group in groups]

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
-from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.meshes import Objects
 from neural_sim.stages.pixels import from_bytes, to_bytes
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.synthesis.training_set import Synthesizer
@@ -27,7 +28,8 @@ class TargetSets:
 
 @dataclass(frozen=True)
 class TargetSetsStage(Stage[TargetSets]):
-    """The sets of a configured target; ``contents`` are the digests of the objects' meshes by name."""
+    """The sets of a configured target; ``contents`` are the digests of the objects by name. ``fields`` are those of
+    objects that there are no meshes of, where the target renders them."""
 
     name: ClassVar[str] = "target_sets"
     kind: ClassVar[str] = "target"
@@ -39,14 +41,16 @@ class TargetSetsStage(Stage[TargetSets]):
     camera: PinholeCamera
     rig: LightRig | None
     seed: int
-    meshes: Meshes = field(metadata=UNKEYED)
+    fields: tuple[FieldStage, ...]
+    objects: Objects = field(metadata=UNKEYED)
 
     @property
     def title(self) -> str:
         return "target sets"
 
     def make(self, results: Results) -> TargetSets:
-        objects = {name: self.meshes.subject(name) for name in self.meshes.names}
+        fields = {stage.views.object: results(stage).field for stage in self.fields}
+        objects = {name: self.objects.subject(name, fields.get(name)) for name in self.objects.names}
         drawn = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
         return TargetSets(**self.target.sets(objects, *drawn))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from neural_sim.renderer.views import Views
-from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.pixels import from_bytes, to_bytes
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.types import PinholeCamera, PosedViews
@@ -25,14 +25,21 @@ class ViewsStage(Stage[PosedViews]):
     object: str
     content: str
     settings: Views
-    meshes: Meshes = field(metadata=UNKEYED)
+    objects: Objects = field(metadata=UNKEYED)
 
     @property
     def title(self) -> str:
         return f"views of {self.object}"
 
+    @property
+    def held_out(self) -> int:
+        """How many of the views, the last, only score the field."""
+        return self.settings.held_out
+
     def make(self, results: Results) -> PosedViews:
-        return self.settings.render(self.meshes.renderer, self.meshes.items[self.object])
+        if not isinstance(self.objects, Meshes):
+            raise TypeError(f"ViewsStage: want Meshes, got {type(self.objects).__name__}")
+        return self.settings.render(self.objects.renderer, self.objects.items[self.object])
 
     def pack(self, value: PosedViews) -> dict[str, Any]:
         camera, weights = value.camera, value.light_weights
@@ -41,9 +48,10 @@ class ViewsStage(Stage[PosedViews]):
             "camera_to_world": value.camera_to_world.cpu(),
             "camera": list(dataclasses.astuple(camera)),
             "light_weights": None if weights is None else weights.cpu(),
+            "known": None if value.known is None else value.known.cpu(),
         }
 
     def unpack(self, stored: Mapping[str, Any]) -> PosedViews:
         camera = PinholeCamera(*stored["camera"])
         images = from_bytes(stored["images"])
-        return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"])
+        return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"], stored["known"])

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from PIL import Image, UnidentifiedImageError
@@ -70,6 +70,7 @@ class CocoTarget:
             ``split_by`` does not put into two or more groups.
     """
 
+    renders: ClassVar[bool] = False  # of the objects it takes the names alone
     annotations: str | Path
     images: str | Path | None = None
     categories: Mapping[str, str | None] | None = None

@@ -1,0 +1,143 @@
+"""Photographs of one object with their cameras, as a capture's files say them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+ROTATION_TOLERANCE = 1e-3
+"""How far R R^T may be from the identity: files round to six digits, and pose optimisers drift."""
+WIDEST = 3.0
+"""Tangent of the largest angle off the axis that a perspective lens is asked about."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera with OpenCV's distortion.
+
+    All in pixels, the principal point from the image's upper left corner (the first pixel's centre is (0.5, 0.5), as
+    COLMAP and nerfstudio count). With x, y on the plane at distance 1 and r its radius, x is scaled by
+    (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then moved by the ``tangential`` p1 and p2.
+    ``fisheye``: r is first replaced by the angle off the axis, and there is nothing tangential.
+
+    Raises:
+        ValueError: a size or a focal length that is not positive, or a number that is not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, ...] = ()
+    divisor: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.radial, *self.divisor, *self.tangential)
+        if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all():
+            raise ValueError(f"want a size of pixels and finite numbers, got {self}")
+        if not (self.fx > 0.0 and self.fy > 0.0):
+            raise ValueError(f"want positive focal lengths, got {self.fx} and {self.fy}")
+
+    def project(self, local: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Pixels (x, y) of points in the camera's OpenGL frame, and which of them the lens can see.
+
+        A point behind the camera is not seen, nor one so far off the axis that the distortion's polynomial has turned
+        back on itself there.
+        """
+        depth = -local[..., 2]
+        ahead = depth > 1e-9
+        plane = torch.stack([local[..., 0], -local[..., 1]], -1) / depth.clamp_min(1e-9)[..., None]
+        radius = plane.norm(dim=-1)
+        along = torch.atan(radius) if self.fisheye else radius
+        seen = ahead & (along < self._reach())
+        ratio = torch.where(radius > 1e-12, along / radius.clamp_min(1e-12), torch.ones_like(radius))
+        plane = plane * (ratio * self._scale(along.square()))[..., None]
+        if not self.fisheye and any(self.tangential):
+            x, y = (
+                torch.stack([local[..., 0], -local[..., 1]], -1) / depth.clamp_min(1e-9)[..., None]
+            ).unbind(-1)
+            (p1, p2), square = self.tangential, x * x + y * y
+            moved = (
+                2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+                p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
+            )
+            plane = plane + torch.stack(moved, -1)
+        focal = plane.new_tensor([self.fx, self.fy])
+        return plane * focal + plane.new_tensor([self.cx, self.cy]), seen
+
+    def _scale(self, square: Tensor) -> Tensor:
+        return _polynomial(self.radial, square) / _polynomial(self.divisor, square)
+
+    def _reach(self) -> float:
+        """The radius (or angle) up to which the distortion only ever moves points outwards."""
+        if not (any(self.radial) or any(self.divisor)):
+            return float("inf") if not self.fisheye else 0.5 * np.pi
+        at = torch.linspace(0.0, 0.5 * np.pi if self.fisheye else WIDEST, 4001, dtype=torch.float64)
+        rising = (at * self._scale(at.square())).diff() > 0.0
+        return float(at[-1] if rising.all() else at[int((~rising).int().argmax())])
+
+
+def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
+    total = torch.zeros_like(square)
+    for coefficient in reversed(coefficients):
+        total = (total + coefficient) * square
+    return 1.0 + total
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph. ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and
+    unit. ``mask`` is an image of its own; ``test`` frames are kept from training by the capture itself."""
+
+    image: Path
+    camera_to_world: Float[np.ndarray, "4 4"]
+    lens: Lens
+    mask: Path | None = None
+    test: bool = False
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The photographs of an object; ``source`` is the file or folder that says their cameras, ``files`` all that was
+    read for them. ``up`` is what the source says of the world's up, None if nothing."""
+
+    name: str
+    frames: tuple[Frame, ...]
+    source: Path
+    files: tuple[Path, ...]
+    up: tuple[float, float, float] | None = None
+
+
+def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
+    """A camera-to-world matrix of 3 or 4 rows.
+
+    Raises:
+        ValueError: another shape, numbers that are none or not finite, or a rotation that is none.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: want a matrix of 4 x 4 numbers, got {matrix!r}") from error
+    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+        raise ValueError(
+            f"{where}: want a matrix of 4 x 4 finite numbers, got shape {pose.shape}: {matrix!r}"
+        )
+    rotation = pose[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise ValueError(
+            f"{where}: its first three rows and columns are no rotation (R R^T is {error:.2g} from the identity, "
+            f"determinant {np.linalg.det(rotation):.3g})"
+        )
+    whole = np.eye(4)
+    whole[:3] = pose[:3]
+    return whole

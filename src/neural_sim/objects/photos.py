@@ -1,0 +1,158 @@
+"""Photographs of objects: a folder an object, with ``transforms.json`` or a COLMAP sparse model."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from neural_sim.objects.capture import Capture, Frame
+from neural_sim.objects.colmap import model_folder, read_colmap
+from neural_sim.objects.files import choose, content_digest, folder_of
+from neural_sim.objects.pictures import Masks, Pictures, mask_of
+from neural_sim.objects.placing import AXES, Placement, place
+from neural_sim.objects.resampling import pixels_per_pixel, resample
+from neural_sim.objects.transforms_json import has_transforms, read_transforms
+from neural_sim.types import PosedViews
+
+_log = logging.getLogger(__name__)
+
+Up = str | list[float] | None
+
+
+class Photos:
+    """Captures of a folder, all of them or those named; an object's name is its folder's.
+
+    Args:
+        root: the folder of the objects' folders.
+        names: which of them; null: all.
+        masks: where the objects' pixels are said, see :class:`Pictures`.
+        up: of the world in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by object's
+            name; null: what the capture's file says, else the mean of the cameras' own.
+        size: the diameter of the object's sphere in metres, or a mapping by object's name; null: unknown, so that
+            distances are in object radii.
+
+    Raises:
+        ValueError: no such folder, one without captures, an unknown name, an up or a size that is none; from a capture
+            whatever its reader refuses.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        names: list[str] | None = None,
+        masks: Masks = "auto",
+        up: Up | Mapping[str, Up] = None,
+        size: float | Mapping[str, float] | None = None,
+    ) -> None:
+        self.root = folder_of(root)
+        found = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
+        if not found:
+            raise ValueError(
+                f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
+            )
+        self._folders = {name: found[name] for name in choose(found, names, {}, str(self.root))}
+        self.masks: Masks = masks
+        self.up, self.size = up, size
+        for name in self._folders:
+            self._up(name)
+            self.radius(name)
+        _ = self.captures  # what is wrong in one is said before anything is made
+
+    def names(self) -> list[str]:
+        return list(self._folders)
+
+    @cached_property
+    def captures(self) -> dict[str, Capture]:
+        """What the files say, by object; photographs are not read."""
+        return {
+            name: (read_transforms if has_transforms(folder) else read_colmap)(folder, name)
+            for name, folder in self._folders.items()
+        }
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each capture's files, masks included, and of the options that apply to it."""
+        return {name: self._digest(name) for name in self._folders}
+
+    def radius(self, name: str) -> float | None:
+        """Of an object's sphere in metres, None where nobody said it."""
+        size = self.size.get(name) if isinstance(self.size, Mapping) else self.size
+        if size is None:
+            return None
+        if type(size) not in (int, float) or not 0.0 < size < float("inf"):
+            raise ValueError(f"objects.size: want metres above 0 for {name}, got {size!r}")
+        return 0.5 * float(size)
+
+    def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
+        """At most ``count`` frames to train on and ``held_out`` that score, evenly spread.
+
+        Those that score are the capture's own test frames where it has some, else an eighth of all at most.
+
+        Raises:
+            ValueError: fewer than two frames to train on.
+        """
+        frames = self.captures[name].frames
+        test = [frame for frame in frames if frame.test]
+        train = [frame for frame in frames if not frame.test]
+        if not test:
+            test = _spread(train, min(held_out, max(1, len(train) // 8)))
+            train = [frame for frame in train if frame not in test]
+        if len(train) < 2:
+            raise ValueError(
+                f"{self.captures[name].source}: want at least 2 frames to train on, got {len(train)}"
+            )
+        return _spread(train, count), _spread(test, held_out)
+
+    def placement(self, name: str) -> Placement:
+        """Where an object stands in its capture's frame."""
+        return place(Pictures(self.captures[name], self.masks), self._up(name))
+
+    def views(self, name: str, count: int, held_out: int, image_size: int) -> PosedViews:
+        """Views of an object, those held out last, see :meth:`split` and :func:`resampling.resample`."""
+        train, test = self.split(name, count, held_out)
+        pictures = Pictures(self.captures[name], self.masks)
+        views = resample(pictures, [*train, *test], self.placement(name), image_size)
+        finest = max(pixels_per_pixel(frame, views.camera) for frame in train)
+        _log.info(
+            "%s: %d photographs train and %d score; a pixel of views.image_size=%d covers up to %.1f of theirs a side",
+            name, len(train), len(test), image_size, finest,
+        )  # fmt: skip
+        return views
+
+    def _up(self, name: str) -> tuple[float, float, float] | None:
+        up: Any = self.up.get(name) if isinstance(self.up, Mapping) else self.up
+        if up is None:
+            return None
+        if isinstance(up, str) and up in AXES:
+            up = AXES[up]
+        numbers = isinstance(up, (list, tuple)) and len(up) == 3 and all(type(x) in (int, float) for x in up)
+        if not numbers or not any(up):
+            raise ValueError(
+                f"objects.up: want one of {', '.join(AXES)} or three numbers for {name}, got {up!r}"
+            )
+        return float(up[0]), float(up[1]), float(up[2])
+
+    def _digest(self, name: str) -> str:
+        capture, folder = self.captures[name], self._folders[name]
+        masks = (mask_of(frame, capture.source) for frame in capture.frames)
+        files = dict.fromkeys([*capture.files, *(path for path in masks if path is not None)])
+        listed = {
+            str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path
+            for path in files
+        }
+        options = f"{self.masks} {self._up(name)} "
+        return content_digest({options: Path(), **listed})
+
+
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds photographs with their cameras."""
+    return has_transforms(folder) or model_folder(folder) is not None
+
+
+def _spread(frames: list[Frame], count: int) -> list[Frame]:
+    """``count`` of the frames, evenly spread, or all of fewer."""
+    if count >= len(frames):
+        return list(frames)
+    return [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]

@@ -1,0 +1,88 @@
+"""The pixels of a capture's photographs: colour, and which of them show the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from neural_sim.objects.capture import Capture, Frame
+
+Masks = Literal["auto", "alpha", "files"]
+FOLDER = "masks"
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Reads the photographs of a capture.
+
+    ``masks``: where an object's pixels are said. ``files``: a frame's own ``mask_path``, or an image of its name in the
+    folder ``masks`` beside the images or beside the capture's file; ``alpha``: the images' alpha channel; ``auto``: the
+    first of these that a frame has.
+
+    Raises:
+        ValueError: another choice; from :meth:`rgba`, a frame without a mask, a mask of another size.
+    """
+
+    capture: Capture
+    masks: Masks = "auto"
+
+    def __post_init__(self) -> None:
+        if self.masks not in get_args(Masks):
+            raise ValueError(f"objects.masks must be one of {get_args(Masks)}, got {self.masks!r}")
+
+    def rgba(self, frame: Frame) -> Float[Tensor, "h w 4"]:
+        """Straight alpha, float32 in [0, 1]."""
+        picture = _open(frame.image)
+        file = mask_of(frame, self.capture.source) if self.masks != "alpha" else None
+        if file is not None:
+            mask = _open(file)
+            if mask.size != picture.size:
+                raise ValueError(
+                    f"{file}: the mask has {mask.size[0]} x {mask.size[1]} pixels, its image {frame.image} "
+                    f"{picture.size[0]} x {picture.size[1]}"
+                )
+            alpha = _values(mask.getchannel("A") if mask.mode in ("LA", "RGBA") else mask.convert("L"))[
+                ..., None
+            ]
+        elif self.masks != "files" and picture.mode in ("RGBA", "LA", "PA"):
+            alpha = _values(picture.convert("RGBA").getchannel("A"))[..., None]
+        else:
+            raise ValueError(
+                f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel, a "
+                f"mask_path, or a mask of its name in a folder {FOLDER!r}"
+            )
+        return torch.cat([_values(picture.convert("RGB")), alpha], -1)
+
+
+def mask_of(frame: Frame, source: Path) -> Path | None:
+    """The file of a frame's mask, None if there is none. COLMAP names it ``image.jpg.png``, others ``image.png``."""
+    if frame.mask is not None:
+        return frame.mask
+    image = frame.image
+    root = source if source.is_dir() else source.parent
+    homes = dict.fromkeys([image.parent / FOLDER, image.parent.parent / FOLDER, root / FOLDER])
+    for home in homes:
+        for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
+            if (home / name).is_file():
+                return home / name
+    return None
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path}: not a readable image ({error})") from error
+
+
+def _values(image: Image.Image) -> Float[Tensor, "h w *c"]:
+    return torch.from_numpy(np.asarray(image, dtype=np.float32) / 255.0)

@@ -1,0 +1,180 @@
+"""Where an object stands in its capture's frame: which way is up, its centre, its radius."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from neural_sim.objects.capture import Capture, Frame, Lens
+from neural_sim.objects.pictures import Pictures
+
+_log = logging.getLogger(__name__)
+
+AXES = {
+    sign + axis: tuple((1.0 if sign == "+" else -1.0) if a == axis else 0.0 for a in "xyz")
+    for sign, axis in itertools.product("+-", "xyz")
+}
+SMALL = 256
+"""Pixels along the longer side of the silhouettes that are carved with."""
+CELLS = 48
+DISSENT = 0.05
+"""Share of the views that may see no object at a cell that stays: poses and masks of photographs are not exact."""
+SEEN_BY = 0.5
+"""Share of the views that must see a cell for it to stay: what few see lies at the edges of their photographs."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """``to_object`` takes points of the capture's frame to the object's: +z up, in the unit sphere round the origin.
+    ``radius`` is that sphere's in the capture's unit."""
+
+    to_object: Float[np.ndarray, "4 4"]
+    radius: float
+
+    def pose(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """A camera's pose in the object's frame; rotations stay rotations."""
+        moved = self.to_object @ camera_to_world
+        moved[:3, :3] *= self.radius
+        return moved
+
+
+def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placement:
+    """``up`` in the capture's frame; None: what its file says, else the mean of the cameras' own, which the log says.
+
+    Centre and radius are those of the space that the silhouettes of (nearly) all photographs share.
+
+    Raises:
+        ValueError: no object in the masks, or silhouettes that share no space.
+    """
+    capture = pictures.capture
+    said = up if up is not None else capture.up
+    if said is None:
+        axes = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames])
+        said = tuple(axes.mean(0))
+        _log.info(
+            "%s: up is taken to be (%.3f, %.3f, %.3f), the mean of the cameras' own; objects.up says another",
+            capture.name, *(np.array(said) / max(float(np.linalg.norm(said)), 1e-12)),
+        )  # fmt: skip
+    turn = upright(np.array(said, dtype=np.float64), capture.name)
+    centre, radius = sphere_of(capture, [silhouette(pictures, frame) for frame in capture.frames])
+    _log.info(
+        "%s: centre (%.4g, %.4g, %.4g) and radius %.4g in the capture's unit, from %d silhouettes",
+        capture.name, *centre, radius, len(capture.frames),
+    )  # fmt: skip
+    to_object = np.eye(4)
+    to_object[:3, :3] = turn / radius
+    to_object[:3, 3] = -to_object[:3, :3] @ centre
+    return Placement(to_object, radius)
+
+
+def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes ``up`` to +z. Raises ``ValueError`` where up is no direction."""
+    length = float(np.linalg.norm(up))
+    if not np.isfinite(length) or length < 1e-6:
+        raise ValueError(f"{name}: up has no direction, got {up.tolist()}; set objects.up")
+    x, y, z = up / length
+    if z < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + z)
+
+
+def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
+    """Which pixels of the photograph, made smaller, show some of the object."""
+    alpha = pictures.rgba(frame)[..., 3]
+    step = max(1, max(alpha.shape) // SMALL)
+    return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
+
+
+def sphere_of(
+    capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Centre and radius of the space that the silhouettes share, in the capture's frame."""
+    empty = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if not mask.any()]
+    if len(empty) == len(silhouettes):
+        raise ValueError(
+            f"{capture.source}: no object in the masks of {capture.name}, such as that of {empty[0]}"
+        )
+    if empty:
+        _log.warning(
+            "%s: no object in the masks of %d photographs, such as %s", capture.name, len(empty), empty[0]
+        )
+    shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
+    centre, half = _first_cube(shown)
+    # The second time in a cube that fits, by the cells' middles alone: the first must not miss a thin part.
+    for reach in (0.5 * np.sqrt(3.0), 0.0):
+        cell = 2.0 * half / CELLS
+        axis = torch.linspace(-half + 0.5 * cell, half - 0.5 * cell, CELLS, dtype=torch.float64)
+        cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(
+            -1, 3
+        ) + torch.from_numpy(centre)
+        kept = cells[_shared(shown, cells, reach * cell)]
+        if not len(kept):
+            raise ValueError(
+                f"{capture.source}: the silhouettes of {capture.name} share no space; check masks, poses and axes"
+            )
+        low, high = kept.amin(0) - 0.5 * cell, kept.amax(0) + 0.5 * cell
+        centre = (0.5 * (low + high)).numpy()
+        radius = float((kept - torch.from_numpy(centre)).norm(dim=-1).max()) + 0.5 * cell
+        half = 1.1 * radius
+    return centre, radius
+
+
+def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
+    """The point nearest to the rays through the silhouettes' middles, and half the side of a cube round the object."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    spans = []
+    for frame, mask in shown:
+        rows, columns = (np.flatnonzero(mask.any(axis).numpy()) for axis in (1, 0))
+        scale = frame.lens.width / mask.shape[1]
+        ends = [scale * np.array([columns[k] + k_, rows[k] + k_]) for k, k_ in ((0, 0.0), (-1, 1.0))]
+        middle = 0.5 * (ends[0] + ends[1])
+        lens = frame.lens
+        local = np.array([(middle[0] - lens.cx) / lens.fx, -(middle[1] - lens.cy) / lens.fy, -1.0])
+        direction = frame.camera_to_world[:3, :3] @ (local / np.linalg.norm(local))
+        across = np.eye(3) - np.outer(direction, direction)
+        normal += across
+        right += across @ frame.camera_to_world[:3, 3]
+        spans.append(0.5 * float(np.linalg.norm((ends[1] - ends[0]) / np.array([lens.fx, lens.fy]))))
+    centre = np.linalg.lstsq(normal, right, rcond=None)[0]
+    depths = [float(np.linalg.norm(frame.camera_to_world[:3, 3] - centre)) for frame, _ in shown]
+    return centre, 1.5 * max(depth * span for depth, span in zip(depths, spans, strict=True))
+
+
+def _shared(
+    shown: Sequence[tuple[Frame, Tensor]], cells: Float[Tensor, "n 3"], reach: float
+) -> Bool[Tensor, "n"]:
+    """Cells at which nearly all photographs that see them show the object within ``reach``."""
+    seen, missed = torch.zeros(len(cells)), torch.zeros(len(cells))
+    for frame, mask in shown:
+        lens, pose = frame.lens, torch.from_numpy(frame.camera_to_world)
+        local = (cells - pose[:3, 3]) @ pose[:3, :3]
+        pixel, ahead = lens.project(local)
+        scale = mask.shape[1] / lens.width
+        nearest = float((-local[:, 2]).clamp_min(1e-6).median())
+        grown = _grown(mask, int(np.ceil(scale * max(lens.fx, lens.fy) * reach / nearest)) + 1)
+        inside, value = _at(grown, pixel, lens)
+        visible = inside & ahead
+        seen += visible
+        missed += visible & ~value
+    return (seen >= SEEN_BY * len(shown)) & (missed <= DISSENT * seen)
+
+
+def _grown(mask: Bool[Tensor, "h w"], by: int) -> Bool[Tensor, "h w"]:
+    return functional.max_pool2d(mask[None, None].float(), 2 * by + 1, 1, by)[0, 0] > 0.0
+
+
+def _at(mask: Tensor, pixel: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+    """Whether pixels lie in the image, and what the smaller mask says there."""
+    size = pixel.new_tensor([lens.width, lens.height])
+    inside = ((pixel >= 0.0) & (pixel < size)).all(-1)
+    place = (pixel / size * pixel.new_tensor([mask.shape[1], mask.shape[0]])).nan_to_num(0.0).long()
+    return inside, mask[place[:, 1].clamp(0, mask.shape[0] - 1), place[:, 0].clamp(0, mask.shape[1] - 1)]

@@ -1,0 +1,103 @@
+"""Photographs as posed views of one camera: distortion undone, each camera turned to the object's middle.
+
+A camera may be turned about its own place, and its focal length and principal point changed, without anything that it
+sees changing but the pixels' places. So photographs of any size and lens become views of one square camera that shows
+the whole object.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from neural_sim.cameras import focal_length, pixel_rays
+from neural_sim.objects.capture import Frame
+from neural_sim.objects.pictures import Pictures
+from neural_sim.objects.placing import Placement
+from neural_sim.types import PinholeCamera, PosedViews
+
+MARGIN = 1.08
+"""How much wider than the object's sphere the views are."""
+MOST_SAMPLES = 16
+"""Along each side of a pixel of the views, where a photograph has so many more."""
+
+
+def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str) -> PinholeCamera:
+    """The square camera in which the unit sphere is whole from the nearest of these places (object radii).
+
+    Raises:
+        ValueError: a photograph from within the sphere.
+    """
+    nearest = float(np.linalg.norm(poses[:, :3, 3], axis=-1).min())
+    if nearest <= 1.02:
+        raise ValueError(
+            f"{name}: a camera {nearest:.3g} object radii from the object's middle is inside of it; "
+            "check the masks"
+        )
+    tangent = MARGIN / math.sqrt(nearest**2 - 1.0)
+    return PinholeCamera(image_size, image_size, 2.0 * math.atan(tangent))
+
+
+def turned_to_origin(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The camera at the same place that looks at the origin, turned by the smallest rotation."""
+    position = pose[:3, 3]
+    backward, target = pose[:3, 2], position / np.linalg.norm(position)
+    axis = np.cross(backward, target)
+    cosine = float(backward @ target)
+    skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    turn = np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
+    turned = pose.copy()
+    turned[:3, :3] = turn @ pose[:3, :3]
+    return turned
+
+
+def resample(
+    pictures: Pictures, frames: Sequence[Frame], placement: Placement, image_size: int
+) -> PosedViews:
+    """Views of these frames in the object's frame, in their order.
+
+    A pixel is the mean of as many samples of the photograph as that has pixels there; it is ``known`` where all of them
+    lie in the photograph.
+    """
+    poses = np.stack([placement.pose(frame.camera_to_world) for frame in frames])
+    camera = shared_camera(poses, image_size, pictures.capture.name)
+    turned = np.stack([turned_to_origin(pose) for pose in poses])
+    made = [
+        _view(pictures.rgba(frame), frame, torch.from_numpy(own), torch.from_numpy(new), camera)
+        for frame, own, new in zip(frames, poses, turned, strict=True)
+    ]
+    images, known = (torch.stack(part) for part in zip(*made, strict=True))
+    return PosedViews(images, torch.from_numpy(turned).float(), camera, known=known)
+
+
+def pixels_per_pixel(frame: Frame, camera: PinholeCamera) -> float:
+    """How many pixels of the photograph one of the views' covers along a side."""
+    return max(frame.lens.fx, frame.lens.fy) / focal_length(camera)
+
+
+def _view(
+    photo: Float[Tensor, "h w 4"], frame: Frame, own: Tensor, turned: Tensor, camera: PinholeCamera
+) -> tuple[Float[Tensor, "s s 4"], Bool[Tensor, "s s"]]:
+    side = min(MOST_SAMPLES, max(1, math.ceil(pixels_per_pixel(frame, camera))))
+    fine = PinholeCamera(side * camera.width, side * camera.height, camera.field_of_view)
+    pixel = torch.arange(fine.width * fine.height)
+    directions = pixel_rays(fine, turned[None], pixel).directions @ own[:3, :3]
+    place, seen = frame.lens.project(directions)
+    size = place.new_tensor([frame.lens.width, frame.lens.height])
+    seen &= ((place >= 0.0) & (place <= size)).all(-1)
+    premultiplied = torch.cat([photo[..., :3] * photo[..., 3:], photo[..., 3:]], -1).movedim(-1, 0)
+    grid = (2.0 * place / size - 1.0).nan_to_num(2.0).float().view(1, fine.height, fine.width, 2)
+    sampled = functional.grid_sample(premultiplied[None], grid, padding_mode="border", align_corners=False)
+    sampled = sampled * seen.view(1, 1, fine.height, fine.width)
+    pooled = functional.avg_pool2d(sampled, side)[0].movedim(0, -1)
+    known = functional.avg_pool2d(seen.view(1, 1, fine.height, fine.width).float(), side)[0, 0] > 1.0 - 1e-6
+    alpha = pooled[..., 3:]
+    colour = torch.where(alpha > 1e-4, pooled[..., :3] / alpha.clamp_min(1e-4), 0.0)
+    image = torch.cat([colour, torch.where(alpha > 1e-4, alpha, 0.0)], -1).clamp(0.0, 1.0)
+    return image * known[..., None], known

@@ -1,0 +1,154 @@
+"""Captures as ``transforms.json``: nerfstudio's, instant-ngp's, and NeRF-synthetic's of three files."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, UnidentifiedImageError
+
+from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
+
+NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+
+
+def has_transforms(folder: Path) -> bool:
+    """Whether a folder holds such a capture."""
+    return any((folder / name).is_file() for name in NAMES[:2])
+
+
+def read_transforms(folder: Path, name: str) -> Capture:
+    """The capture of a folder.
+
+    ``transforms.json`` alone, or ``transforms_train.json`` with ``_val`` and ``_test`` beside it, whose frames are kept
+    from training; the latter are Blender's, so that +z is up. Intrinsics of a frame come before the file's.
+
+    Raises:
+        ValueError: a file that is not readable or has no frames, a frame without a pose or with a rotation that is
+            none, an image that is missing or of another size than its intrinsics say, an unknown camera model.
+    """
+    whole = (folder / NAMES[0]).is_file()
+    sources = (
+        [folder / NAMES[0]] if whole else [folder / part for part in NAMES[1:] if (folder / part).is_file()]
+    )
+    frames: list[Frame] = []
+    up = None if whole else (0.0, 0.0, 1.0)
+    for source in sources:
+        document = _read(source)
+        up = _up(document, source) or up
+        held_out = source.name in NAMES[2:]
+        frames += [
+            _frame(entry, number, document, source, held_out)
+            for number, entry in enumerate(document["frames"])
+        ]
+    files = [*sources, *(path for frame in frames for path in (frame.image, frame.mask) if path is not None)]
+    return Capture(name, tuple(frames), sources[0], tuple(files), up)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not readable as JSON ({error})") from error
+    if (
+        not isinstance(document, dict)
+        or not isinstance(document.get("frames"), list)
+        or not document["frames"]
+    ):
+        raise ValueError(f"{path}: want a list 'frames' with at least one frame")
+    return document
+
+
+def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] | None:
+    """instant-ngp's ``up``."""
+    if "up" not in document:
+        return None
+    up = document["up"]
+    if (
+        not isinstance(up, list)
+        or len(up) != 3
+        or not any(up)
+        or any(type(x) not in (int, float) for x in up)
+    ):
+        raise ValueError(f"{path}: up: want three numbers that are not all zero, got {up!r}")
+    return float(up[0]), float(up[1]), float(up[2])
+
+
+def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool) -> Frame:
+    where = f"{source}: frames[{number}]"
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise ValueError(f"{where}: want a file_path, got {entry!r}")
+    where = f"{where} ({entry['file_path']})"
+    if "transform_matrix" not in entry:
+        raise ValueError(f"{where}: has no pose; want a transform_matrix")
+    pose = checked_pose(entry["transform_matrix"], f"{where}: transform_matrix")
+    image = _image(source.parent / entry["file_path"], where)
+    lens = _lens({**document, **entry}, image_size(image, where), where)
+    mask = entry.get("mask_path")
+    if mask is not None and not (source.parent / str(mask)).is_file():
+        raise ValueError(f"{where}: mask_path: no such file: {source.parent / str(mask)}")
+    return Frame(image, pose, lens, None if mask is None else source.parent / mask, test)
+
+
+def _image(path: Path, where: str) -> Path:
+    """The image itself; NeRF-synthetic leaves its suffix out."""
+    for candidate in (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES)):
+        if candidate.is_file():
+            return candidate
+    raise ValueError(f"{where}: no such image: {path}")
+
+
+def image_size(path: Path, where: str) -> tuple[int, int]:
+    """Width and height in pixels. Raises ``ValueError`` for a file that is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{where}: {path} is not a readable image ({error})") from error
+
+
+def _lens(values: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
+    def number(key: str, default: float) -> float:
+        value = values.get(key, default)
+        if type(value) not in (int, float):
+            raise ValueError(f"{where}: {key}: want a number, got {value!r}")
+        return float(value)
+
+    width, height = size
+    said = round(number("w", width)), round(number("h", height))
+    if said != size:
+        raise ValueError(
+            f"{where}: the image has {width} x {height} pixels, its intrinsics w and h say {said[0]} x {said[1]}"
+        )
+    model = values.get("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye", False))
+    if model not in (*PERSPECTIVE, "OPENCV_FISHEYE"):
+        raise ValueError(
+            f"{where}: camera_model: want one of {', '.join((*PERSPECTIVE, 'OPENCV_FISHEYE'))}, got {model!r}"
+        )
+    if "fl_x" not in values and "camera_angle_x" not in values:
+        raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, of the frame or of the file")
+    fx = (
+        number("fl_x", 0.0)
+        if "fl_x" in values
+        else 0.5 * width / math.tan(0.5 * number("camera_angle_x", 0.0))
+    )
+    fy = fx
+    if "fl_y" in values:
+        fy = number("fl_y", 0.0)
+    elif "fl_x" not in values and "camera_angle_y" in values:
+        fy = 0.5 * height / math.tan(0.5 * number("camera_angle_y", 0.0))
+    radial = tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4))
+    tangential = (number("p1", 0.0), number("p2", 0.0))
+    try:
+        return Lens(
+            width, height, fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height),
+            radial if any(radial) else (), (), tangential, fisheye,
+        )  # fmt: skip
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
