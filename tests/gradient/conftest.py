@@ -148,7 +148,7 @@ COUNT = 4
 ROOMS_CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.0))
 
 
-class Rooms:
+class Pipeline:
     """Four images of one textured block, their detector, and everything between psi and their losses."""
 
     camera = ROOMS_CAMERA
@@ -225,5 +225,5 @@ class Rooms:
 
 
 @pytest.fixture(scope="module")
-def rooms() -> Rooms:
-    return Rooms()
+def pipeline() -> Pipeline:
+    return Pipeline()

@@ -141,8 +141,8 @@ class Unrolled:
         steps = reversed_steps(trajectory, examples, like, slope, self.product, with_inputs)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
-        turns = places(per_bin, self.probes_per_step or per_bin, generator)
-        weights = standing(len(trajectory) - trajectory.first, self.score_every, generator)
+        turns = probe_columns(per_bin, self.probes_per_step or per_bin, generator)
+        weights = step_weights(len(trajectory) - trajectory.first, self.score_every, generator)
         images = torch.zeros_like(slope[:1]).expand(len(examples.inputs[0])).clone()
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if with_inputs else ()
         for step in steps:
@@ -181,7 +181,7 @@ class _Scoring:
         self._levels, self.scored = means, self.scored + len(along)
 
 
-def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[Int[Tensor, "per_step"]]:
+def probe_columns(columns: int, per_step: int, generator: torch.Generator) -> Iterator[Int[Tensor, "per_step"]]:
     """``per_step`` columns at a time from shuffled decks of all: each is as likely as any other in every turn."""
     left = torch.zeros(0, dtype=torch.long)
     while True:
@@ -191,7 +191,7 @@ def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[
         left = left[per_step:]
 
 
-def standing(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
+def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
     """For each step how many it stands for: one of every ``every`` in a row, drawn at random, for all of those."""
     for first in range(0, steps, every):
         block = min(every, steps - first)

@@ -121,7 +121,7 @@ class StratifiedEstimator:
             held = probes[factor.name]
             along = scored(held.index).to(images.psi)
             parts[factor.name] = by_strata(along, held.bins, factor, psi[factor.name], share)
-            p_values[factor.name] = _told_apart(along, held.bins, factor)
+            p_values[factor.name] = _equal_means(along, held.bins, factor)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
@@ -181,7 +181,7 @@ class ReinforceEstimator:
         return replace(reinforce(along, log_prob, images.psi, share), p_values=p_values)
 
 
-def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
+def _equal_means(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
     """p-value of the null that all bins, or all lights, have one mean score; the same scenes are seen under one light
     after the other."""
     if factor.same_scenes:

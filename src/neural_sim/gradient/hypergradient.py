@@ -87,7 +87,7 @@ class Hypergradient:
     ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
     unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
     ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve (or
-    unrolled), mixed. ``raises`` counts how often lambda had to be raised. Where training was unrolled, ``solution``
+    unrolled), mixed. ``damping_raises`` counts how often lambda had to be raised. Where training was unrolled, ``solution``
     says so: its steps are those walked back through, its products their Hessian's, its value ``dL_val/dtheta``; there
     is no damping.
     """
@@ -101,7 +101,7 @@ class Hypergradient:
     stationarity: float
     validation_norm: float
     seconds: dict[str, float] = field(default_factory=dict)
-    raises: int = 0
+    damping_raises: int = 0
 
 
 def hypergradient(
@@ -151,7 +151,7 @@ def hypergradient(
         stationarity=stationarity,
         validation_norm=norm(right_hand_side),
         seconds=seconds,
-        raises=adjoint.raises,
+        damping_raises=adjoint.damping_raises,
     )
 
 

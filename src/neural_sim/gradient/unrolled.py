@@ -73,9 +73,9 @@ class Examples:
         with torch.enable_grad():
             loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
         (slope,) = torch.autograd.grad(loss, point)
-        return slope + self.pull(theta, like)
+        return slope + self.proximal_gradient(theta, like)
 
-    def pull(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
+    def proximal_gradient(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
         """The proximal term's gradient."""
         if self.anchor is None or self.proximal == 0.0:
             return 0.0

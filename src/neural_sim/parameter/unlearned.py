@@ -1,4 +1,4 @@
-"""What no parameter of a run draws is uniform."""
+"""Uniform ranges of the coordinates that no parameter draws."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Unlearned:
-    """Ranges of numbers that no parameter of a run draws: angles in degrees, the distance in object radii.
+    """Uniform ranges of coordinates that no parameter draws: angles in degrees, the distance in object radii.
 
     Raises:
         ValueError: a range that is not ordered, a distance within the object.

@@ -23,13 +23,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solved vector with its account. ``raises`` counts how often lambda had to be raised; ``doubled`` is the
+    """The solved vector with its account. ``damping_raises`` counts how often lambda had to be raised; ``doubled`` is the
     vector at twice the final lambda, None if it was not asked for.
     """
 
     solution: Solution
     damping: Damped
-    raises: int
+    damping_raises: int
     doubled: Float[Tensor, "n"] | None
     seconds: float
 
@@ -76,18 +76,18 @@ class AdjointSolver:
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
         solution = self._solve(operator, damped, b, x0)
-        raises = 0
-        while solution.status is Status.NEGATIVE_CURVATURE and raises < self.max_raises:
+        damping_raises = 0
+        while solution.status is Status.NEGATIVE_CURVATURE and damping_raises < self.max_raises:
             raised = self.damping.raised(damped, solution.curvature[0] - damped.value)
             if raised is None:
                 break
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
-            damped, raises = raised, raises + 1
+            damped, damping_raises = raised, damping_raises + 1
             solution = self._solve(operator, damped, b, solution.value)
         doubled = None
         if self.sensitivity:
             doubled = self._solve(operator, damped, b, solution.value, 2.0).value
-        return Adjoint(solution, damped, raises, doubled, time.perf_counter() - began)
+        return Adjoint(solution, damped, damping_raises, doubled, time.perf_counter() - began)
 
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
