@@ -24,8 +24,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.frozen import FrozenLoop
+from neural_sim.outer.probing import ProbeSet
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos

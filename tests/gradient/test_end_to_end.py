@@ -1,4 +1,4 @@
-"""The estimators on the real pipeline: pose parameter, grid field, renderer, composition and detector, in float64."""
+"""The estimators end to end: pose parameter, grid field, renderer, composition and detector, in float64."""
 
 from __future__ import annotations
 
@@ -41,7 +41,12 @@ def test_pathwise_equals_autograd_through_the_whole_pipeline(pipeline, pathwise)
     along = sum((slope * pipeline.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
     ours = pathwise(
-        pipeline.loss_of, pipeline.trainable, pipeline.vector, pipeline.object_images(), patch_size=700, chunk_size=3
+        pipeline.loss_of,
+        pipeline.trainable,
+        pipeline.vector,
+        pipeline.object_images(),
+        patch_size=700,
+        chunk_size=3,
     )
     assert float(reference.norm()) > 0.0
     torch.testing.assert_close(ours.value, reference, rtol=1e-9, atol=1e-12)
@@ -180,7 +185,9 @@ def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(pipeline, pat
     operator = Shifted(
         HessianOperator(inner.terms(), pipeline.trainable, retain_graph=True), result.damping.value
     )
-    tight = MinimumResidual().solve(operator, gradient(validation, pipeline.trainable), rtol=1e-8, max_steps=200)
+    tight = MinimumResidual().solve(
+        operator, gradient(validation, pipeline.trainable), rtol=1e-8, max_steps=200
+    )
     assert tight.status is Status.CONVERGED
     expected = -estimates["can"](unflatten(tight.value, pipeline.trainable)).value
     error = (result.psi_gradients["can"] - expected).norm() / expected.norm()

@@ -49,7 +49,9 @@ def test_a_good_step_is_kept_with_everything_recorded():
     assert certificate.doubts == [] and actions(certificate) == ["kept", "kept"]
     assert not certificate.stopped and not certificate.void
     assert (
-        certificate.solver_status == "CONVERGED" and certificate.solver_steps == 7 and certificate.damping_raises == 1
+        certificate.solver_status == "CONVERGED"
+        and certificate.solver_steps == 7
+        and certificate.damping_raises == 1
     )
     assert (certificate.curvature_min, certificate.curvature_max, certificate.damping) == (-1.0, 9.0, 3.0)
     assert certificate.condition == pytest.approx(12.0 / 2.0)

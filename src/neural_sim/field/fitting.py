@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import pixels_across, visual_hull
-from neural_sim.field.objective import Fitting, Rendering, RayBlocks
+from neural_sim.field.objective import Fitting, RayBlocks, Rendering
 from neural_sim.field.occupancy import crop
 from neural_sim.field.pool import RayPool, build_pool
 from neural_sim.field.quadrature import composite, render_weights

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.objective import Fitting, Rendering, RayBlocks
+from neural_sim.field.objective import Fitting, RayBlocks, Rendering
 from neural_sim.field.pool import build_pool
 from neural_sim.field.quadrature import composite
 from neural_sim.field.rendering import render_samples

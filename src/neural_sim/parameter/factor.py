@@ -24,8 +24,8 @@ Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
 
 @dataclass(frozen=True)
 class BinNoise:
-    """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponentials from which
-    further Gumbel noise is made that selects the same bins."""
+    """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponential noise, for
+    further Gumbel noise that selects the same bins."""
 
     gumbel: Float[Tensor, "n k"]
     exponential: Float[Tensor, "n draws k"] | None = None
@@ -211,11 +211,11 @@ class BinnedFactor:
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
         """The coordinate, differentiable in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
 
-        ``gumbel_softmax`` is the paper's: at small tau most draws have next to no derivative, and the few near a tie between
-        two bins have nearly all of it. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and takes the
-        relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of no
-        expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is averaged
-        over noise that selects the same bin (Paulus et al. 2021).
+        ``gumbel_softmax`` is the paper's: at small tau most draws have next to no derivative, and the few near a tie
+        between two bins have nearly all of it. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and
+        takes the relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of
+        no expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is
+        averaged over noise that selects the same bin (Paulus et al. 2021).
 
         Raises:
             ValueError: ``gumbel_rao`` without the noise for it.

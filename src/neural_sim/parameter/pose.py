@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import ConfiguredDistributions, BinnedFactor, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Gap
 
 Axis = Literal["polar", "azimuth", "both"]
 OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
@@ -29,8 +29,8 @@ class Pose:
             k + 1 - i show an object from the same sides, upright and on its head.
         other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
         temperature, bin_mean, floor: see :class:`BinnedFactor`; ``bin_mean`` is that of the full circle.
-        initial, target, biased, gap: see :class:`ConfiguredDistributions`. With ``both``, {phi: ..., rho: ...} gives each
-            angle a distribution; a single distribution is phi's, and rho is uniform.
+        initial, target, biased, gap: see :class:`ConfiguredDistributions`. With ``both``, {phi: ..., rho: ...} gives
+            each angle a distribution; a single distribution is phi's, and rho is uniform.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.

@@ -20,7 +20,7 @@ from neural_sim.types import SceneDraw
 
 
 class Parameter(Protocol):
-    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it draws without learning them."""
+    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it does not learn."""
 
     @property
     def factors(self) -> tuple[Factor, ...]: ...
@@ -48,7 +48,7 @@ class SceneNoise:
 
 @dataclass(frozen=True)
 class SceneDistribution:
-    """p_psi = the product of the factors' distributions; psi is one vector for each object, the factors' parts in order.
+    """p_psi = the product of the factors' distributions; psi is one vector for each object, factor by factor.
 
     Raises:
         ValueError: no factor, two factors of one name, or two of one coordinate.

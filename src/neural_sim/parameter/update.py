@@ -1,9 +1,9 @@
 """Steps of psi along a hypergradient, bounded so that one noisy gradient cannot collapse p.
 
 For bins, psi are logits and ``log_p`` [objects, k] their log probabilities; steps are in logits. For lights, psi are
-weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's ``project`` returns the result
-to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and ``standard_error`` have psi's shape, in
-units of the outer loss over those of psi.
+weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's ``project`` returns the
+result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and ``standard_error`` have psi's
+shape, in units of the outer loss over those of psi.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CLIP = 10.0
 
 @dataclass(frozen=True)
 class UpdateState:
-    """State of an update between steps: ``first`` and ``second`` moment of the direction, variance of its noise, and the
+    """State of an update between steps: ``first`` and ``second`` moment of the direction, its noise variance, and the
     number of steps.
 
     ``refused`` counts gradients that are not finite, or whose squares are not: they change neither psi nor the moments.
@@ -66,7 +66,7 @@ def _accept(
     second: Float[Tensor, "objects k"],
     noise: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
-    """psi and the state after the step, or both as before where the result is not finite: NaN would stay in the moments.
+    """psi and the state after the step, or before it where the result is not finite: NaN would stay in the moments.
 
     An infinite noise variance (an unknown standard error) keeps the old one for the same reason.
     """
@@ -132,11 +132,11 @@ class Adam:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    The direction in the logits is the gradient by p, which is the gradient by the logits divided by p, centred: a bin of
-    small p gets as long a step as one of large p. Momentum averages the direction. The average is divided by the largest
-    root mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever the units
-    of the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients near the
-    end, and objects without a gradient would drift.)
+    The direction in the logits is the gradient by p, which is the gradient by the logits divided by p, centred: a bin
+    of small p gets as long a step as one of large p. Momentum averages the direction. The average is divided by the
+    largest root mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever
+    the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients
+    near the end, and objects without a gradient would drift.)
 
     ``shrink`` multiplies each component of the average by :func:`shrinkage` (James and Stein 1961, positive part):
     components within their noise do not move. Standard errors that are not finite shrink nothing.

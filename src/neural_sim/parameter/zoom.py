@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import ConfiguredDistributions, BinnedFactor, Coordinate, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Coordinate, Gap
 
 By = Literal["distance", "focal_length"]
 NEAREST = 1.05

@@ -1,4 +1,4 @@
-"""``v = (H + lambda I)^-1 b``: curvature operator, damping and linear solver put together."""
+"""``v = (H + lambda I)^-1 b`` from a curvature operator, a damping and a linear solver."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solved vector with its account. ``damping_raises`` counts how often lambda had to be raised; ``doubled`` is the
-    vector at twice the final lambda, None if it was not asked for.
+    """The solution and its damping. ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at
+    twice the final lambda, None unless asked for.
     """
 
     solution: Solution
@@ -45,11 +45,11 @@ class AdjointSolver:
     Args:
         linear: the linear solver.
         damping: the choice of lambda.
-        mode: how Hessian products are made, see ``HessianOperator``.
+        mode: how Hessian products are computed, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
-        max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never is).
-        sensitivity: also solve at 2 lambda, to see how much hangs on the damping: up to ``max_steps`` more products.
+        max_raises: most increases of lambda after solves that met negative curvature (a fixed lambda has none).
+        sensitivity: also solve at 2 lambda, to measure the influence of the damping: up to ``max_steps`` more products.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -92,7 +92,7 @@ class AdjointSolver:
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """At ``times`` lambda, from where the damping's own products got to, else from ``x0``."""
+        """Solve at ``times`` lambda, from the search by the damping's products where there is one, else from ``x0``."""
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
