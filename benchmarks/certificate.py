@@ -27,7 +27,7 @@ from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import psi_contributions
 from neural_sim.gradient.significance import no_association, no_difference, zero_mean
 from neural_sim.gradient.stratified import stratified
-from neural_sim.outer.still import StillLoop
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 
@@ -143,7 +143,7 @@ def simulated(objects: int, draws: int) -> list[str]:
     return lines
 
 
-def populations(world: StillLoop, each: int) -> Float[Tensor, "objects bins n"]:
+def populations(world: FrozenLoop, each: int) -> Float[Tensor, "objects bins n"]:
     """The detector's own scores of ``each`` images of every bin of every object, without their bin's mean."""
     probed = world.probes(each, torch.Generator().manual_seed(0))
     index = torch.cat([part["pose"].index for part in probed.probes])

@@ -17,8 +17,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.still import StillLoop, centred
-from neural_sim.parameter.update import told_from_noise
+from neural_sim.outer.frozen import FrozenLoop, centred
+from neural_sim.parameter.update import shrinkage
 from neural_sim.synthesis.scene import join
 from neural_sim.types import SceneDraw
 
@@ -28,13 +28,13 @@ UNIT = COUNTS[0]
 
 @dataclass(frozen=True)
 class Variant:
-    """A pathwise estimator with the settings of other rooms that belong to it."""
+    """A pathwise estimator with the settings of other packages that belong to it."""
 
     estimator: PathwiseEstimator
     bin_mean: str = "circular"
     label_gradient: str = "differentiable"
 
-    def of(self, world: StillLoop) -> StillLoop:
+    def of(self, world: FrozenLoop) -> FrozenLoop:
         moved = world.with_factor(dataclasses.replace(world.bins, bin_mean=self.bin_mean))
         synthesizer = dataclasses.replace(moved.scene.synthesizer, label_gradient=self.label_gradient)
         return dataclasses.replace(moved, scene=dataclasses.replace(moved.scene, synthesizer=synthesizer))
@@ -63,7 +63,7 @@ class Result:
 
 
 def run_pathwise(
-    world: StillLoop, estimator: PathwiseEstimator, units: int, seed: int
+    world: FrozenLoop, estimator: PathwiseEstimator, units: int, seed: int
 ) -> tuple[Float[Tensor, "units objects k"], float]:
     """Estimates from ``UNIT`` images each, and the seconds an image took, drawing and rendering included.
 
@@ -77,7 +77,7 @@ def run_pathwise(
 
 
 def score(
-    world: StillLoop,
+    world: FrozenLoop,
     estimator: StratifiedEstimator | ReinforceEstimator,
     cached: CachedSet,
     drawn: Probes,
@@ -111,7 +111,7 @@ def pathwise_result(units: Tensor, seconds: float) -> Result:
     return result
 
 
-def run_stratified(world: StillLoop, pool: int) -> dict[str, Result]:
+def run_stratified(world: FrozenLoop, pool: int) -> dict[str, Result]:
     """Disjoint parts of ``pool`` images of every bin; as it is, and shrunk by its noise as the psi update does it."""
     began = time.process_time()
     probed = world.probes(pool, torch.Generator().manual_seed(31))
@@ -127,7 +127,7 @@ def run_stratified(world: StillLoop, pool: int) -> dict[str, Result]:
             found = [score(world, StratifiedEstimator(), cached, p, label) for label, p in enumerate(parts)]
             values.append(centred(found))
             noise = torch.stack([part.standard_error.square() for part in found])
-            kept.append(values[-1] * told_from_noise(values[-1], noise))
+            kept.append(values[-1] * shrinkage(values[-1], noise))
         spent = (time.process_time() - began) / (len(values) * len(probes))
         for result, estimates in ((plain, values), (shrunk, kept)):
             result.estimates[count] = torch.stack(estimates)
@@ -135,7 +135,7 @@ def run_stratified(world: StillLoop, pool: int) -> dict[str, Result]:
     return {"stratified": plain, "stratified, shrunk": shrunk}
 
 
-def run_reinforce(world: StillLoop, pool: int) -> Result:
+def run_reinforce(world: FrozenLoop, pool: int) -> Result:
     """Disjoint parts of ``pool`` hard draws of every object."""
     began = time.process_time()
     parts = world.scene.training_set(world.psi, pool, torch.Generator().manual_seed(41))

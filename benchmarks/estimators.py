@@ -38,12 +38,12 @@ from worlds import WORLDS, Truth, hard_truth, make_world
 
 from neural_sim.cameras import orbit
 from neural_sim.gradient.pathwise import contract, draw_cotangents
-from neural_sim.outer.still import StillLoop
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.synthesis.motion import pose_rates
 from neural_sim.types import Maps, PinholeCamera
 
 
-def compare(name: str, world: StillLoop, repeats: int, truth_images: int) -> dict[str, Any]:
+def compare(name: str, world: FrozenLoop, repeats: int, truth_images: int) -> dict[str, Any]:
     """Every estimator on one world, with both truths."""
     hard = hard_truth(world, truth_images // world.scene.distribution.size, seed=21)
     base = PATHWISE[RELAXED]
@@ -106,7 +106,7 @@ def _by_p(derivative: Tensor, p: Tensor) -> Tensor:
     return ratio - ratio.mean(-1, keepdim=True)
 
 
-def compare_modes(world: StillLoop, size: int = 96, count: int = 8) -> list[dict[str, float | str]]:
+def compare_modes(world: FrozenLoop, size: int = 96, count: int = 8) -> list[dict[str, float | str]]:
     """Seconds an image of the render and its derivative by one number of V, and how far the modes are apart."""
     scene = dataclasses.replace(
         world.scene, camera=PinholeCamera(size, size, world.scene.camera.field_of_view)

@@ -22,8 +22,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import build, conf_directory
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.still import StillLoop
 from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import join
 
@@ -42,7 +42,7 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
         inner = InnerLoop(scene, detector, warm_start, validation, x.loop.outer, x.training, generator)
         images = join(inner.draw(psi))
         inner.train(CachedSet.of(detector, inner.backbone, images))
-        loop = StillLoop.at(
+        loop = FrozenLoop.at(
             scene,
             detector,
             inner.theta,

@@ -24,8 +24,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.training import train_detector
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.main import build, conf_directory
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.probing import ProbeSet
-from neural_sim.outer.still import StillLoop
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos
@@ -42,7 +42,7 @@ class State:
 
     inner: InnerProblem
     b: Float[Tensor, "m"]
-    loop: StillLoop
+    loop: FrozenLoop
     probed: ProbeSet
 
     def derivative(self, v: Float[Tensor, "m"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
@@ -79,7 +79,7 @@ def state(context: Context, which: str, seed: int) -> State:
     )  # fmt: skip
     trainable = detector.split(theta)[1]
     validation = CachedSet.of(detector, backbone, context.results(context.graph.targets).val)
-    loop = StillLoop(
+    loop = FrozenLoop(
         context.results(context.graph.scene), detector, backbone, trainable, {}, psi, "not solved"
     )
     probed = loop.probes(context.experiment.loop.gradient.probes_per_bin, generator)

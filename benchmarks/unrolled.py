@@ -29,7 +29,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Parameters
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
-from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, places, standing
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, probe_columns, step_weights
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
@@ -232,8 +232,8 @@ def few(
     scored: Float[Tensor, "steps k per_bin"], count: int, every: int, generator: torch.Generator
 ) -> Float[Tensor, "k"]:
     """The same from the few probes that the walk would have scored."""
-    turns, total = places(PER_BIN, count, generator), torch.zeros(scored.shape[1])
-    for step, weight in zip(scored, standing(len(scored), every, generator), strict=True):
+    turns, total = probe_columns(PER_BIN, count, generator), torch.zeros(scored.shape[1])
+    for step, weight in zip(scored, step_weights(len(scored), every, generator), strict=True):
         if weight:
             total += weight * centred(step[:, next(turns)].mean(1))
     return centred(total)

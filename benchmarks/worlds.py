@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.still import StillLoop, centred
+from neural_sim.outer.frozen import FrozenLoop, centred
 from neural_sim.stages.context import Context
-from neural_sim.stages.temperatures import still_loop
+from neural_sim.stages.temperatures import frozen_loop
 
 SMALL = [
     "scale=quick", "progress=false", "training.image_size=64", "views.count=68",
@@ -25,11 +25,11 @@ WORLDS = {
 }
 
 
-def make_world(overrides: list[str]) -> StillLoop:
+def make_world(overrides: list[str]) -> FrozenLoop:
     """Fields and detector from the store, or made now; v by the configured solver."""
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         context = Context.of(build(compose("config", [*SMALL, *overrides])))
-    return still_loop(context, seed=11)
+    return frozen_loop(context, seed=11)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Truth:
         return (signal / (signal + noise)).sqrt().tolist()
 
 
-def hard_truth(world: StillLoop, per_bin: int, seed: int) -> Truth:
+def hard_truth(world: FrozenLoop, per_bin: int, seed: int) -> Truth:
     """From ``per_bin`` images of every bin."""
     found = world.truth(per_bin, torch.Generator().manual_seed(seed))
     return Truth(centred(found), torch.stack([part.standard_error for part in found]))

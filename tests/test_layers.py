@@ -1,4 +1,4 @@
-"""Rooms import only from the rooms before them, and each heavy library from its own place."""
+"""Packages import only from the packages before them, and each heavy library from its own place."""
 
 import ast
 from pathlib import Path
@@ -14,7 +14,7 @@ TORCH_ONLY = ("types", "cameras", "solver")
 
 def _imports():
     for path in sorted(PACKAGE.rglob("*.py")):
-        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        package = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 modules = [alias.name for alias in node.names]
@@ -25,15 +25,15 @@ def _imports():
             else:
                 continue
             for module in modules:
-                yield path.relative_to(PACKAGE), room, module
+                yield path.relative_to(PACKAGE), package, module
 
 
 def test_rooms_import_from_earlier_rooms_only():
-    for path, room, module in _imports():
-        if module.startswith("neural_sim.") and room != "__init__":
+    for path, package, module in _imports():
+        if module.startswith("neural_sim.") and package != "__init__":
             other = module.split(".")[1]
             assert other in ORDER, f"{path} imports {module}, which has no place in the order"
-            assert ORDER.index(other) <= ORDER.index(room), f"{path} imports {module}, a later room"
+            assert ORDER.index(other) <= ORDER.index(package), f"{path} imports {module}, a later package"
 
 
 def test_heavy_libraries_stay_in_their_rooms():
@@ -56,9 +56,9 @@ def test_heavy_libraries_stay_in_their_rooms():
 
 def test_types_cameras_and_solvers_know_only_torch():
     standard = set(__import__("sys").stdlib_module_names)
-    for path, room, module in _imports():
+    for path, package, module in _imports():
         top = module.split(".")[0]
-        if room in TORCH_ONLY and top != "neural_sim":
+        if package in TORCH_ONLY and top != "neural_sim":
             assert top in {"torch", "jaxtyping"} | standard, f"{path} imports {module}"
 
 

@@ -1,4 +1,4 @@
-"""The frozen dataclasses that travel between rooms. They hold tensors and no behaviour beyond selection."""
+"""The frozen dataclasses that travel between packages. They hold tensors and no behaviour beyond selection."""
 
 from __future__ import annotations
 

@@ -145,13 +145,13 @@ def problem() -> Bilevel:
 
 
 COUNT = 4
-ROOMS_CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.0))
+PIPELINE_CAMERA = PinholeCamera(width=32, height=32, field_of_view=math.radians(40.0))
 
 
-class Rooms:
+class Pipeline:
     """Four images of one textured block, their detector, and everything between psi and their losses."""
 
-    camera = ROOMS_CAMERA
+    camera = PIPELINE_CAMERA
 
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(5)
@@ -166,7 +166,7 @@ class Rooms:
         self.psi = torch.randn(4, generator=generator, dtype=DOUBLE)
         self.noise = self.distribution.draw_noise(COUNT, generator, DOUBLE)
         self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-        self.nuisance = self.synthesizer.draw_nuisance(COUNT, ROOMS_CAMERA, generator)
+        self.nuisance = self.synthesizer.draw_nuisance(COUNT, PIPELINE_CAMERA, generator)
         self.detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,))), head=Head(8, 1))
         params = {name: value.double() for name, value in self.detector.init(generator).items()}
         self.backbone, self.trainable = self.detector.split(params)
@@ -183,13 +183,15 @@ class Rooms:
 
     def render(self, psi):
         draw = self.distribution.relaxed(psi, self.noise)
-        bundle = cameras.rays(ROOMS_CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
+        bundle = cameras.rays(PIPELINE_CAMERA, cameras.orbit(draw.phi, draw.rho, draw.distance))
         rgb, opacity = self.render_rays(Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3)))
         return rgb.view(COUNT, 32, 32, 3), opacity.view(COUNT, 32, 32)
 
     def tangents(self, draw, names):
         poses, rates = cameras.orbit(draw.phi, draw.rho, draw.distance), pose_rates(draw, names)
-        _, moved = NerfRenderer(termination=0.0).render_with_tangents(self.field, ROOMS_CAMERA, poses, rates)
+        _, moved = NerfRenderer(termination=0.0).render_with_tangents(
+            self.field, PIPELINE_CAMERA, poses, rates
+        )
         return dict(zip(names, moved, strict=True))
 
     def compose(self, rgb, opacity):
@@ -214,7 +216,7 @@ class Rooms:
             relaxed=lambda psi: self.distribution.relaxed(psi, self.noise),
             render_rays=self.render_rays,
             compose=lambda rgb, opacity: self.compose(rgb, opacity).images,
-            camera=ROOMS_CAMERA,
+            camera=PIPELINE_CAMERA,
             rgb=rgb,
             opacity=opacity,
         )
@@ -225,5 +227,5 @@ class Rooms:
 
 
 @pytest.fixture(scope="module")
-def rooms() -> Rooms:
-    return Rooms()
+def pipeline() -> Pipeline:
+    return Pipeline()

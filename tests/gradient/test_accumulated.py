@@ -12,7 +12,7 @@ from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 from neural_sim.detector.optimiser import SGD, AdamW
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
-from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, places, standing
+from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, probe_columns, step_weights
 from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
@@ -76,8 +76,8 @@ def test_a_few_probes_a_step_are_unbiased(micro, per_step, every):
     expected = up_to_a_constant(scores.sum(0).view(4, 2).mean(1))
     generator, drawn = torch.Generator().manual_seed(11), []
     for _ in range(1500):
-        total, turns = torch.zeros(4, dtype=DOUBLE), places(2, per_step, generator)
-        for row, weight in zip(scores, standing(6, every, generator), strict=True):
+        total, turns = torch.zeros(4, dtype=DOUBLE), probe_columns(2, per_step, generator)
+        for row, weight in zip(scores, step_weights(6, every, generator), strict=True):
             if weight:
                 total += weight * up_to_a_constant(row.view(4, 2)[:, next(turns)].mean(1))
         drawn.append(total)
@@ -97,8 +97,8 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
         ProbeGroups(micro.cached.losses, groups),
     )  # fmt: skip
     generator, total = torch.Generator().manual_seed(seed), torch.zeros(8, dtype=DOUBLE)
-    turns, levels = places(2, 1, generator), None
-    for row, weight in zip(scores, standing(6, 2, generator), strict=True):
+    turns, levels = probe_columns(2, 1, generator), None
+    for row, weight in zip(scores, step_weights(6, 2, generator), strict=True):
         if weight:
             rows = [table[:, chosen].reshape(-1) for chosen in [next(turns)] for table in groups]
             means = [row[part].mean() for part in rows]
@@ -110,10 +110,10 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
 
 
 def test_every_place_has_its_turn(generator):
-    turns = list(itertools.islice(places(5, 2, generator), 10))
+    turns = list(itertools.islice(probe_columns(5, 2, generator), 10))
     assert torch.bincount(torch.cat(turns), minlength=5).tolist() == [4] * 5
-    assert sum(standing(11, 3, generator)) == 11
-    assert list(standing(4, 1, generator)) == [1, 1, 1, 1]
+    assert sum(step_weights(11, 3, generator)) == 11
+    assert list(step_weights(4, 1, generator)) == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize("every", [1, 2])
@@ -231,35 +231,35 @@ def test_pathwise_is_the_derivative_of_the_training_on_images_that_move(problem,
     assert float((ours - expected).norm()) < 1e-6 * float(expected.norm())
 
 
-def test_pathwise_goes_through_the_backbone_once_for_all_steps(rooms):
+def test_pathwise_goes_through_the_backbone_once_for_all_steps(pipeline):
     """Pixels, features, six steps of the detector's pyramid and head: against the same training at psi +- h."""
     rates, every = (3e-3, 5e-3, 4e-3, 2e-3), [torch.tensor([0, 2]), torch.tensor([1, 3])] * 2
-    labels = rooms.targets.labels
+    labels = pipeline.targets.labels
 
     def inputs_of(leaves, rows):
-        return (*rooms.detector.features(rooms.backbone, leaves[0]), rooms.targets.deltas[rows])
+        return (*pipeline.detector.features(pipeline.backbone, leaves[0]), pipeline.targets.deltas[rows])
 
     def losses(params, inputs, rows):
-        return rooms.detector.per_image_loss(params, inputs[:-1], Targets(labels[rows], inputs[-1]))
+        return pipeline.detector.per_image_loss(params, inputs[:-1], Targets(labels[rows], inputs[-1]))
 
     def trained(psi):
         with torch.no_grad():
-            images = rooms.compose(*rooms.render(psi)).images
+            images = pipeline.compose(*pipeline.render(psi)).images
             inputs = inputs_of((images,), torch.arange(len(images)))
         held = Examples(inputs, losses, inputs_of=inputs_of)
         made = train(
-            RULE, flatten(rooms.trainable), tuple(every), rates,
-            lambda theta, rows: held.gradient(theta, rooms.trainable, rows),
+            RULE, flatten(pipeline.trainable), tuple(every), rates,
+            lambda theta, rows: held.gradient(theta, pipeline.trainable, rows),
         )  # fmt: skip
         return made, held
 
-    direction = flatten(rooms.vector)
-    made, held = trained(rooms.psi)
-    found = EXACT.accumulate(made, held, rooms.trainable, direction, torch.Generator(), with_inputs=True)
-    ours = PathwiseEstimator(chunk_size=3).accumulated(found, rooms.object_images(), {}).value
+    direction = flatten(pipeline.vector)
+    made, held = trained(pipeline.psi)
+    found = EXACT.accumulate(made, held, pipeline.trainable, direction, torch.Generator(), with_inputs=True)
+    ours = PathwiseEstimator(chunk_size=3).accumulated(found, pipeline.object_images(), {}).value
     along = torch.tensor([1.0, -0.5, 0.3, -0.8], dtype=DOUBLE)
     expected = extrapolated(
-        lambda step: float(trained(rooms.psi + step * along)[0].end @ direction), 10 * STEP
+        lambda step: float(trained(pipeline.psi + step * along)[0].end @ direction), 10 * STEP
     )
     assert float(ours @ along) == pytest.approx(expected, rel=1e-5)
 

@@ -32,7 +32,7 @@ def exact(log_probabilities, means=SCORES, psi=PSI):
 def test_stratified_is_exact_given_the_bins_means(log_probabilities):
     bins = torch.tensor([0, 0, 1, 2, 2])
     scores = SCORES[bins] + torch.tensor([0.7, -0.7, 0.0, 0.2, -0.2], dtype=DOUBLE)
-    found = stratified(scores, bins, PSI, log_probabilities, share=0.25)
+    found = stratified(scores, bins, PSI, log_probabilities, weight=0.25)
     torch.testing.assert_close(found.value, 0.25 * exact(log_probabilities))
 
 
@@ -99,7 +99,7 @@ def test_stratified_refuses_nonsense(scores, bins):
 def test_importance_weights_restore_p():
     p = torch.tensor([0.7, 0.1, 0.2], dtype=DOUBLE)
     bins = torch.tensor([2, 0, 1, 1, 2, 2])
-    weights = importance_weights(p, bins, share=0.5)
+    weights = importance_weights(p, bins, weight=0.5)
     mass = torch.zeros(3, dtype=DOUBLE).index_add_(0, bins, weights)
     torch.testing.assert_close(mass, 0.5 * p)
 
@@ -111,7 +111,7 @@ def test_reinforce_is_unbiased_over_all_draws(count, log_probabilities):
     expectation = torch.zeros_like(PSI)
     for outcome in itertools.product(range(3), repeat=count):
         bins = torch.tensor(outcome)
-        found = reinforce(SCORES[bins], lambda psi, bins=bins: log_probabilities(psi)[bins], PSI, share=2.0)
+        found = reinforce(SCORES[bins], lambda psi, bins=bins: log_probabilities(psi)[bins], PSI, weight=2.0)
         expectation += p[bins].prod() * found.value
     torch.testing.assert_close(expectation, 2.0 * exact(log_probabilities))
 

@@ -31,7 +31,7 @@ def result(gradient=(1.0, -1.0), p_values=(0.01, 0.04), status=Status.CONVERGED,
         standard_errors={name: torch.ones(2) for name in names},
         p_values={name: {"pose": p} for name, p in zip(names, p_values, strict=True)},
         solution=Solution(torch.ones(3), status, 7, residual, (0.1, 9.0), 8, False),
-        damping=Damped(3.0, SPECTRUM), sensitivity=0.2, stationarity=1.5, validation_norm=2.5, raises=1,
+        damping=Damped(3.0, SPECTRUM), sensitivity=0.2, stationarity=1.5, validation_norm=2.5, damping_raises=1,
     )  # fmt: skip
     return dataclasses.replace(made, **changes)
 
@@ -49,7 +49,9 @@ def test_a_good_step_is_kept_with_everything_recorded():
     assert certificate.doubts == [] and actions(certificate) == ["kept", "kept"]
     assert not certificate.stopped and not certificate.void
     assert (
-        certificate.solver_status == "CONVERGED" and certificate.solver_steps == 7 and certificate.raises == 1
+        certificate.solver_status == "CONVERGED"
+        and certificate.solver_steps == 7
+        and certificate.damping_raises == 1
     )
     assert (certificate.curvature_min, certificate.curvature_max, certificate.damping) == (-1.0, 9.0, 3.0)
     assert certificate.condition == pytest.approx(12.0 / 2.0)

@@ -8,7 +8,7 @@ import torch
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.still import StillLoop
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.temperatures import Temperatures, against, bin_shares
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.solver.adjoint import AdjointSolver
@@ -53,7 +53,7 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
     theta, validation = detector.init(generator), join(scene.training_set(psi, 3, generator))
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     images = join(scene.training_set(psi, 4, generator))
-    loop = StillLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
+    loop = FrozenLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
     rows, truths = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100).measure(
         loop, PathwiseEstimator(), 4, seed=0
     )

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from neural_sim.parameter.factor import Beliefs, BinnedFactor
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,11 @@ class Turn:
     @property
     def factors(self):
         low, high = (math.radians(degrees) for degrees in self.range_deg)
-        return (BinnedFactor("turn", "rho", self.bins, low, high, beliefs=Beliefs(target=self.target)),)
+        return (
+            BinnedFactor(
+                "turn", "rho", self.bins, low, high, configured=ConfiguredDistributions(target=self.target)
+            ),
+        )
 
     @property
     def ranges(self):

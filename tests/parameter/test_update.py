@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neural_sim.parameter.update import SGD, Adam, Mirror, UpdateState, bound, told_from_noise
+from neural_sim.parameter.update import SGD, Adam, Mirror, UpdateState, bound, shrinkage
 
 
 def test_bound_keeps_direction_and_limits_size():
@@ -115,10 +115,10 @@ def test_directions_are_shrunk_by_what_is_noise():
     direction = torch.tensor([[3.0, -4.0, 0.5], [0.0, 2.0, 1.0]], dtype=torch.float64)
     variance = torch.tensor([[2.0, 4.0, 1.0], [1.0, torch.inf, 0.0]], dtype=torch.float64)
     expected = torch.tensor([[7.0 / 9.0, 0.75, 0.0], [0.0, 1.0, 1.0]], dtype=torch.float64)
-    torch.testing.assert_close(told_from_noise(direction, variance), expected)
+    torch.testing.assert_close(shrinkage(direction, variance), expected)
 
 
-def test_mirror_moves_what_is_told_from_noise_and_holds_the_rest():
+def test_mirror_step_shrinks_components_within_their_noise():
     """One object's gradient has a mean, the others' are noise of the stated size.
 
     A shrunk standard normal has the root mean square sqrt(1/3), which is by how much a random walk gets shorter.

@@ -216,7 +216,7 @@ def test_damping_is_raised_until_conjugate_gradients_hold(generator):
     b = torch.randn(400, generator=generator, dtype=DOUBLE)
     damping = LanczosDamping(max_condition=1e3, lanczos_steps=2)
     adjoint = AdjointSolver(ConjugateGradient(), damping, rtol=1e-8).solve(terms, params, b, None, generator)
-    assert adjoint.raises >= 1
+    assert adjoint.damping_raises >= 1
     assert adjoint.solution.status is Status.CONVERGED
     torch.testing.assert_close(adjoint.vector, b / (values + adjoint.damping.value), rtol=1e-6, atol=1e-7)
     fixed = AdjointSolver(ConjugateGradient(), FixedDamping(0.1, 0), rtol=1e-8).solve(
@@ -224,7 +224,7 @@ def test_damping_is_raised_until_conjugate_gradients_hold(generator):
     )
     assert (
         fixed.solution.status is Status.NEGATIVE_CURVATURE
-        and fixed.raises == 0
+        and fixed.damping_raises == 0
         and fixed.damping.value == 0.1
     )
 

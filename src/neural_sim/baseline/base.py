@@ -1,4 +1,4 @@
-"""What the outer loop asks of a method that sees rewards only."""
+"""Methods that learn psi from rewards, and the settings of all other methods."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Draws = Sequence[SceneDraw]
 
 
 class Search(Protocol):
-    """A run of such a method: psi is asked for, a detector trained on its images, and its reward told."""
+    """A run of such a method: ``ask`` for psi, train a detector on its images, ``tell`` the reward."""
 
     @property
     def psi(self) -> Float[Tensor, "objects K"]:
-        """What the method would report now."""
+        """The method's current result."""
         ...
 
     def ask(self) -> Float[Tensor, "objects K"]:
@@ -35,9 +35,9 @@ class Search(Protocol):
 
 
 class RewardMethod(Protocol):
-    """A configured method. ``rounds`` of draw, train and reward are made for each outer iteration of the budget.
+    """A configured method. Each outer iteration of the budget has ``rounds`` of drawing, training and reward.
 
-    ``explores`` says whether it scores its draws, so that they need a density: lights are then drawn around psi's.
+    ``explores``: the method needs a density of its draws, so that lights are drawn around psi's.
     """
 
     explores: ClassVar[bool]

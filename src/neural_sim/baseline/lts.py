@@ -1,7 +1,7 @@
 """Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the validation reward.
 
 The policy is p_psi, an action is a whole training set, its reward what a detector trained on it scores on the target
-set. One number tells all objects and bins how they did, so that thousands of rounds stand where one hypergradient does.
+set. One number is the reward of all objects and bins, so that thousands of rounds replace one hypergradient.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from neural_sim.types import SceneDraw
 class LearningToSimulate:
     """Ascent along ``(R - b) d log p(training set) / d psi`` with a moving average b of past rewards.
 
-    The first reward has no past. Its round is kept until the second, drawn from the same psi, gives it a baseline: each
-    of the two rewards is then the other's (leave one out, which biases neither), and psi steps along both.
+    The first reward has no baseline. psi stays until the second round; then each of the two rewards is the other's
+    baseline (leave one out, unbiased), and psi steps along both.
 
     Args:
         name: in reports.
         learning_rate: logits a step at an advantage of one standard deviation of past rewards.
         decay: of the moving averages of the reward and of its square.
         max_step: largest change of a logit a step.
-        rounds: training sets for each outer iteration of the budget; two take about the seconds of one hypergradient.
+        rounds: training sets for each outer iteration of the budget; two take about as long as one hypergradient.
 
     Raises:
         ValueError: any of these out of its range.
@@ -85,7 +85,7 @@ class Policy:
             return
         if self._told == 2:  # R_1 - R_2 is the first round's advantage, R_2 - R_1 the second's
             slope = slope - self._first
-        # A sum of n scores has a spread of sqrt(n): taken out, so that the rate is in logits.
+        # A sum of n scores has a standard deviation of order sqrt(n): divided out, so that the rate is in logits.
         size = max(len(draws[0]), 1) ** 0.5
         step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)
         moved = {
@@ -94,13 +94,13 @@ class Policy:
         self._psi = self._distribution.constrained(self._psi + self._distribution.join(moved))
 
     def _advantage(self, reward: float) -> float:
-        """``R - b`` by the running standard deviation of rewards; then b moves on."""
+        """``R - b`` over the running standard deviation of rewards; then b is updated."""
         above, rest = reward - self._mean, 1.0 - self._settings.decay
         self._told += 1
         if self._told == 1:
             self._mean = reward
             return 0.0
-        # The first difference is the only measure of spread that there is.
+        # The first difference is the only measure of spread so far.
         self._variance = above**2 if self._told == 2 else (1.0 - rest) * (self._variance + rest * above**2)
         self._mean += rest * above
         return above / self._variance**0.5 if self._variance > 0.0 else 0.0

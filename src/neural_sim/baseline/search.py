@@ -16,7 +16,7 @@ from neural_sim.parameter.product import SceneDistribution
 
 
 class Incumbent(ABC):
-    """The best psi told of so far; psi asked for is the initial one first, then what :meth:`propose` makes."""
+    """The psi of the best reward so far. The first psi asked for is the initial one, the next are :meth:`propose`'s."""
 
     def __init__(self, psi: Float[Tensor, "objects K"]) -> None:
         self._best, self._asked, self._reward, self._told = psi, psi, -math.inf, 0
@@ -82,8 +82,8 @@ class _Random(Incumbent):
 class BayesOpt:
     """Tree-structured Parzen estimators (Bergstra et al. 2011) over the logits, by Optuna's ask and tell.
 
-    Every logit, and every weight of a light, is sought in [-``reach``, ``reach``], widened where the start lies outside
-    so that the start is among what is sought. Optuna is imported only when a run begins.
+    Every logit, and every weight of a light, is searched in [-``reach``, ``reach``], widened where necessary to contain
+    the start. Optuna is imported only when a run begins.
 
     Raises:
         ValueError: a reach or number of rounds that is not positive.

@@ -1,4 +1,4 @@
-"""A labelled set under a frozen backbone: its features are computed once for all losses, products and scores."""
+"""A labelled set under a frozen backbone, whose features are computed once for all losses, products and scores."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from neural_sim.types import LabelledImages
 def cached_features(
     detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
 ) -> tuple[Tensor, ...]:
-    """Feature maps of all images, computed batch by batch on the backbone's device, without a graph.
+    """Feature maps [n, channels, height, width] of all images [n, 3, H, W] in [0, 1], one tensor for each level.
+
+    They are computed batch by batch on the backbone's device, without a graph.
 
     Raises:
         ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
@@ -32,7 +34,8 @@ def cached_features(
 
 @dataclass(frozen=True)
 class CachedSet:
-    """Features of a set's images under the frozen backbone, and their targets: all the predictor's loss needs."""
+    """Features of n images under the frozen backbone, one tensor [n, ...] for each level, and the targets of their
+    anchors: the inputs of the predictor's loss."""
 
     detector: Detector
     features: tuple[Tensor, ...]
@@ -43,7 +46,7 @@ class CachedSet:
 
     @staticmethod
     def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
-        """The set under a backbone, on whose device it is kept; the images may be elsewhere."""
+        """The features and targets of ``images``, on the backbone's device; the images may be on another."""
         features = cached_features(detector, backbone, images.images)
         device = features[0].device
         return CachedSet(
@@ -52,7 +55,7 @@ class CachedSet:
 
     @property
     def device(self) -> torch.device:
-        """Of features and targets, and so of the rows that losses are asked for."""
+        """The device of features, targets and row indices."""
         return self.targets.labels.device
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
@@ -65,24 +68,24 @@ class CachedSet:
 
     @property
     def inputs(self) -> tuple[Tensor, ...]:
-        """What the losses are functions of where images and boxes move: features, then the targets' boxes."""
+        """Inputs of the losses that move with images and boxes: features by level, encoded boxes [n, anchors, 4]."""
         return (*self.features, self.targets.deltas)
 
     def losses_from(
         self, params: Parameters, inputs: tuple[Tensor, ...], index: Tensor
     ) -> Float[Tensor, "n"]:
-        """Losses of the images ``index`` from these rows of :attr:`inputs`, differentiable in them."""
+        """Losses of the images ``index`` from given rows of :attr:`inputs`, differentiable in these."""
         targets = Targets(self.targets.labels[index], inputs[-1])
         return self.detector.per_image_loss(params, inputs[:-1], targets)
 
     def select(self, index: Tensor) -> CachedSet:
-        """The images ``index`` alone."""
+        """The set of the images ``index``."""
         index = index.to(self.device)
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
-        """The same with ``others`` in the places ``index``."""
+        """The set with the images ``index`` replaced by ``others``."""
         place = index.to(self.device)
         features = tuple(
             level.index_copy(0, place, new) for level, new in zip(self.features, others.features, strict=True)
@@ -97,7 +100,7 @@ class CachedSet:
         return CachedSet(self.detector, tuple(level.double() for level in self.features), targets)
 
     def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
-        """The mean loss as a sum over chunks."""
+        """The mean loss as a sum of terms, each of at most ``chunk_size`` images."""
         count = len(self.targets)
         return [
             lambda params, rows=rows: self.losses(params, rows).sum() / count

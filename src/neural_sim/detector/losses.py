@@ -41,6 +41,6 @@ def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Floa
 def proximal_loss(
     params: Mapping[str, Tensor], anchor: Mapping[str, Tensor], proximal: float
 ) -> Float[Tensor, ""]:
-    """``proximal / 2 |params - anchor|^2`` over the names of ``params``; the anchor is held fixed."""
+    """``proximal / 2 |params - anchor|^2`` over the names of ``params``; no derivative by the anchor."""
     squares = [(value - anchor[name].detach()).square().sum() for name, value in params.items()]
     return 0.5 * proximal * torch.stack(squares).sum()

@@ -43,9 +43,9 @@ def evaluate(
         {"boxes": boxes[present].float().cpu(), "labels": label[present].cpu()}
         for boxes, label, present in zip(images.boxes, images.labels, images.present, strict=True)
     ]
-    found = [{key: _single(value) for key, value in prediction.items()} for prediction in predictions]
-    per_class = _average_precision(found, truth, None, len(class_names))
-    per_class_50 = _average_precision(found, truth, [0.5], len(class_names))
+    detections = [{key: _single(value) for key, value in prediction.items()} for prediction in predictions]
+    per_class = _average_precision(detections, truth, None, len(class_names))
+    per_class_50 = _average_precision(detections, truth, [0.5], len(class_names))
     return AveragePrecision(
         _mean(per_class),
         _mean(per_class_50),
@@ -60,7 +60,7 @@ def _single(value: Tensor) -> Tensor:
 
 
 def _average_precision(
-    found: list[dict[str, Tensor]],
+    detections: list[dict[str, Tensor]],
     truth: list[dict[str, Tensor]],
     thresholds: list[float] | None,
     classes: int,
@@ -72,7 +72,7 @@ def _average_precision(
         max_detection_thresholds=[1, 10, 100],
     )
     metric.warn_on_many_detections = False
-    metric.update(found, truth)
+    metric.update(detections, truth)
     result = metric.compute()
     values = [float("nan")] * classes
     present = {int(label) for image in truth for label in image["labels"]}

@@ -27,8 +27,8 @@ class Optimisation:
 
     Args:
         epochs, batch_size: the budget of steps.
-        learning_rate: at its peak.
-        weight_decay: decoupled, on convolution weights only.
+        learning_rate: the peak of the schedule.
+        weight_decay: decoupled weight decay of convolution weights (not of biases and normalisations).
         warmup_fraction: part of the steps over which the learning rate rises.
 
     Raises:
@@ -56,7 +56,7 @@ class DetectorModule(pl.LightningModule):
         fixed: all others; never written to.
         total_steps: optimiser steps until the learning rate reaches zero.
         anchor: of the detector's proximal term, which is left out without it; holds the learned names.
-        recording: what is kept of the steps, for :meth:`trajectory`.
+        recording: what is recorded of the steps, for :meth:`trajectory`.
 
     Raises:
         ValueError: for a recording that does not fit its memory.
@@ -132,7 +132,7 @@ class DetectorModule(pl.LightningModule):
             raise ValueError(f"DetectorModule: no gradient, and so no step to record, of {missed}")
 
         def moment(name: str) -> Tensor:
-            # Before its first step the optimiser holds none.
+            # The optimiser has no moments before its first step.
             return _flat(optimizer.state[value].get(name, torch.zeros_like(value)) for value in self._values)
 
         def state() -> State:
@@ -145,7 +145,7 @@ class DetectorModule(pl.LightningModule):
         self.steps_done = len(self._sizes)
 
     def on_train_end(self) -> None:
-        # All losses come to the host once, here: a trip in each epoch would let the device run dry.
+        # One transfer to the host for all losses: one in each epoch would stall the device.
         losses = torch.stack(self._losses).cpu().double().split(self._epochs)
         sizes = torch.tensor(self._sizes, dtype=torch.float64).split(self._epochs)
         pairs = zip(losses, sizes, strict=True)

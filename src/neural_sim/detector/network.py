@@ -31,7 +31,7 @@ class NormalisedBackbone(nn.Module):
 
 
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
-    """A number for each channel, made where ``like`` is instead of copied there."""
+    """A number for each channel, created on the device of ``like`` without a copy."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 

@@ -1,7 +1,7 @@
-"""Optimiser steps as pure functions of flat vectors, which training's derivative walks back through.
+"""Optimiser steps as pure functions of flat vectors, differentiated to reverse a training.
 
-A state is theta, then the rule's own buffers. A step is made of elementwise operations that autograd knows, so that its
-derivative is written nowhere twice.
+A state is theta, then the rule's buffers. A step consists of elementwise operations of torch, whose derivative autograd
+knows.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def pulled_back(
 ) -> tuple[list[Tensor], Float[Tensor, "n"]]:
     """Cotangents of a step's outcome pulled back onto its state, and onto its gradient.
 
-    That the gradient depends on theta is left to the caller: a product of the batch's Hessian with the second.
+    The caller adds that the gradient depends on theta: the batch's Hessian times the second.
     """
     leaves = [part.detach().requires_grad_() for part in (*state, gradient)]
     with torch.enable_grad():

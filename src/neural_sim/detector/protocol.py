@@ -34,10 +34,10 @@ class Detector(Protocol):
     """A detector for images of one size. It holds a shape and settings, never its parameters, which come in as an
     argument, so that losses can be differentiated any number of times, in forward and in reverse mode.
 
-    Its parameters are those of a backbone, which the psi loop freezes, and of what stands on its features. ``proximal``
-    is lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm start. A class is
-    made with ``num_classes`` and ``image_size``, (height, width) in pixels, by name, the rest comes from its file in
-    ``conf/detector``.
+    Its parameters are those of a backbone, which the psi loop freezes, and of what stands on its features.
+    ``proximal`` is lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm
+    start. A class is constructed with ``num_classes`` and ``image_size``, (height, width) in pixels, by name; other
+    arguments come from its file in ``conf/detector``.
     """
 
     proximal: float
@@ -55,7 +55,7 @@ class Detector(Protocol):
         ...
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """What the rest needs of images in [0, 1]: tensors with a row for each image."""
+        """The predictor's inputs for images in [0, 1]: tensors with a row for each image."""
         ...
 
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:

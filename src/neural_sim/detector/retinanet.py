@@ -183,11 +183,11 @@ class RetinaNet:
         """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
         :class:`Detections`."""
         backbone, trainable = self.split(params)
-        found, device = [], next(iter(trainable.values())).device
+        detections, device = [], next(iter(trainable.values())).device
         for chunk in images.split(batch_size) if len(images) else ():
             logits, deltas = self.outputs(trainable, self.features(backbone, chunk.to(device)))
-            found += self._chosen(logits.sigmoid(), deltas)
-        return found
+            detections += self._chosen(logits.sigmoid(), deltas)
+        return detections
 
     def _chosen(
         self, scores: Float[Tensor, "n anchors classes"], deltas: Float[Tensor, "n anchors 4"]

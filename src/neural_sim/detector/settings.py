@@ -1,4 +1,4 @@
-"""What a RetinaNet is made of, each part with what belongs together."""
+"""The settings of a RetinaNet, by component."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ class Backbone:
 
     Args:
         architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
-        weights: of the ResNets: None, a file with a torchvision state dictionary, or torchvision's name of the weights.
-        freeze: it keeps ``weights`` in every training. It is always frozen in the psi loop.
+        weights: initial weights of a ResNet: None (random), a file with a torchvision state dictionary, or
+        torchvision's name of the weights.
+        freeze: train the predictor only, in every training. In the psi loop the backbone is always frozen.
     """
 
     architecture: str = "tiny"
@@ -50,10 +51,10 @@ class Backbone:
 
 @dataclass(frozen=True)
 class Head:
-    """The feature pyramid, and the head that its levels share.
+    """The feature pyramid, and the head that is applied to all its levels.
 
     Args:
-        channels: of both, a multiple of 8.
+        channels: width of both, a multiple of 8.
         convs: convolutions in each branch of the head, 1 to 4.
         normalisation: of both, ``group`` or ``none`` (torchvision's own).
         prior: foreground probability that the untrained head predicts.
@@ -116,12 +117,13 @@ class Anchors:
 
 @dataclass(frozen=True)
 class Losses:
-    """What an anchor's error costs.
+    """The loss of an anchor's prediction.
 
     Args:
         box: ``pseudo_huber`` or ``l1`` (torchvision's own).
-        box_delta: scale of the pseudo-Huber loss, in encoded units.
-        focal_alpha, focal_gamma: of the focal loss.
+        box_delta: delta of the pseudo-Huber loss, in units of the box code (centre shifts in anchor sides, log size
+        ratios).
+        focal_alpha, focal_gamma: alpha and gamma of the focal loss (Lin et al. 2017, Eq. 5).
     """
 
     box: BoxLoss = "pseudo_huber"

@@ -23,7 +23,7 @@ THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
 
 @dataclass(frozen=True)
 class Ranked:
-    """One class's detections in all images, and what they found. Image by image, the best of an image first.
+    """One class's detections in all images and the boxes nearest to them, image by image, the best of an image first.
 
     ``overlaps`` are with the nearest box of the class in the image, 0 where there is none. ``image`` numbers the image
     of each, ``box`` its nearest box among all of the class, -1 for none. ``boxes`` is how many boxes the class has.
@@ -41,11 +41,11 @@ class SmoothAP:
     """Settings of the smooth AP.
 
     Args:
-        temperature: of a rank, in logits. AP's own ranks are the limit at 0.
-        width: of a true positive, in overlap. AP's own are the limit at 0.
+        temperature: width of the sigmoid of a rank, in logits; the AP itself is the limit at 0.
+        width: width of the sigmoid of a true positive, in overlap; the AP itself is the limit at 0.
         per_class: the best detections of an image that count for each class.
-        loss: what the loss of training counts beside it. A class that is never found has an AP of zero whatever psi
-            does, and only its loss tells the way.
+        loss: weight of the training loss beside the AP. The AP of a class without true positives is zero for any
+            small change of psi; only its loss has a gradient.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -70,56 +70,59 @@ class SmoothAP:
     ) -> Float[Tensor, "classes images"]:
         """What each image adds to every class's AP, which is the sum of a row; nan for a class without boxes."""
         rows = []
-        for found in ranked(detector, outputs, images, self.per_class):
-            row = found.logits.new_zeros(len(images))
+        for detections in ranked(detector, outputs, images, self.per_class):
+            row = detections.logits.new_zeros(len(images))
             rows.append(
-                row.index_add(0, found.image, self.of_class(found)) if found.boxes else row + torch.nan
+                row.index_add(0, detections.image, self.of_class(detections))
+                if detections.boxes
+                else row + torch.nan
             )
         return torch.stack(rows)
 
-    def of_class(self, found: Ranked) -> Float[Tensor, "m"]:
+    def of_class(self, detections: Ranked) -> Float[Tensor, "m"]:
         """What each detection adds to one class's AP, the mean over :data:`THRESHOLDS`.
 
         Raises:
             ValueError: for a class without boxes, whose AP does not exist.
         """
-        if found.boxes == 0:
+        if detections.boxes == 0:
             raise ValueError("smooth_ap: want at least one box of the class")
-        true = self.true_positives(found)
-        candidates = (found.box >= 0).nonzero().flatten()  # only they can be true
-        above = torch.sigmoid((found.logits - found.logits[candidates, None]) / self.temperature)
+        true = self.true_positives(detections)
+        candidates = (detections.box >= 0).nonzero().flatten()  # only they can be true
+        above = torch.sigmoid((detections.logits - detections.logits[candidates, None]) / self.temperature)
         # A detection ranks above itself by a half; in full it is 1.
-        above = above + 0.5 * (candidates[:, None] == torch.arange(len(found.box), device=above.device))
+        above = above + 0.5 * (candidates[:, None] == torch.arange(len(detections.box), device=above.device))
         precision = (above @ true) / above.sum(1, keepdim=True)
-        added = (true[candidates] * precision).mean(1) / found.boxes
-        return torch.zeros_like(found.logits).index_add(0, candidates, added)
+        added = (true[candidates] * precision).mean(1) / detections.boxes
+        return torch.zeros_like(detections.logits).index_add(0, candidates, added)
 
-    def true_positives(self, found: Ranked) -> Float[Tensor, "m thresholds"]:
+    def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
         """How far each detection is a true positive, at each overlap: as far as it overlaps its box, and as far as no
         better detection of the same box is one. Those of a box sum to at most 1."""
-        levels = found.overlaps.new_tensor(THRESHOLDS)
-        reached = torch.sigmoid((found.overlaps[:, None] - levels) / self.width)
-        reached = torch.where((found.box >= 0)[:, None], reached, 0.0)
-        left = torch.ones_like(reached)
+        levels = detections.overlaps.new_tensor(THRESHOLDS)
+        matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)
+        matched = torch.where((detections.box >= 0)[:, None], matched, 0.0)
+        unclaimed = torch.ones_like(matched)
         for back in range(1, self.per_class):
             # The detection ``back`` places before, if it is in the same image and at the same box.
-            before, same = reached.roll(back, 0), (found.box == found.box.roll(back)) & (found.box >= 0)
+            before, box = matched.roll(back, 0), detections.box
+            same = (box == box.roll(back)) & (box >= 0)
             same = same & (torch.arange(len(same), device=same.device) >= back)
-            left = left * torch.where(same[:, None], 1.0 - before, 1.0)
-        return reached * left
+            unclaimed = unclaimed * torch.where(same[:, None], 1.0 - before, 1.0)
+        return matched * unclaimed
 
 
 def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_class: int) -> list[Ranked]:
     """Each class's detections in these images, at most ``per_class`` of an image; differentiable in the outputs."""
-    found = detector.best(outputs, per_class)
-    labels, boxes = images.labels.to(found.image.device), images.boxes.to(found.boxes)
+    best = detector.best(outputs, per_class)
+    labels, boxes = images.labels.to(best.image.device), images.boxes.to(best.boxes)
     classes = []
     for number in range(outputs[0].shape[-1]):
-        own, present = found.label == number, labels == number
-        image = found.image[own]
-        overlaps, which = nearest_box(found.boxes[own], boxes[image], present[image])
+        own, present = best.label == number, labels == number
+        image = best.image[own]
+        overlaps, which = nearest_box(best.boxes[own], boxes[image], present[image])
         box = torch.where(which >= 0, image * labels.shape[1] + which, -1)
-        classes.append(Ranked(found.logits[own], overlaps, image, box, int(present.sum())))
+        classes.append(Ranked(best.logits[own], overlaps, image, box, int(present.sum())))
     return classes
 
 

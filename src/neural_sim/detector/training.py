@@ -22,7 +22,10 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class Training:
-    """What every detector trained from scratch gets, whatever the method that chose its images."""
+    """Training settings of every detector, whatever the method that chose its images.
+
+    ``image_size`` is the side of the square images in pixels; ``warm_epochs`` are those of the warm start,
+    ``cold_epochs`` those of the detectors that are scored. For the rest see :class:`Optimisation`."""
 
     image_size: int = 96
     images_per_object: int = 100
@@ -118,7 +121,7 @@ def train_detector(
 
 
 def _fit(module: DetectorModule, batches: Batches, device: torch.device) -> None:
-    """Run Lightning's loop with everything off that writes files or talks."""
+    """Run Lightning's loop without files and messages."""
     talker = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     level = talker.level
     talker.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""What is kept of a training, so that it can be walked backwards: its batches, learning rates, states and gradients."""
+"""The record of a training, for its reverse pass: batches, learning rates, states and gradients of the steps."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ MEGABYTE = 2**20
 
 @dataclass(frozen=True)
 class Recording:
-    """How much of a training is kept.
+    """How much of a training is recorded.
 
     Args:
-        part: of the steps, the last ones, that can be walked back through.
-        max_memory_mb: what is kept fits this. States are kept at every sqrt(steps)-th step and all gradients beside
-            them: steps in between are then repeated elementwise. Where gradients do not fit, they are computed again,
-            which costs one more training.
+        part: fraction of the steps, the last ones, that can be reversed.
+        max_memory_mb: limit of the record. It has the states of every sqrt(steps)-th step and all gradients; states in
+            between are recomputed elementwise. Gradients that do not fit are recomputed, which costs one more training.
 
     Raises:
         ValueError: either of these out of its range.
@@ -52,7 +51,7 @@ class Recording:
         """
         count = steps - self.first(steps)
         length = segment_length(count)
-        # States at the segments' first steps, then one segment's states and gradients while it is walked.
+        # States at the segments' first steps, then one segment's states and gradients while it is reversed.
         least = (math.ceil(count / length) + length) * state_bytes + length * vector_bytes
         if least > self.max_memory_mb * MEGABYTE:
             raise ValueError(
@@ -94,7 +93,7 @@ class Trajectory:
 
     @property
     def first(self) -> int:
-        """The first step that can be walked back through."""
+        """The first step that can be reversed."""
         return min(self.checkpoints)
 
     def segments(self) -> list[range]:
@@ -104,31 +103,31 @@ class Trajectory:
         return [range(begin, end) for begin, end in zip(starts, ends, strict=True)][::-1]
 
     def replayed(self, segment: range, gradient_at: GradientAt) -> list[tuple[State, Float[Tensor, "n"]]]:
-        """The state before each step of a segment, and its gradient: as kept, else ``gradient_at(theta, rows)``."""
-        found, state = [], self.checkpoints[segment.start]
+        """The state before each step of a segment, and its gradient: as recorded, else ``gradient_at(theta, rows)``."""
+        replayed, state = [], self.checkpoints[segment.start]
         for step in segment:
             gradient = self.gradients.get(step)
             if gradient is None:
                 gradient = gradient_at(state[0], self.rows[step])
-            found.append((state, gradient))
+            replayed.append((state, gradient))
             if step + 1 < segment.stop:
                 state = self.rule.step(state, gradient, self.rates[step], step)
-        return found
+        return replayed
 
 
 def segment_length(steps: int) -> int:
-    """Steps from one kept state to the next, at which the states kept and those of one segment are fewest together."""
+    """Steps between recorded states that minimise the number of recorded states plus those of one segment."""
     return max(1, math.isqrt(max(0, steps - 1)) + 1)
 
 
 class Recorder:
-    """Takes the steps of one training as they come.
+    """Records the steps of one training.
 
     Args:
-        recording: how much is kept.
-        rule: the optimiser's.
-        steps: that the training will take.
-        theta: of the size that will be trained.
+        recording: how much is recorded.
+        rule: the optimiser.
+        steps: number of steps of the training.
+        theta: the parameters, for their size and type.
 
     Raises:
         ValueError: where the states do not fit ``recording.max_memory_mb``.
@@ -149,7 +148,7 @@ class Recorder:
             )
 
     def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
-        """Note a step before it is made; ``state`` and ``gradient`` are asked for copies where they are kept."""
+        """Record a step before it is taken. ``state`` and ``gradient`` give copies where they are needed."""
         number = len(self._rates)
         self._rates.append(rate)
         if number < self._first:
@@ -177,6 +176,6 @@ def train(
     state = rule.begin(theta)
     for done, (batch, rate) in enumerate(zip(rows, rates, strict=True)):
         gradient = gradient_at(state[0], batch)
-        recorder.step(lambda held=state: held, lambda held=gradient: held, rate)
+        recorder.step(lambda value=state: value, lambda value=gradient: value, rate)
         state = rule.step(state, gradient, rate, done)
     return recorder.trajectory(rows, state[0])

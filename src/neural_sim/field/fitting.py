@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import pixels_across, visual_hull
-from neural_sim.field.objective import Fitting, Rendering, Rounds
+from neural_sim.field.objective import Fitting, RayBlocks, Rendering
 from neural_sim.field.occupancy import crop
 from neural_sim.field.pool import RayPool, build_pool
 from neural_sim.field.quadrature import composite, render_weights
@@ -64,13 +64,13 @@ class GridFitting(Fitting):
         self.field.reset(occupied, origin, cell)
         # A hull cell projects at most two of its own diagonals beyond the silhouette (see ``visual_hull``).
         border = pixels_across(views, math.sqrt(3.0) * cell)
-        self._rounds = Rounds(build_pool(views, border, generator))
+        self._blocks = RayBlocks(build_pool(views, border, generator))
         self._ready = []
 
     def next_batch(self) -> tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]:
         """The next rays with their samples and the cells of these."""
         if not self._ready:
-            block = self._rounds.draw(self.batch_rays * BATCHES_PER_BLOCK)
+            block = self._blocks.draw(self.batch_rays * BATCHES_PER_BLOCK)
             self._ready = self._batches(block, self.batch_rays)[::-1]
         return self._ready.pop()
 
@@ -106,7 +106,7 @@ class GridFitting(Fitting):
         largest = self.field.table.new_zeros(self.field.occupancy.count)
         size = self.batch_rays * BATCHES_PER_BLOCK
         for _ in range(math.ceil(self.prune_rays / size)):
-            block = self._rounds.draw(size)
+            block = self._blocks.draw(size)
             for rays, samples, cells in self._batches(block, size):
                 positions, _ = sample_points(rays.rays, samples)
                 weights = render_weights(self.field.density(self.field.raw(positions, cells)), samples)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.objective import Fitting, Rendering, Rounds
+from neural_sim.field.objective import Fitting, RayBlocks, Rendering
 from neural_sim.field.pool import build_pool
 from neural_sim.field.quadrature import composite
 from neural_sim.field.rendering import render_samples
@@ -28,11 +28,11 @@ class MLPFitting(Fitting):
         self.learning_rate = learning_rate
 
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
-        self._rounds = Rounds(build_pool(views, None, generator))
+        self._blocks = RayBlocks(build_pool(views, None, generator))
         self._generator = generator
 
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
-        batch = self._rounds.draw(self.batch_rays)
+        batch = self._blocks.draw(self.batch_rays)
         coarse = self.field.sample_coarse(batch.rays, self._generator)
         fine = self.field.sample_fine(batch.rays, coarse, self._generator)
         sigma, rgb = self.field.query_coarse(*sample_points(batch.rays, coarse))

@@ -67,7 +67,7 @@ class Fitting(ABC):
         """Parameter groups with their initial learning rates."""
 
 
-class Rounds:
+class RayBlocks:
     """Walks a shuffled pool block by block, from its beginning again when it is used up."""
 
     def __init__(self, pool: RayPool) -> None:

@@ -1,4 +1,4 @@
-"""What the steps of a training say of its images, summed over the steps: scores, and derivatives by their inputs."""
+"""Sums over the steps of a training: scores of images, and derivatives by their inputs."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from neural_sim.gradient.unrolled import Examples, InputsOf, Product, ReversedSt
 
 @dataclass(frozen=True)
 class Accumulated:
-    """Sums over the steps that were walked back through. ``along`` in step t is a_t of :mod:`gradient.unrolled`.
+    """Sums over the reversed steps; a_t is that of :mod:`gradient.unrolled`.
 
     ``images`` [N]: the derivative of L_val by each training image's weight, 1 in the means of its batches.
-    ``inputs``: that by the training images' inputs, which ``inputs_of`` makes; empty unless asked for.
+    ``inputs``: the derivative by the training images' inputs, which ``inputs_of`` computes; empty unless asked for.
     ``probes`` [m]: every probe's score, estimated from the steps that scored it; the mean over the probes of a bin is
-    unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to a number that all bins of a group share.
-    ``scored`` counts the pairs of a probe and a step that were scored.
+    unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group.
+    ``scored`` counts the scored pairs of a probe and a step.
     """
 
     images: Float[Tensor, "N"]
@@ -36,7 +36,7 @@ class Accumulated:
     def cotangents(
         self, leaves: tuple[Tensor, ...], index: Int[Tensor, "n"], chunk_size: int = 16
     ) -> tuple[Tensor, ...]:
-        """The derivative of L_val by images, and by their boxes where these move: that by the inputs pulled back.
+        """The derivative of L_val by images, and by boxes where they move, pulled back from that by the inputs.
 
         ``leaves`` are those of the rows ``index``, at most ``chunk_size`` of them in memory at a time.
 
@@ -49,24 +49,24 @@ class Accumulated:
         chunks = zip(index.split(chunk_size), *(leaf.split(chunk_size) for leaf in leaves), strict=True)
         for rows, *chunk in chunks:
             there = rows.to(self.inputs[0].device)
-            held = tuple(part.detach().requires_grad_() for part in chunk)
+            chunk_leaves = tuple(part.detach().requires_grad_() for part in chunk)
             with torch.enable_grad():
-                made = self.inputs_of(held, there)
-            # A frozen label is an input that no image moves.
+                inputs = self.inputs_of(chunk_leaves, there)
+            # The input of a frozen label depends on no image.
             moved = [
-                (x, pulled[there]) for x, pulled in zip(made, self.inputs, strict=True) if x.requires_grad
+                (x, pulled[there]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
             ]
             values, pulled = zip(*moved, strict=True)
-            parts.append(torch.autograd.grad(values, held, pulled, materialize_grads=True))
+            parts.append(torch.autograd.grad(values, chunk_leaves, pulled, materialize_grads=True))
         return tuple(torch.cat(column) for column in zip(*parts, strict=True))
 
 
 @dataclass(frozen=True)
 class ProbeGroups:
-    """The probes that steps score a few of.
+    """The probes, of which each step scores a sample.
 
-    Each group is a table [strata, per_bin] of rows of ``losses``: one object's images of one factor's bins, or under
-    its lights, where a column may be one scene. All groups have as many columns.
+    Each group is a table [strata, per_bin] of rows of ``losses``: one object's images of one factor's bins, or of the
+    same scenes (columns) under its lights. All groups have the same number of columns.
     """
 
     losses: IndexedLoss
@@ -84,7 +84,7 @@ class ProbeGroups:
 
     @property
     def count(self) -> int:
-        """Rows up to the largest in any group."""
+        """One above the largest row of any group."""
         return 1 + max(int(table.max()) for table in self.groups)
 
 
@@ -94,10 +94,10 @@ class Unrolled:
 
     Args:
         product: of a batch's Hessian with a vector, see :func:`gradient.unrolled.reversed_steps`.
-        part: of the steps, the last ones, that are walked back through; 1 is exact.
-        max_memory_mb: for what is kept of the training, see :class:`detector.trajectory.Recording`.
-        probes_per_step: of every bin, taken in turn from a shuffled order, that a step scores; 0: all of them.
-        score_every: steps from which one, drawn at random, stands for all in scoring probes.
+        part: fraction of the steps, the last ones, that are reversed; 1 is exact.
+        max_memory_mb: limit for the recorded training, see :class:`detector.trajectory.Recording`.
+        probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them.
+        score_every: length of the blocks of steps of which one, drawn at random, scores probes for all.
         chunk_size: probes whose losses are computed at a time.
 
     Raises:
@@ -121,7 +121,7 @@ class Unrolled:
 
     @property
     def recording(self) -> Recording:
-        """What a training must keep for this."""
+        """What a training must record."""
         return Recording(self.part, self.max_memory_mb)
 
     def accumulate(
@@ -134,15 +134,15 @@ class Unrolled:
         probes: ProbeGroups | None = None,
         with_inputs: bool = False,
     ) -> Accumulated:
-        """Walk back through a training from ``slope``, its outcome's ``dL_val/dtheta``.
+        """Reverse a training from ``slope``, ``dL_val/dtheta`` after its last step.
 
-        ``like`` gives the parameters' names and shapes. ``generator`` draws which probes are scored where.
+        ``like`` gives the parameters' names and shapes. ``generator`` draws which probes each step scores.
         """
         steps = reversed_steps(trajectory, examples, like, slope, self.product, with_inputs)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
-        turns = places(per_bin, self.probes_per_step or per_bin, generator)
-        weights = standing(len(trajectory) - trajectory.first, self.score_every, generator)
+        columns = probe_columns(per_bin, self.probes_per_step or per_bin, generator)
+        weights = step_weights(len(trajectory) - trajectory.first, self.score_every, generator)
         images = torch.zeros_like(slope[:1]).expand(len(examples.inputs[0])).clone()
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if with_inputs else ()
         for step in steps:
@@ -150,13 +150,13 @@ class Unrolled:
             for into, part in zip(inputs, step.inputs, strict=True):
                 into.index_add_(0, step.rows, part)
             if scoring is not None and (weight := next(weights)):
-                scoring.add(step, next(turns), weight)
+                scoring.add(step, next(columns), weight)
         total, scored = (slope.new_zeros(0), 0) if scoring is None else (scoring.total, scoring.scored)
         return Accumulated(images, inputs, total, scored, examples.inputs_of)
 
 
 class _Scoring:
-    """Sums of probes' scores, from the steps that score them."""
+    """Running sums of the probes' scores."""
 
     def __init__(self, probes: ProbeGroups, like: Tensor, chunk_size: int) -> None:
         self.losses, self.per_bin, self.chunk_size = probes.losses, probes.per_bin, chunk_size
@@ -165,7 +165,7 @@ class _Scoring:
         self._levels: list[Tensor] = []
 
     def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: int) -> None:
-        """One step's scores of the probes in some columns, standing for all columns and ``weight`` steps."""
+        """Add one step's scores of the probes in some columns, scaled up to all columns and ``weight`` steps."""
         columns = chosen.to(self.total.device)
         rows = [table[:, columns].reshape(-1) for table in self.tables]
         along = scores(
@@ -174,15 +174,17 @@ class _Scoring:
         parts = along.split([part.numel() for part in rows])
         means = [part.mean() for part in parts]
         scale = weight * self.per_bin / len(columns)
-        # What all bins share moves nothing, and would be noise wherever probes are scored unequally often. It is taken
-        # from the step before: a mean of these scores themselves would hide a part of their own noise.
+        # A common offset moves nothing, but is noise where probes are scored unequally often. It is estimated from the
+        # step before: the mean of these same scores would correlate with their noise.
         for into, part, level in zip(rows, parts, self._levels or means, strict=True):
             self.total.index_add_(0, into, scale * (part - level))
         self._levels, self.scored = means, self.scored + len(along)
 
 
-def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[Int[Tensor, "per_step"]]:
-    """``per_step`` columns at a time from shuffled decks of all: each is as likely as any other in every turn."""
+def probe_columns(
+    columns: int, per_step: int, generator: torch.Generator
+) -> Iterator[Int[Tensor, "per_step"]]:
+    """``per_step`` columns at a time from shuffled passes over all: each is equally likely in every batch."""
     left = torch.zeros(0, dtype=torch.long)
     while True:
         while len(left) < per_step:
@@ -191,9 +193,9 @@ def places(columns: int, per_step: int, generator: torch.Generator) -> Iterator[
         left = left[per_step:]
 
 
-def standing(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
-    """For each step how many it stands for: one of every ``every`` in a row, drawn at random, for all of those."""
+def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
+    """Each step's weight: the block's length for one random step of each block of ``every`` steps, 0 for others."""
     for first in range(0, steps, every):
         block = min(every, steps - first)
         chosen = int(torch.randint(block, (), generator=generator))
-        yield from (block if place == chosen else 0 for place in range(block))
+        yield from (block if step == chosen else 0 for step in range(block))

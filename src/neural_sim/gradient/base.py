@@ -1,6 +1,6 @@
-"""What the estimators of ``d/dpsi <dL_train/dtheta, v>`` share: their inputs, their result, small protocols.
+"""Inputs and result of the estimators of ``d/dpsi <dL_train/dtheta, v>``.
 
-No estimator knows of the implicit function theorem's minus sign; it is written once, in ``hypergradient.py``.
+The implicit function theorem's minus sign is not theirs: it is applied once, in ``hypergradient.py``.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Params = dict[str, Tensor]
 
 
 class IndexedLoss(Protocol):
-    """Losses of training images by row, from whatever is cached of them (features of a frozen backbone)."""
+    """Losses of training images by row, from cached features of a frozen backbone."""
 
     def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]: ...
 
 
 class ImageLoss(Protocol):
-    """Losses of training images, differentiable (twice in all) in parameters and images; targets by row ``index``.
+    """Losses of training images, twice differentiable in parameters and images; targets by row ``index``.
 
-    Where ``boxes`` are given, they take the place of those rows' boxes, and the losses are differentiable in them too.
+    ``boxes``, where given, replace those rows' boxes; the losses are differentiable in them too.
     """
 
     def __call__(
@@ -43,7 +43,7 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class Probes:
-    """Images of one object drawn from every bin of one factor on purpose: their rows among all probes, and bins."""
+    """Probes of one object: images of every bin of one factor. ``index`` are their rows among all probes."""
 
     index: Int[Tensor, "m"]
     bins: Int[Tensor, "m"]
@@ -60,13 +60,13 @@ class Losses:
 
 @dataclass(frozen=True)
 class RenderedPath:
-    """How one object's images came from psi, so that the way can be walked again with derivatives.
+    """How one object's images were computed from psi, to be computed again with derivatives.
 
     ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to premultiplied colour
     [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images with the
     nuisance bound, ``boxes`` opacity maps to the images' boxes where the boxes' derivative is wanted. ``rgb`` and
-    ``opacity`` are the first render's. ``tangents``, where that render carried them (forward mode), hold the maps'
-    derivatives by the numbers of the draw that psi moves.
+    ``opacity`` are the first render's. ``tangents`` (forward mode only) are the maps' derivatives by
+    the draw's numbers that depend on psi, from that same render.
     """
 
     relaxed: Callable[[Float[Tensor, "K"]], SceneDraw]
@@ -103,9 +103,9 @@ class ObjectImages:
 class MixedDerivative:
     """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
-    ``standard_error`` is that of ``value`` over draws of the images (v held fixed); inf where it cannot be
-    told. ``p_values``, by factor of psi, are those of the null that all components of that factor are zero, over the
-    same draws; none where nothing was tested.
+    ``standard_error`` is that of ``value`` over draws of the images at fixed v; inf where it is unknown. ``p_values``,
+    by factor of psi, are those of the null that all components of that factor are zero, over the same draws; empty
+    where nothing was tested.
     """
 
     value: Float[Tensor, "K"]
@@ -114,7 +114,7 @@ class MixedDerivative:
 
 
 def group_sums(contributions: Float[Tensor, "n K"], group: int) -> Float[Tensor, "groups K"]:
-    """Contributions of every ``group`` of consecutive images together.
+    """Contributions summed over every ``group`` of consecutive images.
 
     Raises ``ValueError`` for a number of images that does not divide into groups.
     """

@@ -1,4 +1,4 @@
-"""The estimators by name: which images each draws, and which derivative it takes of them."""
+"""The estimators as configured: which images each draws, and how it estimates the derivative from them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from neural_sim.synthesis.scene import Draws, HardDraws
 class Estimator(Protocol):
     """How psi's derivative is estimated from images.
 
-    ``draws`` says how an iteration's images are drawn; ``probes_per_bin`` how many images of every stratum of every
-    factor are made beside them (0: none); ``through_images`` whether :meth:`accumulated` wants the derivatives by the
-    training images' inputs.
+    ``draws`` says how an iteration's images are drawn. ``probes_per_bin`` is the number of further images of every
+    stratum of every factor (0: none). ``through_images``: :meth:`accumulated` needs the derivatives by the training
+    images' inputs.
     """
 
     through_images: ClassVar[bool]
@@ -48,7 +48,7 @@ class Estimator(Protocol):
         ...
 
     def accumulated(
-        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+        self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
         """``dL_val/dpsi`` of one object through the training that was run, sign included."""
         ...
@@ -56,10 +56,10 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Mean scores of every bin of every factor, and under every anchor light, from images drawn from it on purpose, see
-    :mod:`gradient.stratified`.
+    """Stratified sampling: mean scores of every bin of every factor, and under every anchor light, from probes of each
+    (:mod:`gradient.stratified`).
 
-    An outer iteration pays one Jacobian-vector product over the predictor for its probes, taken as ``theta_mode`` says
+    An outer iteration costs one Jacobian-vector product over the predictor for its probes, computed by ``theta_mode``
     (see :func:`gradient.mixed.scores`).
     """
 
@@ -91,7 +91,8 @@ class StratifiedEstimator:
     ) -> MixedDerivative:
         """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
-        The null of its significance is that a factor's bins, or lights, have one mean score: then the value is zero.
+        The null of its significance is that a factor's bins, or lights, have the same mean score, for which the value
+        is zero.
         """
         scored = losses.probes
         if scored is None:
@@ -103,10 +104,10 @@ class StratifiedEstimator:
         )
 
     def accumulated(
-        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+        self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
         """``dL_val/dpsi`` of one object through the training that was run, sign included."""
-        return self._over_strata(lambda index: found.probes[index.to(found.probes.device)], images, probes)
+        return self._over_strata(lambda index: sums.probes[index.to(sums.probes.device)], images, probes)
 
     def _over_strata(
         self, scored: Callable[[Tensor], Tensor], images: ObjectImages, probes: Mapping[str, Probes]
@@ -116,12 +117,12 @@ class StratifiedEstimator:
             raise ValueError(
                 f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
             )
-        share, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
+        weight, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
         for factor in distribution.factors:
-            held = probes[factor.name]
-            along = scored(held.index).to(images.psi)
-            parts[factor.name] = by_strata(along, held.bins, factor, psi[factor.name], share)
-            p_values[factor.name] = _told_apart(along, held.bins, factor)
+            own = probes[factor.name]
+            along = scored(own.index).to(images.psi)
+            parts[factor.name] = by_strata(along, own.bins, factor, psi[factor.name], weight)
+            p_values[factor.name] = _equal_means(along, own.bins, factor)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
@@ -138,12 +139,12 @@ class ReinforceEstimator:
 
     @property
     def draws(self) -> HardDraws:
-        """Samples of p_psi that have a density."""
+        """Samples of p_psi with a density."""
         return HardDraws(explore=True)
 
     @property
     def probes_per_bin(self) -> int:
-        """None: an iteration's own images are scored."""
+        """0: the iteration's own images are scored."""
         return 0
 
     def estimate(
@@ -163,27 +164,27 @@ class ReinforceEstimator:
         )
 
     def accumulated(
-        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+        self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
         """``dL_val/dpsi`` of one object through the training that was run, sign included."""
-        by_weight = found.images[images.index.to(found.images.device)]
+        by_weight = sums.images[images.index.to(sums.images.device)]
         return self._by_score_function(by_weight / images.weights.to(by_weight), images)
 
     def _by_score_function(self, along: Tensor, images: ObjectImages) -> MixedDerivative:
         along = along.to(images.psi)
-        share = float(images.weights.sum())
+        weight = float(images.weights.sum())
 
         def log_prob(psi: Tensor) -> Tensor:
             return images.distribution.log_prob(psi, images.draw)
 
         drawn = images.distribution.statistics(images.draw)
         p_values = {name: no_association(along, values) for name, values in drawn.items()}
-        return replace(reinforce(along, log_prob, images.psi, share), p_values=p_values)
+        return replace(reinforce(along, log_prob, images.psi, weight), p_values=p_values)
 
 
-def _told_apart(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
-    """p-value of the null that all bins, or all lights, have one mean score; the same scenes are seen under one light
-    after the other."""
+def _equal_means(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
+    """p-value of the null that all bins, or all lights, have the same mean score. Lights are compared on the same
+    scenes."""
     if factor.same_scenes:
         return no_difference(scores.view(factor.size, -1).T)
     return no_association(scores, one_hot(strata, factor.size))

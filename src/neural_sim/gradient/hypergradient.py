@@ -36,10 +36,10 @@ class InnerProblem:
     """``L_train(theta) = sum_i w_i l_i(theta) + proximal / 2 |theta - anchor|^2`` at its (near) minimiser
     ``params``.
 
-    ``weights`` [N] belong to rows 0..N-1 of ``losses``; 1 / N each for plain draws. At most ``chunk_size`` images are
-    in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term: with it ``(H + proximal I)^-1`` is the
-    problem's exact derivative. ``subset`` limits Hessian products (not the stationarity) to these rows, their weights
-    scaled up to the same sum.
+    ``weights`` [N] are those of rows 0..N-1 of ``losses``; 1 / N each for independent draws. At most ``chunk_size``
+    images are in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term: with it ``(H + proximal
+    I)^-1`` is the problem's exact derivative. ``subset`` limits Hessian products (not the stationarity) to these rows,
+    their weights scaled up to the same sum.
     """
 
     params: Params
@@ -63,7 +63,7 @@ class InnerProblem:
             raise ValueError("inner problem: a proximal term needs its anchor theta_0")
 
     def terms(self, subset: Tensor | None = None) -> list[Term]:
-        """The loss as a sum of chunks (and the proximal term), of all rows or of a subset standing for all."""
+        """The loss as a sum over chunks (and the proximal term), of all rows or of a subset scaled up to all."""
         index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
         weights = self.weights[index]
         if subset is not None:
@@ -87,9 +87,8 @@ class Hypergradient:
     ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
     unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
     ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve (or
-    unrolled), mixed. ``raises`` counts how often lambda had to be raised. Where training was unrolled, ``solution``
-    says so: its steps are those walked back through, its products their Hessian's, its value ``dL_val/dtheta``; there
-    is no damping.
+    unrolled), mixed. ``damping_raises`` counts the increases of lambda. Where training was unrolled, ``solution`` has
+    status UNROLLED, the reversed steps as steps and products, and ``dL_val/dtheta`` as value; there is no damping.
     """
 
     psi_gradients: dict[str, Float[Tensor, "k"]]
@@ -101,7 +100,7 @@ class Hypergradient:
     stationarity: float
     validation_norm: float
     seconds: dict[str, float] = field(default_factory=dict)
-    raises: int = 0
+    damping_raises: int = 0
 
 
 def hypergradient(
@@ -115,9 +114,8 @@ def hypergradient(
     """Eq. 2 for every object.
 
     ``validation`` are the terms of L_val as functions of the parameters. ``estimates`` maps an object's name
-    to its estimator with the object's images bound, a function of v giving ``d/dpsi <dL_train/dtheta, v>``.
-    ``previous`` warms the solve. A failed solve leaves v at the best iterate: the caller reads
-    ``solution.status``.
+    to a function from v to ``d/dpsi <dL_train/dtheta, v>``.
+    ``previous`` is the solve's initial guess. A failed solve returns the best iterate: read ``solution.status``.
     """
     began = time.perf_counter()
     right_hand_side = gradient(validation, inner.params)
@@ -151,7 +149,7 @@ def hypergradient(
         stationarity=stationarity,
         validation_norm=norm(right_hand_side),
         seconds=seconds,
-        raises=adjoint.raises,
+        damping_raises=adjoint.damping_raises,
     )
 
 
@@ -169,17 +167,17 @@ def unrolled_hypergradient(
     """The derivative of the training that was run, for every object.
 
     ``trajectory`` is that training, of ``examples``, which ended at ``inner.params``. ``estimates`` maps an object's
-    name to what its estimator makes of the sums over the steps. ``probes`` and ``with_inputs`` say what is summed up.
+    name to its estimator as a function of the sums over the steps. ``probes`` and ``with_inputs`` say what is summed.
     """
     began = time.perf_counter()
     slope = gradient(validation, inner.params)
     stationarity = norm(gradient(inner.terms(), inner.params))
     validated = time.perf_counter()
-    found = unrolled.accumulate(trajectory, examples, inner.params, slope, generator, probes, with_inputs)
+    sums = unrolled.accumulate(trajectory, examples, inner.params, slope, generator, probes, with_inputs)
     walked = time.perf_counter()
-    parts = {name: estimate(found) for name, estimate in estimates.items()}
+    parts = {name: estimate(sums) for name, estimate in estimates.items()}
     steps = len(trajectory) - trajectory.first
-    finite = bool(found.images.isfinite().all())
+    finite = bool(sums.images.isfinite().all())
     solution = Solution(
         slope, Status.UNROLLED if finite else Status.NON_FINITE, steps, 0.0, (0.0, 0.0), steps, False
     )

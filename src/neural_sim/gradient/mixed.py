@@ -1,7 +1,6 @@
-"""The mixed second derivative of the training loss, contracted with v before anything large exists (paper,
-Tool 2).
+"""The mixed second derivative of the training loss, contracted with v first (paper, Tool 2).
 
-Contracting with v first leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one
+That leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one
 image-sized array, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
 """
 
@@ -116,7 +115,7 @@ _ALONG = {
 
 
 def _device(params: Params) -> torch.device:
-    """Where losses are computed: rows and weights, made on the CPU, are taken there once."""
+    """Where losses are computed: rows and weights, which are on the CPU, are moved there once."""
     return next(iter(params.values())).device
 
 

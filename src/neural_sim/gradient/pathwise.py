@@ -1,10 +1,11 @@
 """The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eqs. 3 to 6).
 
-Reverse mode is the paper's. First forward: images without derivatives (the scene's). Then v and the images' cotangents.
-Second forward: rays of one patch at a time, replayed from the same draw, each backward at once into the draw's few
-numbers per image. Forward mode: V has a few numbers per image and an image has thousands, so the first render carries
-the maps' derivatives by the numbers that psi moves, and there is neither a second render nor a patch; the cotangents
-are contracted with them. Either way the chain from psi to the draw is walked once, at the end.
+Reverse mode is the paper's. The first forward pass renders images without derivatives. Then v and the images'
+cotangents are computed. The second forward pass renders rays of one patch at a time from the same draw, each patch
+followed by its backward pass into the draw's few numbers per image. Forward mode: V has a few numbers per image and an
+image has thousands, so the first render also computes the maps' derivatives by those numbers, and the cotangents are
+contracted with them; there is no second render and no patch. Either way the draw is differentiated by psi once, at the
+end.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class PathwiseEstimator:
 
     @property
     def probes_per_bin(self) -> int:
-        """None: an iteration's own images are differentiated."""
+        """0: the iteration's own images are differentiated."""
         return 0
 
     @property
@@ -118,14 +119,14 @@ class PathwiseEstimator:
         return self._through_images(path, cotangents, images)
 
     def accumulated(
-        self, found: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
+        self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
         """``dL_val/dpsi`` of one object through the training that was run, sign included.
 
         Raises ``ValueError`` for images without a path.
         """
         path = _path(images)
-        cotangents = found.cotangents(_inputs(images, path), images.index, self.chunk_size)
+        cotangents = sums.cotangents(_inputs(images, path), images.index, self.chunk_size)
         return self._through_images(path, cotangents, images)
 
     def _through_images(
@@ -134,12 +135,12 @@ class PathwiseEstimator:
         maps = map_cotangents(path, *cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
-            # Light's derivatives, a few numbers, ride along in any mode; those of the camera only in forward mode.
+            # The first render computes derivatives by lights in any mode, those by the camera in forward mode only.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         # From here on a few numbers an image, on the CPU as psi and the draws are.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
         sums = group_sums(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
-        # What is common to a factor's components moves no distribution, and no weights of lights.
+        # An offset common to a factor's components changes neither its distribution nor its weights of lights.
         parts = images.distribution.split(sums).items()
         p_values = {name: zero_mean(part - part.mean(-1, keepdim=True)) for name, part in parts}
         return replace(from_contributions(sums), p_values=p_values)
@@ -152,7 +153,7 @@ def _path(images: ObjectImages) -> RenderedPath:
 
 
 def _inputs(images: ObjectImages, path: RenderedPath) -> tuple[Tensor, ...]:
-    """What moves with psi: the images, and their boxes where those do."""
+    """The images, and their boxes where these depend on psi."""
     return (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
 
 
@@ -164,11 +165,11 @@ def map_cotangents(
     """Cotangents of images, and of boxes where they move, pulled back through the compositing onto the maps."""
     rgb, opacity = path.rgb.detach().requires_grad_(), path.opacity.detach().requires_grad_()
     with torch.enable_grad():
-        made, pulled = [path.compose(rgb, opacity)], [image_cotangents]
+        composed, cotangents = [path.compose(rgb, opacity)], [image_cotangents]
         if path.boxes is not None and box_cotangents is not None:
-            made.append(path.boxes(opacity))
-            pulled.append(box_cotangents)
-    return Maps(*torch.autograd.grad(made, (rgb, opacity), pulled, materialize_grads=True))
+            composed.append(path.boxes(opacity))
+            cotangents.append(box_cotangents)
+    return Maps(*torch.autograd.grad(composed, (rgb, opacity), cotangents, materialize_grads=True))
 
 
 def draw_cotangents(
@@ -176,8 +177,7 @@ def draw_cotangents(
 ) -> dict[str, Float[Tensor, "n"]]:
     """Cotangents of the draw's coordinates: the second forward and the only backward (Tools 2, 3).
 
-    Memory is that of ``patch_size`` rays. Pixels whose cotangent is exactly zero are left out, which changes
-    nothing.
+    Memory is that of ``patch_size`` rays. Pixels whose cotangent is exactly zero are skipped, which is exact.
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
@@ -211,11 +211,10 @@ def psi_contributions(
     psi: Float[Tensor, "K"],
     cotangents: Mapping[str, Float[Tensor, "n"]],
 ) -> Float[Tensor, "n K"]:
-    """Every image's part in the derivative by psi: its draw's cotangents through the replayed relaxed draw
-    (Tool 1).
+    """Every image's contribution to the derivative by psi: its draw's cotangents through the relaxed draw (Tool 1).
 
-    Rows sum to the vector-Jacobian product; they are kept apart for the standard error. psi has fewer numbers than
-    there are images, so that forward mode, one pass for each number, is the cheap way to all rows.
+    Rows sum to the vector-Jacobian product; the standard error needs them apart. psi has fewer numbers than there are
+    images, so forward mode, one pass for each number, is the cheap way to all rows.
     """
 
     def along(psi: Tensor) -> Tensor:

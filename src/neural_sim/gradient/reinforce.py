@@ -15,9 +15,9 @@ def reinforce(
     scores: Float[Tensor, "n"],
     log_prob: Callable[[Float[Tensor, "K"]], Float[Tensor, "n"]],
     psi: Float[Tensor, "K"],
-    share: float = 1.0,
+    weight: float = 1.0,
 ) -> MixedDerivative:
-    """``share * d/dpsi E[s]`` from n >= 2 independent draws: mean of ``(s_i - b_i) dlog p(V_i)/dpsi``.
+    """``weight * d/dpsi E[s]`` from n >= 2 independent draws: the mean of ``weight (s_i - b_i) dlog p(V_i)/dpsi``.
 
     ``b_i`` is the mean of the other draws' scores, hence independent of draw i: the estimate stays unbiased.
     ``log_prob`` maps psi to the draws' log-probabilities. Raises ``ValueError`` for fewer than 2 draws.
@@ -39,4 +39,4 @@ def reinforce(
         torch.autograd.grad(entry, leaf, retain_graph=True, materialize_grads=True)[0]
         for entry in log_probabilities
     ]
-    return from_contributions(share / count * advantage[:, None] * torch.stack(slopes))
+    return from_contributions(weight / count * advantage[:, None] * torch.stack(slopes))

@@ -1,11 +1,11 @@
 """Whether a derivative can be told from zero: p-values for all components of one factor of psi together.
 
 The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2`` of per-image contributions c to the derivative. Every
-component is divided by a variance of its own, so that bins whose scores scatter more, and rare bins, weigh no more than
-others; an image alone in its bin adds about 1 to Q whatever its score. Q's distribution under the null is not looked up
-but made from the data, by changing them at random in ways that the null allows. The p-value is the part of the changed
-data, and the data themselves, whose Q is at least the data's. The level is exact, whatever the scores' law, where the
-changes leave that law as it is (Phipson and Smyth 2010). The random changes are the same in every call.
+component is divided by its own variance, so that bins of scattered scores and rare bins weigh no more than others; an
+image alone in its bin adds about 1 to Q whatever its score. Q's distribution under the null comes from resampling: the
+data are changed at random in ways that the null allows. The p-value is the fraction of the resampled data, and the data
+themselves, whose Q is at least the data's. The level is exact, whatever the scores' distribution, where the changes
+leave that distribution invariant (Phipson and Smyth 2010). The random changes are the same in every call.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
     """p-value of the null that independent ``rows`` have mean zero, by random changes of their signs.
 
     Exact for rows symmetric about zero, whatever their tails, their variances and the dependence between their
-    components. Rows of zeros tell nothing: with m others the p-value is at least about 2^(1 - m). 1 for rows that are
+    components. Rows of zeros add nothing: with m others the p-value is at least about 2^(1 - m). 1 for rows that are
     not finite.
     """
     rows = _scaled(rows.double())
@@ -104,8 +104,8 @@ def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "*d k"]) -> F
 
 
 def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
-    """Values without their mean, in a unit of their own. What all share is taken out first: equal values give exactly
-    0, not the rounding of a sum."""
+    """Values without their mean, in a unit of their own. The first value is subtracted beforehand: equal values give
+    exactly 0, not a rounding error."""
     apart = values - values[:1]
     return _scaled(apart - apart.mean(0))
 

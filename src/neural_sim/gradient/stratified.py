@@ -1,9 +1,9 @@
 """The derivative over hard bins: with ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is
-``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits without a floor ``p_i (s_i - sum_j p_j s_j)``. And a difference of mean
-scores that stands for the derivative by lights, :func:`across_lights`.
+``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits without a floor ``p_i (s_i - sum_j p_j s_j)``. For lights, differences
+of mean scores take the place of the derivative, :func:`across_lights`.
 
-Only mean scores are estimated, so every bin is drawn on purpose instead of waiting for p to draw it, and
-the renderer is never differentiated.
+Only mean scores are estimated: every bin is sampled by itself (stratified sampling), whatever p, and the renderer is
+never differentiated.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
 
 def importance_weights(
-    probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], share: float = 1.0
+    probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], weight: float = 1.0
 ) -> Float[Tensor, "n"]:
-    """Weights ``share p_b / n_b`` under which images drawn on purpose from bins train as if p had drawn them.
+    """Weights ``weight p_b / n_b`` under which images of prescribed bins train as if drawn from p.
 
-    ``share`` is the object's part of the training set. They sum to ``share`` when every bin of positive p was
-    drawn; the mass of bins left out is missing, not spread over the others.
+    ``weight`` is the object's fraction of the training set. The weights sum to it when every bin of positive p was
+    drawn; the mass of other bins is missing, not redistributed.
     """
     counts = torch.bincount(bins, minlength=probabilities.numel())
-    return share * (probabilities / counts.clamp_min(1))[bins]
+    return weight * (probabilities / counts.clamp_min(1))[bins]
 
 
 def stratified(
@@ -39,12 +39,12 @@ def stratified(
     bins: Int[Tensor, "n"],
     psi: Float[Tensor, "k"],
     log_probabilities: LogProbabilities,
-    share: float = 1.0,
+    weight: float = 1.0,
 ) -> MixedDerivative:
-    """``share * dE/dpsi`` from scores of images of known bins, however many each bin has.
+    """``weight * dE/dpsi`` from scores of images of known bins, however many each bin has.
 
-    A bin without images takes the p-weighted mean of the others as its mean score (logged), which is the
-    value at which it says nothing, and infinite standard error. Variances within bins are pooled for bins of
+    A bin without images gets the p-weighted mean score of the others (logged), at which its own derivative is zero, and
+    an infinite standard error. Variances within bins are pooled for bins of
     one image.
     """
     _check(scores, bins, psi)
@@ -54,16 +54,16 @@ def stratified(
     means = total / counts.clamp_min(1.0)
     variance = _variance_of_means(scores - means[bins], bins, counts)
     p, slopes = _jacobian(log_probabilities, psi)
-    # What all bins share moves nothing: taken out first, equal scores give 0 and not the rounding of a sum.
+    # A common offset moves nothing. Subtracted first, equal scores give exactly 0 instead of a rounding error.
     means = torch.where(seen, means - means[seen][0], 0.0)
     if not bool(seen.all()):
         logger.info("stratified: bins %s have no images", (~seen).nonzero().flatten().tolist())
         mass = p[seen].sum()  # 0 where p is one-hot on a bin without images
         mean = (p * means)[seen].sum() / mass if mass > 0.0 else means[seen].mean()
         means = torch.where(seen, means, mean)
-    # A slope of zero makes a bin's unknown mean harmless; 0 * inf would not say so.
+    # A bin of slope 0 adds nothing, also where its variance is infinite: 0 * inf would be NaN.
     spread = torch.where(slopes == 0.0, torch.zeros_like(slopes), slopes.square() * variance[:, None])
-    return MixedDerivative(share * (means @ slopes), share * spread.sum(0).sqrt())
+    return MixedDerivative(weight * (means @ slopes), weight * spread.sum(0).sqrt())
 
 
 def by_strata(
@@ -71,25 +71,24 @@ def by_strata(
     strata: Int[Tensor, "n"],
     factor: Factor,
     psi: Float[Tensor, "k"],
-    share: float = 1.0,
+    weight: float = 1.0,
 ) -> MixedDerivative:
-    """The derivative by one factor's psi from the scores of its probes, by :func:`stratified`; for lights what stands
-    for it, :func:`across_lights`."""
+    """The derivative by one factor's psi from the scores of its probes, by :func:`stratified`; for lights
+    :func:`across_lights` instead."""
     if factor.same_scenes:
-        return across_lights(scores, factor.size, share)
-    return stratified(scores, strata, psi, factor.log_probabilities, share)
+        return across_lights(scores, factor.size, weight)
+    return stratified(scores, strata, psi, factor.log_probabilities, weight)
 
 
-def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -> MixedDerivative:
-    """``share * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights. What is
-    common to all is left out, since the constraint takes it back.
+def across_lights(scores: Float[Tensor, "n"], lights: int, weight: float = 1.0) -> MixedDerivative:
+    """``weight * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights. What is
+    common to all lights is subtracted, since the projection onto the constraint removes it.
 
-    They are no derivative of the training loss by psi, whose weights blend the lights in every image
-    (``gradient=pathwise`` takes that one). They are the derivative of another training set's loss: one of images under
-    single lights, a part w_i of them under light i. It is taken in its place because, where one light is bent all the
-    way into another, the derivative by the blend says little: a detector that never saw the other light gains nothing
-    from a trace of it (docs/numerics.md, Lights: both beside the truth). ``scores`` are those of the same scenes under
-    one light after the other.
+    This is not the derivative of the training loss by psi, whose weights blend the lights in every image
+    (``gradient=pathwise`` computes that one). It is the derivative for another training set: images under single
+    lights, a fraction w_i of them under light i. It replaces the derivative by the blend, which says little about a
+    large change of light: a detector that never saw a light gains nothing from a trace of it (docs/numerics.md, Lights,
+    compares both with the truth). ``scores`` are those of the same scenes under one light after the other.
     """
     if lights < 1 or scores.ndim != 1 or scores.numel() == 0 or scores.numel() % lights:
         raise ValueError(
@@ -99,7 +98,7 @@ def across_lights(scores: Float[Tensor, "n"], lights: int, share: float = 1.0) -
     apart = table - table.mean(0)
     count = table.shape[1]
     error = apart.std(1) / count**0.5 if count > 1 else torch.full_like(apart[:, 0], torch.inf)
-    return MixedDerivative(share * apart.mean(1), share * error)
+    return MixedDerivative(weight * apart.mean(1), weight * error)
 
 
 def _variance_of_means(residuals: Tensor, bins: Tensor, counts: Tensor) -> Float[Tensor, "k"]:

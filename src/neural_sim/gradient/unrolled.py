@@ -1,14 +1,14 @@
 """The derivative of the training that was run: reverse mode through its optimiser's steps.
 
-The implicit adjoint asks for a stationary point; a dozen epochs end at none. With lambda_t the derivative of L_val by
-the state before step t (theta and the optimiser's moments), each step back takes
+The implicit adjoint assumes a stationary point; a dozen epochs do not reach one. With lambda_t the derivative of L_val
+by the state before step t (theta and the optimiser's moments), each step back takes
 
     a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
     lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
 
 H_t the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta, a_t>``:
-summed over the steps, this score takes the place of ``-<dl/dtheta, v>``; its sign is that of the derivative already.
-Baydin and Pearlmutter 2014, Maclaurin et al. 2015, with states kept instead of reversed.
+summed over the steps, this score replaces ``-<dl/dtheta, v>``; it already has the derivative's sign (Baydin and
+Pearlmutter 2014; Maclaurin et al. 2015, with states stored instead of recomputed backwards).
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class LossesFrom(Protocol):
 
 @dataclass(frozen=True)
 class Examples:
-    """What a training's batches were made of.
+    """A training's examples and their losses.
 
-    ``inputs`` [N, ...] are what losses are differentiated by where images move. The steps minimised a batch's mean loss
-    plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` makes these inputs of images, and of boxes where these move,
-    given with their rows.
+    ``inputs`` [N, ...] are the inputs that losses are differentiated by where images move. The steps minimised a
+    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images, and
+    from boxes where they move, and their rows.
     """
 
     inputs: tuple[Tensor, ...]
@@ -68,14 +68,14 @@ class Examples:
     def gradient(
         self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]
     ) -> Float[Tensor, "n"]:
-        """Of what one step minimises."""
+        """Gradient of the objective of one step."""
         point = theta.detach().requires_grad_()
         with torch.enable_grad():
             loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
         (slope,) = torch.autograd.grad(loss, point)
-        return slope + self.pull(theta, like)
+        return slope + self.proximal_gradient(theta, like)
 
-    def pull(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
+    def proximal_gradient(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
         """The proximal term's gradient."""
         if self.anchor is None or self.proximal == 0.0:
             return 0.0
@@ -84,7 +84,7 @@ class Examples:
 
 @dataclass(frozen=True)
 class ReversedStep:
-    """One step walked back through.
+    """One reversed step.
 
     ``params`` is theta before it, ``along`` a_t. ``rows`` are its batch's, ``scores`` those images' <dl/dtheta, a_t>,
     and ``inputs`` the derivative of the mean score by those rows of the inputs, empty unless asked for.
@@ -140,10 +140,15 @@ def reversed_steps(
                 trajectory.rule, state, gradient, trajectory.rates[step], step, cotangents
             )
             rows = trajectory.rows[step]
-            found = curved(examples, state[0], like, rows, along, with_inputs)
-            cotangents[0] = cotangents[0] + found.product + examples.proximal * along
+            curvature = curved(examples, state[0], like, rows, along, with_inputs)
+            cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
             yield ReversedStep(
-                step, unflatten(state[0], like), unflatten(along, like), rows, found.scores, found.inputs
+                step,
+                unflatten(state[0], like),
+                unflatten(along, like),
+                rows,
+                curvature.scores,
+                curvature.inputs,
             )
 
 
@@ -165,7 +170,7 @@ def _doubly_reversed(
 def _differenced(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
 ) -> _Curved:
-    """Central differences of losses and gradients; nothing here makes the host wait for a device."""
+    """Central differences of losses and gradients, without waiting for a device."""
     # As ``difference_length`` chooses it, kept on the device; for a zero vector all differences are zero.
     size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
     reach = torch.finfo(theta.dtype).eps ** (1 / 3) * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)

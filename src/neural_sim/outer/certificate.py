@@ -46,7 +46,7 @@ class Certificate:
     solver_steps: int
     solver_residual: float
     damping: float
-    raises: int
+    damping_raises: int
     curvature_min: float
     curvature_max: float
     condition: float
@@ -100,7 +100,7 @@ def certify(
         solver_steps=solution.steps,
         solver_residual=solution.residual,
         damping=result.damping.value,
-        raises=result.raises,
+        damping_raises=result.damping_raises,
         curvature_min=spectrum.smallest if spectrum else math.nan,
         curvature_max=spectrum.largest if spectrum else math.nan,
         condition=result.damping.condition,

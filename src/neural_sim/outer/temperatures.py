@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.still import StillLoop, centred
+from neural_sim.outer.frozen import FrozenLoop, centred
 from neural_sim.parameter.bins import gumbel
 from neural_sim.parameter.factor import BinnedFactor, BinNoise
 
@@ -76,7 +76,7 @@ class Temperatures:
             )
 
     def measure(
-        self, loop: StillLoop, estimator: PathwiseEstimator, images: int, seed: int
+        self, loop: FrozenLoop, estimator: PathwiseEstimator, images: int, seed: int
     ) -> tuple[list[AtTemperature], list[Truth]]:
         """Every object at every temperature, estimates from ``images`` images each; and the truth."""
         names, bins = loop.scene.names, loop.bins.bins

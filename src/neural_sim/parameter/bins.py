@@ -15,7 +15,7 @@ from torch import Tensor
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
-    The floor keeps every bin within reach of a draw and every log p finite, however far psi has run.
+    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is.
 
     Raises:
         ValueError: unless 0 <= floor < 1 / k.
@@ -30,7 +30,7 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 
 
 def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Centred logits whose :func:`log_probabilities` are log ``probabilities`` (raised to just above the floor)."""
+    """Centred logits whose :func:`log_probabilities` are log ``probabilities``, clamped to just above the floor."""
     bins = probabilities.shape[-1]
     above_floor = ((probabilities - floor) / (1.0 - bins * floor)).clamp_min(1e-6)
     log_p = above_floor.log()
@@ -111,7 +111,7 @@ def circular_mean(
     """The direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
 
     Its derivative grows as one over the resultant's length, without bound where opposite bins mix in equal
-    parts; below ``smallest_resultant`` the length in the derivative is held there. The value is not touched.
+    parts; a length below ``smallest_resultant`` is replaced by it in the derivative. The value is exact.
     """
     sine, cosine = weights @ bin_centres.sin(), weights @ bin_centres.cos()
     squared = (sine.square() + cosine.square()).detach().clamp_min(smallest_resultant**2)
@@ -121,6 +121,6 @@ def circular_mean(
 
 
 def nearest_bin(angle: Float[Tensor, "*n"], bins: int, low: float, high: float) -> Int[Tensor, "*n"]:
-    """Index of the bin of [low, high) that holds ``angle``, taken modulo the range."""
+    """Index of the bin of [low, high) that contains ``angle`` modulo the range."""
     fraction = ((angle.detach() - low) / (high - low)) % 1.0
     return (fraction * bins).long().clamp_max(bins - 1)

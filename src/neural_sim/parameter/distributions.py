@@ -11,8 +11,8 @@ from torch import Tensor
 Specification = str | Mapping[str, object] | Sequence[float]
 
 DOMINANT_REST = 0.02
-"""Probability of a bin that is no mode. The paper (Sec. 4.2) says only which bins dominate; this is the number in its
-authors' code, which leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of three
+"""Probability of a bin that is no mode. The paper (Sec. 4.2) only names the dominant bins; the number is that of its
+authors' code and leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of three
 (github.com/gyhandy/Neural-Sim-NeRF, optimization/neural_sim_main.py)."""
 
 
@@ -20,7 +20,7 @@ def distribution(specification: Specification, bins: int, where: str = "distribu
     """Probabilities over ``bins`` bins, float64.
 
     ``uniform``; ``{dominant: b}``, 0.02 on all bins but b, which has the rest (0.86 for k = 8);
-    ``{modes: [b, ...]}``, 0.02 on all others, the rest shared equally by the modes; or ``bins`` numbers
+    ``{modes: [b, ...]}``, 0.02 on all others, the rest split equally among the modes; or ``bins`` numbers
     that add up to 1. Bins are numbered from 1, as in the paper.
 
     Raises:

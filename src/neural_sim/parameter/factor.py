@@ -24,19 +24,19 @@ Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
 
 @dataclass(frozen=True)
 class BinNoise:
-    """What picks the bins of n draws. ``exponential``, for ``gumbel_rao`` only, makes other Gumbel noise that would
-    have picked the same ones."""
+    """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponential noise, for
+    further Gumbel noise that selects the same bins."""
 
     gumbel: Float[Tensor, "n k"]
     exponential: Float[Tensor, "n draws k"] | None = None
 
 
 @dataclass(frozen=True)
-class Beliefs:
-    """The configured distributions of one factor, by object.
+class ConfiguredDistributions:
+    """Initial and target distribution of one factor for each object, as configured.
 
     Args:
-        initial, target: of objects not named in ``biased``.
+        initial, target: distributions of objects not named in ``biased``.
         biased: object name -> {initial: ..., target: ...}, see :func:`distributions.distribution`.
         gap: how far biased objects start from their target: ``disjoint`` as ``biased`` says, ``uniform``, or ``same``,
             at the target itself.
@@ -58,18 +58,17 @@ class Beliefs:
 
 
 class Factor(Protocol):
-    """One factor of p_psi: its part of psi, and what the loop, the estimators and the methods ask of it.
+    """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
 
-    Its strata, as many as numbers of psi (``size``), are its bins or the lights that it weighs. ``update`` is the
-    setting of the psi loop that steps it. ``lights`` is how many anchor lights it weighs: where there are any, images
-    themselves change with psi, not only how often each is drawn. ``same_scenes``: the probes of all strata see the same
-    scenes. ``drawn`` is what hard draws of given ``p`` depend on.
+    ``update`` names the setting of the psi loop that steps it. ``lights`` is the number of anchor lights; above 0, the
+    images themselves change with psi, not only how often each is drawn. ``same_scenes``: probes of all strata show the
+    same scenes. ``drawn`` lists what hard draws at given ``p`` depend on.
 
-    ``psi`` is the configured ``initial`` or ``target`` psi of an object, in float64; ``psi_of`` the one that gives
-    probabilities of bins or weights of lights, and ``p_of`` its inverse. ``log_probabilities`` are 0 where psi is what
-    is rendered, and steps are Euclidean; ``project`` gives the nearest psi that meets the factor's constraint.
-    ``stratum_of`` are the strata that probes lie in. ``reach`` gives a score in the units of psi's steps, and the
-    largest step, to a method that steps by ``step`` logits.
+    ``psi`` is the configured ``initial`` or ``target`` psi of an object, float64. ``psi_of`` maps probabilities of bins
+    or weights of lights to psi; ``p_of`` is its inverse. ``log_probabilities`` are 0 for lights, whose steps are
+    Euclidean. ``project`` returns the nearest psi that meets the factor's constraint. ``stratum_of`` returns the
+    stratum of each draw. ``reach`` converts a score to the units of psi and gives the largest step, for a method whose
+    steps are at most ``step`` logits.
     """
 
     update: ClassVar[str]
@@ -82,7 +81,7 @@ class Factor(Protocol):
     @property
     def lights(self) -> int: ...
     @property
-    def beliefs(self) -> Beliefs: ...
+    def configured(self) -> ConfiguredDistributions: ...
     @property
     def drawn(self) -> dict[str, Any]: ...
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]: ...
@@ -99,14 +98,14 @@ class BinnedFactor:
     """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
 
     Args:
-        name: of the factor, and of the configuration node ``parameter.<name>``.
-        coordinate: the number of the scene that it draws; angles in radians.
+        name: the factor's, and that of the configuration node ``parameter.<name>``.
+        coordinate: the coordinate of the scene that is drawn; angles in radians, lengths in object radii.
         geometric: bins of equal ratio instead of equal width (both ends positive).
-        periodic: the ends are the same place.
+        periodic: ``low`` and ``high`` are the same place.
         temperature: tau of the Gumbel-softmax (Eq. 4; the paper: 0.1).
         bin_mean: ``linear`` is the paper's sum_i y_i B_i, ``circular`` its counterpart on the circle.
         floor: smallest probability of a bin.
-        beliefs: initial and target distributions.
+        configured: initial and target distributions by object.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -124,7 +123,7 @@ class BinnedFactor:
     temperature: float = 0.1
     bin_mean: Literal["linear", "circular"] = "linear"
     floor: float = 0.005
-    beliefs: Beliefs = Beliefs()
+    configured: ConfiguredDistributions = ConfiguredDistributions()
 
     def __post_init__(self) -> None:
         where = f"parameter.{self.name}"
@@ -138,11 +137,11 @@ class BinnedFactor:
             raise ValueError(f"{where}.temperature must be positive, got {self.temperature}")
         if not 0.0 <= self.floor < 1.0 / self.bins:
             raise ValueError(f"{where}.floor must lie in [0, 1/bins), got {self.floor}")
-        if self.beliefs.gap not in get_args(Gap):
-            raise ValueError(f"{where}.gap must be one of {get_args(Gap)}, got {self.beliefs.gap!r}")
+        if self.configured.gap not in get_args(Gap):
+            raise ValueError(f"{where}.gap must be one of {get_args(Gap)}, got {self.configured.gap!r}")
         if not self.low < self.high or (self.geometric and not self.low > 0.0):
             raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
-        for name in self.beliefs.biased or {}:
+        for name in self.configured.biased or {}:
             for which in ("initial", "target"):
                 self.probabilities(which, name)
 
@@ -154,18 +153,18 @@ class BinnedFactor:
 
     @property
     def size(self) -> int:
-        """How many numbers of psi an object has here."""
+        """Numbers of psi for each object."""
         return self.bins
 
     @property
     def lights(self) -> int:
-        """None: images are under one fixed light as far as this factor goes."""
+        """0: this factor does not move the light."""
         return 0
 
     def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The configured ``initial`` or ``target`` distribution of one object."""
         where = f"parameter.{self.name}.{which} of {object_name}"
-        return distribution(self.beliefs.of(which, object_name), self.bins, where)
+        return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The logits that give :meth:`probabilities`."""
@@ -184,15 +183,15 @@ class BinnedFactor:
         return binned.log_probabilities(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """psi itself: all logits are allowed."""
+        """psi itself: logits are unconstrained."""
         return psi
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """The bin that each draw lies in, whatever bin it was drawn for."""
+        """The bin of each draw's coordinate, which a relaxed draw may not share with the bin that it was drawn for."""
         return self.bin_of(getattr(draw, self.coordinate))
 
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """The score itself, by ``step`` logits at most."""
+        """The score itself, and ``step``."""
         return score, step
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
@@ -212,11 +211,11 @@ class BinnedFactor:
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
         """The coordinate, differentiable in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
 
-        ``gumbel_softmax`` is the paper's: at small tau most draws lie in one bin and carry next to no derivative; the
-        few near a tie carry it all. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and takes the
-        relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of no
-        expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is averaged
-        over noise that would have chosen the same bin (Paulus et al. 2021).
+        ``gumbel_softmax`` is the paper's: at small tau most draws have next to no derivative, and the few near a tie
+        between two bins have nearly all of it. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and
+        takes the relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of
+        no expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is
+        averaged over noise that selects the same bin (Paulus et al. 2021).
 
         Raises:
             ValueError: ``gumbel_rao`` without the noise for it.
@@ -239,7 +238,7 @@ class BinnedFactor:
         return self._place(centre, within), chosen
 
     def bin_of(self, values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-        """The bin that each value lies in; without a wrap, values outside belong to the bin at that end."""
+        """The bin of each value. Values outside a range that is not periodic belong to the bin at that end."""
         low, high = self._ends
         at = values.log() if self.geometric else values
         if self.periodic:

@@ -1,4 +1,4 @@
-"""The illumination parameter: psi are affine weights over anchor lights, deterministic and kept on their constraint.
+"""The illumination parameter: psi are affine weights over anchor lights, deterministic and constrained.
 
 A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), so an object's images share one light, and
 psi steps by projected gradient descent. Estimators that need a density draw a Gaussian around psi instead and score the
@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.parameter.distributions import Specification, distribution
-from neural_sim.parameter.factor import Beliefs, Gap
+from neural_sim.parameter.factor import ConfiguredDistributions, Gap
 from neural_sim.parameter.simplex import project_simplex, project_sum
 from neural_sim.types import SceneDraw
 
@@ -42,7 +42,7 @@ class Illumination:
         deviation: standard deviation of each weight in Gaussian draws.
         initial, target: weights of objects not named in ``biased``: ``uniform``, ``{dominant: b}``,
             ``{modes: [b, ...]}`` (see :func:`distributions.distribution`) or k numbers that add up to 1.
-        biased, gap: see :class:`Beliefs`.
+        biased, gap: see :class:`ConfiguredDistributions`.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -69,13 +69,13 @@ class Illumination:
             raise ValueError(f"parameter.illumination.deviation must be positive, got {self.deviation}")
         if self.gap not in get_args(Gap):
             raise ValueError(f"parameter.illumination.gap must be one of {get_args(Gap)}, got {self.gap!r}")
-        for name in ("", *(self.biased or {})):  # what is wrong with a specification is said before any stage
+        for name in ("", *(self.biased or {})):  # a bad specification is refused before any stage runs
             self.psi("initial", name)
             self.psi("target", name)
 
     @property
     def name(self) -> str:
-        """Of the factor."""
+        """The factor's name."""
         return "illumination"
 
     @property
@@ -85,7 +85,7 @@ class Illumination:
 
     @property
     def size(self) -> int:
-        """How many numbers of psi an object has here."""
+        """Numbers of psi for each object."""
         return self.anchors
 
     @property
@@ -95,7 +95,7 @@ class Illumination:
 
     @property
     def factors(self) -> tuple[Illumination, ...]:
-        """Itself: the one factor that it is."""
+        """Itself, the only factor."""
         return (self,)
 
     @property
@@ -104,13 +104,13 @@ class Illumination:
         return {}
 
     @property
-    def beliefs(self) -> Beliefs:
+    def configured(self) -> ConfiguredDistributions:
         """The configured weights, by object."""
-        return Beliefs(self.initial, self.target, self.biased, self.gap)
+        return ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """The configured ``initial`` or ``target`` weights of one object, float64: they are psi itself."""
-        specification = self.beliefs.of(which, object_name)
+        specification = self.configured.of(which, object_name)
         where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
         numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
         if self.constraint == "affine" and numbers:
@@ -126,7 +126,7 @@ class Illumination:
         return psi
 
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """0: nothing is drawn, and the metric of a step is the Euclidean one."""
+        """0: nothing is drawn, and steps are Euclidean."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -140,16 +140,15 @@ class Illumination:
         return draw.weights.argmax(-1)
 
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """A Gaussian's score is in units of one over its deviation; a step of that size is one of exploration."""
+        """The score times the variance, in units of psi, and one standard deviation as the largest step."""
         return self.deviation**2 * score, self.deviation
 
     def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
-        """Every image's weights: psi itself, nothing is random. Differentiable in psi."""
+        """Every image's weights: psi itself, differentiable in psi."""
         return psi.expand(count, -1)
 
     def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
-        """Draws of N(psi, deviation^2 I) from standard normal ``noise``, and the weights nearest to them. No derivative
-        reaches psi."""
+        """Draws of N(psi, deviation^2 I) from standard normal ``noise``, and their projections; detached from psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import Beliefs, BinnedFactor, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Gap
 
 Axis = Literal["polar", "azimuth", "both"]
 OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
-"""Of the angle beside the full circle, where ``unlearned`` does not say it."""
+"""Range of the other angle, where ``unlearned`` does not give it."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Pose:
             k + 1 - i show an object from the same sides, upright and on its head.
         other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
         temperature, bin_mean, floor: see :class:`BinnedFactor`; ``bin_mean`` is that of the full circle.
-        initial, target, biased, gap: see :class:`Beliefs`; with ``both``, {phi: ..., rho: ...} where a distribution
-            stands for itself gives each angle its own, and one distribution is phi's, rho being uniform.
+        initial, target, biased, gap: see :class:`ConfiguredDistributions`. With ``both``, {phi: ..., rho: ...} gives
+            each angle a distribution; a single distribution is phi's, and rho is uniform.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -65,18 +65,18 @@ class Pose:
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:
         """The learned angles."""
-        beliefs = Beliefs(self.initial, self.target, self.biased, self.gap)
+        configured = ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
         circle = BinnedFactor(
             "pose", "rho" if self.axis == "azimuth" else "phi", self.bins, 0.0, 2.0 * math.pi, periodic=True,
             temperature=self.temperature, bin_mean=self.bin_mean, floor=self.floor,
-            beliefs=_angle(beliefs, "phi") if self.axis == "both" else beliefs,
+            configured=_angle(configured, "phi") if self.axis == "both" else configured,
         )  # fmt: skip
         if self.axis != "both" or self._other_range_deg is None:
             return (circle,)
         low, high = (math.radians(degrees) for degrees in self._other_range_deg)
         turn = replace(
             circle, name="turn", coordinate="rho", bins=self.other_bins, low=low, high=high, periodic=False,
-            bin_mean="linear", beliefs=_angle(beliefs, "rho"),
+            bin_mean="linear", configured=_angle(configured, "rho"),
         )  # fmt: skip
         return circle, turn
 
@@ -89,8 +89,8 @@ class Pose:
         return {"phi" if self.axis == "azimuth" else "rho": (low, high)}
 
 
-def _angle(beliefs: Beliefs, angle: str) -> Beliefs:
-    """The part of two angles' distributions that is one angle's."""
+def _angle(configured: ConfiguredDistributions, angle: str) -> ConfiguredDistributions:
+    """One angle's distributions, from those configured for two."""
 
     def part(specification: Specification) -> Specification:
         if isinstance(specification, Mapping) and set(specification) <= {"phi", "rho"} and specification:
@@ -99,6 +99,6 @@ def _angle(beliefs: Beliefs, angle: str) -> Beliefs:
 
     biased = {
         name: {which: part(specification) for which, specification in own.items()}
-        for name, own in (beliefs.biased or {}).items()
+        for name, own in (configured.biased or {}).items()
     }
-    return Beliefs(part(beliefs.initial), part(beliefs.target), biased, beliefs.gap)
+    return ConfiguredDistributions(part(configured.initial), part(configured.target), biased, configured.gap)

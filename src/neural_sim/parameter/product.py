@@ -1,4 +1,4 @@
-"""p_psi over the scene's numbers V: a product of independent factors, everything that none of them learns uniform."""
+"""p_psi over the scene's numbers V: a product of independent factors; coordinates that no factor draws are uniform."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neural_sim.types import SceneDraw
 
 
 class Parameter(Protocol):
-    """A configured parameter: the factors that it learns, and uniform ranges of what it draws beside them."""
+    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it does not learn."""
 
     @property
     def factors(self) -> tuple[Factor, ...]: ...
@@ -32,11 +32,11 @@ class Parameter(Protocol):
 
 @dataclass(frozen=True)
 class SceneNoise:
-    """All randomness of n draws, made once and replayed by every pass (paper, Tool 2).
+    """All randomness of n draws, drawn once and replayed in every pass (paper, Tool 2).
 
-    ``bins`` picks each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it. ``light`` is standard normal: lights are explored around psi's weights, which
-    they are where it is None.
+    ``bins`` selects each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
+    where no factor draws it. ``light`` is standard normal, for lights drawn around psi's weights; None: the lights are
+    psi's weights.
     """
 
     bins: Mapping[str, BinNoise]
@@ -49,7 +49,7 @@ class SceneNoise:
 
 @dataclass(frozen=True)
 class SceneDistribution:
-    """p_psi = the product of the factors' distributions; psi is one vector an object, factor after factor.
+    """p_psi = the product of the factors' distributions; psi is one vector for each object, factor by factor.
 
     ``ranges`` are of coordinates that no factor draws; distances are in ``distance_unit``.
 
@@ -97,7 +97,7 @@ class SceneDistribution:
 
     @property
     def lights(self) -> int:
-        """How many anchor lights psi weighs; 0 where images are under one fixed light."""
+        """Number of anchor lights; 0 where the light is fixed."""
         return sum(factor.lights for factor in self.factors)
 
     @property
@@ -110,7 +110,7 @@ class SceneDistribution:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What hard draws of given probabilities depend on, without how they are relaxed and from which logits."""
+        """What hard draws at given probabilities depend on: not the relaxation, not the logits."""
         drawn = {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
         return drawn | {"distance_unit": self.distance_unit}
 
@@ -118,16 +118,16 @@ class SceneDistribution:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the factors, in their order."""
+        """The factors' names, in order."""
         return tuple(factor.name for factor in self.factors)
 
     @property
     def size(self) -> int:
-        """How many numbers of psi an object has."""
+        """Numbers of psi for each object."""
         return sum(factor.size for factor in self.factors)
 
     def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
-        """Every factor's part of psi, or of anything with a number for each of psi's."""
+        """Every factor's part of psi, or of any vector of psi's shape."""
         parts = psi.split([factor.size for factor in self.factors], -1)
         return dict(zip(self.names, parts, strict=True))
 
@@ -152,14 +152,14 @@ class SceneDistribution:
         return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
     def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
-        """psi with every factor's part brought back to its constraint."""
+        """psi with every factor's part projected onto its constraint."""
         parts = self.split(psi)
         return self.join({f.name: f.project(parts[f.name]) for f in self.factors})
 
     @property
     def biased(self) -> tuple[str, ...]:
-        """Objects that some factor gives distributions of their own, sorted."""
-        return tuple(sorted({name for factor in self.factors for name in factor.beliefs.biased or {}}))
+        """Names of the objects that some factor's ``biased`` lists, sorted."""
+        return tuple(sorted({name for factor in self.factors for name in factor.configured.biased or {}}))
 
     # --- draws ---
 
@@ -198,14 +198,14 @@ class SceneDistribution:
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:
-        """Samples in given bins of every factor, uniform within each; their light is not said."""
+        """Samples in given bins of every factor, uniform within each; without a light."""
         placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.binned}
         return self._draw(placed, bins, noise)
 
     def lit(
         self, draw: SceneDraw, psi: Float[Tensor, "K"], noise: Float[Tensor, "n k"] | None = None
     ) -> SceneDraw:
-        """``draw`` under psi's light, differentiable in psi; with ``noise`` under lights around it, which are not."""
+        """``draw`` under psi's light, differentiable in psi; with ``noise`` under lights drawn around it, detached."""
         if self._light is None:
             return draw
         weights = self.split(psi)[self._light.name]
@@ -229,8 +229,8 @@ class SceneDistribution:
     def probes(
         self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
     ) -> tuple[SceneDraw, Int[Tensor, "n"]]:
-        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi; and the number of
-        each draw's scene, which strata may share."""
+        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi; and the index of
+        each draw's scene, the same for all strata where ``same_scenes``."""
         factor = self.factor(name)
         strata = torch.arange(factor.size).repeat_interleave(each)
         if not factor.same_scenes:
@@ -263,21 +263,21 @@ class SceneDistribution:
         return torch.stack(logs).sum(0)
 
     def statistics(self, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
-        """What each factor drew, as the sufficient statistics of its psi: the bin as a row of zeros and a one, or the
-        light as it was before its projection, apart from what the constraint takes back; none of a light not drawn."""
-        found = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
+        """Sufficient statistics of each factor's psi: the drawn bin, one-hot; or the drawn light before its projection,
+        centred. A light that was not drawn has none."""
+        statistics = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
         if self._light is not None and draw.explored is not None:
-            found[self._light.name] = draw.explored - draw.explored.mean(-1, keepdim=True)
-        return found
+            statistics[self._light.name] = draw.explored - draw.explored.mean(-1, keepdim=True)
+        return statistics
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
-        """The bins that each draw lies in, whatever bins it was drawn for; a column for each binned factor."""
+        """The bins of each draw's coordinates, see :meth:`BinnedFactor.stratum_of`; a column for each binned factor."""
         return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
     def label_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The first binned factor's bin, for reports; -1 where nothing is binned."""
-        found = self.bins_of(draw)
-        return found[:, 0] if found.shape[1] else torch.full((len(draw),), -1)
+        bins = self.bins_of(draw)
+        return bins[:, 0] if bins.shape[1] else torch.full((len(draw),), -1)
 
     def _draw(
         self,
@@ -296,5 +296,5 @@ class SceneDistribution:
 
 
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
-    """Bins side by side, none as no column."""
+    """Bins as columns of one table, [n, 0] without factors."""
     return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)

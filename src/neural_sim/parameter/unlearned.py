@@ -1,4 +1,4 @@
-"""What no parameter of a run draws is uniform."""
+"""Uniform ranges of the coordinates that no parameter draws."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from neural_sim.parameter.distances import Unit, check_unit
 
 @dataclass(frozen=True)
 class Unlearned:
-    """Ranges of numbers that no parameter of a run draws: angles in degrees, the distance in
-    ``distance_unit``.
+    """Uniform ranges of coordinates that no parameter draws: angles in degrees, the distance in ``distance_unit``.
 
     Raises:
         ValueError: a range that is not ordered, a distance within the object, an unknown unit.

@@ -1,8 +1,9 @@
-"""Steps of psi from a hypergradient, bounded so that one noisy gradient cannot collapse p.
+"""Steps of psi along a hypergradient, bounded so that one noisy gradient cannot collapse p.
 
-Of bins psi are logits and ``log_p`` their log probabilities. Of lights psi are weights and ``log_p`` is 0: the metric
-of each step is then the Euclidean one, ``learning_rate`` and ``max_step`` are in weights, and the factor's ``project``
-brings what a step gives back to the constraint (projected gradient descent, paper, Sec. 3.2).
+For bins, psi are logits and ``log_p`` [objects, k] their log probabilities; steps are in logits. For lights, psi are
+weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's ``project`` returns the
+result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and ``standard_error`` have psi's
+shape, in units of the outer loss over those of psi.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ from torch import Tensor
 
 _log = logging.getLogger(__name__)
 
-CLIFF = 10.0
-"""The mirror step clips gradients to this many times its scale."""
+CLIP = 10.0
+"""The mirror step clips a gradient's root mean square to this many times the largest seen before."""
 
 
 @dataclass(frozen=True)
 class UpdateState:
-    """What an update carries between steps: moments of the direction, its noise variance, and the step count.
+    """State of an update between steps: ``first`` and ``second`` moment of the direction, its noise variance, and the
+    number of steps.
 
-    ``refused`` counts gradients that were not finite, or whose square is not: they move neither psi nor the moments.
+    ``refused`` counts gradients that are not finite, or whose squares are not: they change neither psi nor the moments.
     """
 
     first: Float[Tensor, "objects k"]
@@ -50,7 +52,7 @@ def check_rates(learning_rate: float, max_step: float | None, **rates: float) ->
 
 
 def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:
-    """The centred step, scaled down per object where its largest change of a logit exceeds ``largest``."""
+    """The centred step, scaled down for each object whose largest component exceeds ``largest``."""
     centred = step - step.mean(-1, keepdim=True)
     size = centred.abs().amax(-1, keepdim=True)
     return centred * (largest / size.clamp_min(largest))
@@ -64,9 +66,9 @@ def _accept(
     second: Float[Tensor, "objects k"],
     noise: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
-    """The step with what it carries on, or none at all where a number of it is not finite: NaN would stay for ever.
+    """psi and the state after the step, or before it where the result is not finite: NaN would stay in the moments.
 
-    Noise that is not known (an infinite standard error) is not carried on either, for the same reason.
+    An infinite noise variance (an unknown standard error) keeps the old one for the same reason.
     """
     if all(bool(torch.isfinite(values).all()) for values in (moved, first, second)):
         noise = torch.where(torch.isfinite(noise), noise, before.noise)
@@ -79,8 +81,8 @@ def _accept(
 class SGD:
     """Gradient descent with momentum (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
 
-    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; steps are as long as that says where ``max_step``
-    is None, as in the paper.
+    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; ``max_step`` None: steps are
+    not bounded, as in the paper.
     """
 
     learning_rate: float
@@ -102,7 +104,7 @@ class SGD:
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam (Kingma and Ba 2015) on the logits."""
+    """Adam (Kingma and Ba 2015) on psi, its steps bounded by ``max_step``."""
 
     learning_rate: float = 0.3
     betas: tuple[float, float] = (0.8, 0.95)
@@ -130,15 +132,14 @@ class Adam:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    The step in the logits is the gradient with respect to p, which is the one in the logits over p (centred):
-    a bin that p has left gets as long a step as one it favours. Momentum averages the direction; its scale is taken out
-    by the largest root mean square over all objects and bins seen so far, so that ``learning_rate`` is in logits per
-    step whatever the units of the loss, and steps shorten as the gradient does. (A scale that forgets would blow up
-    what little gradient is left at the end, and the objects that have none to speak of would wander with it.)
+    The direction in the logits is the gradient by p, which is the gradient by the logits divided by p, centred: a bin
+    of small p gets as long a step as one of large p. Momentum averages the direction. The average is divided by the
+    largest root mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever
+    the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients
+    near the end, and objects without a gradient would drift.)
 
-    ``shrink`` scales each component of the averaged direction by max(0, 1 - its noise variance / its square), the
-    positive-part rule of James and Stein (1961): what cannot be told from noise moves nothing, and the average of
-    several iterations tells more than each of them. Standard errors that are not finite shrink nothing.
+    ``shrink`` multiplies each component of the average by :func:`shrinkage` (James and Stein 1961, positive part):
+    components within their noise do not move. Standard errors that are not finite shrink nothing.
     """
 
     learning_rate: float = 3.0
@@ -161,29 +162,29 @@ class Mirror:
         velocity = self.momentum * state.first + rest * clipped * direction
         noise = self.momentum**2 * state.noise + (rest * clipped * standard_error / p).square()
         unbiased = velocity / (1 - self.momentum**steps)
-        # Of all that was seen, noise as well: scaled by what is left of it, shrunk noise would be as long as before.
+        # Taken before shrinking: dividing by the shrunk norm would undo the shrinkage.
         largest = state.second.maximum(unbiased.square().mean())
         if self.shrink:
-            unbiased = unbiased * told_from_noise(velocity, noise)
+            unbiased = unbiased * shrinkage(velocity, noise)
         scale = largest.sqrt().clamp_min(torch.finfo(psi.dtype).tiny)
         moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
         return _accept(psi, moved, state, velocity, largest, noise)
 
     def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
-        """The part of a direction that counts: the scale never falls, so one freak gradient must not set it."""
+        """Factor that clips an outlier to ``CLIP`` times the scale, which never falls: one outlier must not set it."""
         size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
         return torch.where(
-            known > 0.0, (CLIFF * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)
+            known > 0.0, (CLIP * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)
         )
 
 
-def told_from_noise(
+def shrinkage(
     direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]
 ) -> Float[Tensor, "objects k"]:
-    """max(0, 1 - variance / direction^2); 1 where a variance is not finite, 0 where a direction is zero."""
-    kept = 1.0 - variance / direction.square().clamp_min(torch.finfo(direction.dtype).tiny)
-    kept = torch.where(direction == 0.0, torch.zeros_like(kept), kept.clamp(0.0, 1.0))
-    return torch.where(torch.isfinite(variance), kept, torch.ones_like(kept))
+    """Factors max(0, 1 - variance / direction^2); 1 where a variance is not finite, 0 where a direction is zero."""
+    factors = 1.0 - variance / direction.square().clamp_min(torch.finfo(direction.dtype).tiny)
+    factors = torch.where(direction == 0.0, torch.zeros_like(factors), factors.clamp(0.0, 1.0))
+    return torch.where(torch.isfinite(variance), factors, torch.ones_like(factors))
 
 
 Update = SGD | Adam | Mirror

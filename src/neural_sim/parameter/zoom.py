@@ -8,14 +8,14 @@ from typing import Literal, get_args
 
 from neural_sim.parameter.distances import NEAREST, Unit, check_unit
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import Beliefs, BinnedFactor, Coordinate, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Coordinate, Gap
 
 By = Literal["distance", "focal_length"]
 
 
 @dataclass(frozen=True)
 class Zoom:
-    """``bins`` bins of equal ratio, which do not wrap: neighbours' middles differ in image size by (far / near)^(1/k).
+    """``bins`` bins of equal ratio, which do not wrap: neighbouring centres differ in image size by (far / near)^(1/k).
 
     Args:
         bins: k.
@@ -25,7 +25,7 @@ class Zoom:
             is the nearest, or the smallest magnification.
         unit: of the distances, ``radii`` of each object or ``metres``; has no meaning for a focal length.
         temperature, floor: see :class:`BinnedFactor`.
-        initial, target, biased, gap: see :class:`Beliefs`.
+        initial, target, biased, gap: see :class:`ConfiguredDistributions`.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -56,14 +56,14 @@ class Zoom:
 
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:
-        """The learned number."""
+        """The learned coordinate, as one factor."""
         near, far = self.range
         coordinate: Coordinate = "distance" if self.by == "distance" else "magnification"
-        beliefs = Beliefs(self.initial, self.target, self.biased, self.gap)
+        configured = ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
         return (
             BinnedFactor(
                 "zoom", coordinate, self.bins, near, far, geometric=True, temperature=self.temperature,
-                floor=self.floor, beliefs=beliefs,
+                floor=self.floor, configured=configured,
             ),
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""``v = (H + lambda I)^-1 b``: curvature operator, damping and linear solver put together."""
+"""``v = (H + lambda I)^-1 b`` from a curvature operator, a damping and a linear solver."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solved vector with its account. ``raises`` counts how often lambda had to be raised; ``doubled`` is the
-    vector at twice the final lambda, None if it was not asked for.
+    """The solution and its damping. ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at
+    twice the final lambda, None unless asked for.
     """
 
     solution: Solution
     damping: Damped
-    raises: int
+    damping_raises: int
     doubled: Float[Tensor, "n"] | None
     seconds: float
 
@@ -45,11 +45,11 @@ class AdjointSolver:
     Args:
         linear: the linear solver.
         damping: the choice of lambda.
-        mode: how Hessian products are made, see ``HessianOperator``.
+        mode: how Hessian products are computed, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
-        max_raises: how often lambda may be raised after a solve met negative curvature (a fixed one never is).
-        sensitivity: also solve at 2 lambda, to see how much hangs on the damping: up to ``max_steps`` more products.
+        max_raises: most increases of lambda after solves that met negative curvature (a fixed lambda has none).
+        sensitivity: also solve at 2 lambda, to measure the influence of the damping: up to ``max_steps`` more products.
     """
 
     linear: LinearSolver = field(default_factory=ConjugateGradient)
@@ -76,23 +76,23 @@ class AdjointSolver:
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
         solution = self._solve(operator, damped, b, x0)
-        raises = 0
-        while solution.status is Status.NEGATIVE_CURVATURE and raises < self.max_raises:
+        damping_raises = 0
+        while solution.status is Status.NEGATIVE_CURVATURE and damping_raises < self.max_raises:
             raised = self.damping.raised(damped, solution.curvature[0] - damped.value)
             if raised is None:
                 break
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
-            damped, raises = raised, raises + 1
+            damped, damping_raises = raised, damping_raises + 1
             solution = self._solve(operator, damped, b, solution.value)
         doubled = None
         if self.sensitivity:
             doubled = self._solve(operator, damped, b, solution.value, 2.0).value
-        return Adjoint(solution, damped, raises, doubled, time.perf_counter() - began)
+        return Adjoint(solution, damped, damping_raises, doubled, time.perf_counter() - began)
 
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """At ``times`` lambda, from where the damping's own products got to, else from ``x0``."""
+        """Solve at ``times`` lambda, from the search by the damping's products where there is one, else from ``x0``."""
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)

@@ -1,4 +1,4 @@
-"""The frame all solvers share: scaling, warm start, true residual, status. Each solver adds its iteration."""
+"""Base of all solvers: scaling, warm start, recomputed residual, status. Each solver adds its iteration."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Search:
-    """A search by conjugate directions to be gone on with: where it stands, ``b - A value`` by the recurrence, and
-    the direction it would take next. Solvers other than conjugate gradients take the value alone.
+    """State of a search by conjugate directions, to be continued: iterate, ``b - A value`` by the recurrence, and next
+    direction. Solvers other than conjugate gradients use the iterate alone.
     """
 
     value: Float[Tensor, "n"]
@@ -49,8 +49,8 @@ class Search:
 class System:
     """``operator x = rhs`` as a solver's iteration gets it: ``rhs`` has a norm in [1, 2), ``tolerance`` is absolute.
 
-    ``residual`` is that at ``start``. It comes from a product wherever it meets the tolerance; above, it may be a
-    search's own, which then has its next ``direction`` beside it.
+    ``residual`` is that at ``start``. It comes from a product where it meets the tolerance. Above, it may be a
+    search's recurrence, whose next ``direction`` is then given.
     """
 
     operator: Watched
@@ -79,7 +79,7 @@ class LinearSolver(abc.ABC):
         max_steps: int = 40,
     ) -> Solution:
         """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps, starting from ``x0`` (default
-        0) or where a search has got to.
+        0), a vector or a search to continue.
 
         Bad numbers give a status, never a NaN. Raises ``ValueError`` for shapes and settings that make no
         sense.
@@ -108,7 +108,7 @@ class LinearSolver(abc.ABC):
                 failed.value, Status.NON_FINITE, 0, 1.0, operator.curvature, operator.products, False
             )
         if residual > 1.0 and end.status is not Status.APPROXIMATE:
-            # Rounding made the recursion lose touch with the true residual: zero is the better answer.
+            # By rounding, the recursion has diverged from the true residual: zero is the better answer.
             logger.warning("%s: the true residual is %.3g; zero is returned", type(self).__name__, residual)
             end, residual = Iterate(torch.zeros_like(rhs), _lost(end.status), end.steps), 1.0
         value = end.value * unit * scale

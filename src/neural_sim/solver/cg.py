@@ -13,8 +13,8 @@ from neural_sim.solver.solution import Status
 
 @dataclass(frozen=True)
 class ConjugateGradient(LinearSolver):
-    """For positive definite operators. ``restart_gain``: when the recursion says converged and the recomputed
-    residual does not, iteration restarts from the true one as long as a restart shrinks it by this factor.
+    """For positive definite operators. ``restart_gain``: where the recursion's residual converges and the recomputed
+    one does not, iteration restarts from the latter, as long as each restart shrinks it by this factor.
     """
 
     restart_gain: float = 0.5
@@ -29,8 +29,8 @@ class ConjugateGradient(LinearSolver):
 def conjugate_gradients(system: System, restart_gain: float, precondition: Matvec | None = None) -> Iterate:
     """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse.
 
-    A system that comes with a search's direction is gone on with as that search would have gone on, which a
-    preconditioner, having other directions, cannot.
+    A system with a search's direction continues that search; with a preconditioner, whose directions differ, it does
+    not.
     """
     operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
     value = best = system.start

@@ -35,7 +35,7 @@ class Damped:
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
     def search(self, times: float = 1.0) -> Search | None:
-        """The solve at ``times`` lambda as far as the estimate's products have brought it, where they have."""
+        """The solve at ``times`` lambda from the estimate's own products; None without them."""
         return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
@@ -47,7 +47,7 @@ class Damping(abc.ABC):
         """lambda for ``matvec`` and the right-hand side ``b``."""
 
     def raised(self, damped: Damped, lowest: float) -> Damped | None:
-        """A larger lambda after a solve met the curvature ``lowest`` < -lambda, or None: this choice stands."""
+        """A larger lambda after a solve met the curvature ``lowest`` < -lambda, or None: lambda is fixed."""
         return None
 
 
@@ -77,10 +77,10 @@ class LanczosDamping(Damping):
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    The Krylov space is the right-hand side's, which conjugate gradients search and go on from: lambda past its
-    smallest Ritz value is what keeps these first steps of theirs from breaking down. (From a random start a detector's
-    few negative eigenvalues hide among many near zero: on a tiny RetinaNet 12 steps saw -0.01 where lambda_min was
-    -2.4.) Where a longer solve still meets negative curvature, lambda is raised past it.
+    The Krylov space is the right-hand side's, in which conjugate gradients begin: with lambda past its smallest Ritz
+    value these first steps cannot break down. (From a random start few steps miss a detector's few negative
+    eigenvalues among many near zero: on a tiny RetinaNet 12 steps gave -0.01, lambda_min was -2.4.) Where a longer
+    solve still meets negative curvature, lambda is raised past it.
     """
 
     margin: float = 0.25
@@ -97,7 +97,7 @@ class LanczosDamping(Damping):
             )
 
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        # A zero or non-finite right-hand side has no Krylov space; its solve has a status of its own.
+        # A zero or non-finite right-hand side has no Krylov space; the solve reports it.
         usable = bool(torch.isfinite(b).all()) and bool(b.any())
         if usable:
             spectrum = lanczos(matvec, b, self.lanczos_steps)

@@ -80,7 +80,7 @@ class HessianOperator:
         return total
 
     def _gradient_graphs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """For each term a leaf point and the gradient there, still attached to it."""
+        """For each term a leaf point, and the gradient there with its graph."""
         for term in self._terms:
             point = self._point.clone().requires_grad_()
             with torch.enable_grad():

@@ -11,7 +11,7 @@ from neural_sim.solver.solution import Status
 
 @dataclass(frozen=True)
 class Identity(LinearSolver):
-    """``x = scale b``. One product is spent all the same, on an honest residual."""
+    """``x = scale b``. One product is spent on the residual."""
 
     scale: float = 1.0
 

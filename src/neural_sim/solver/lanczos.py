@@ -52,8 +52,8 @@ class Krylov:
         value, last = weights.T.to(self.basis) @ self.basis
         residual = -float(weights[-1, 0]) * self.beyond
         direction = residual + norm(self.beyond) ** 2 * float(weights[-1, 0]) * last
-        found = Search(value, residual, direction)
-        return found if bool(torch.isfinite(torch.stack([value, residual, direction])).all()) else None
+        search = Search(value, residual, direction)
+        return search if bool(torch.isfinite(torch.stack([value, residual, direction])).all()) else None
 
 
 @dataclass(frozen=True)
@@ -105,11 +105,11 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
     finite = True
     for step in range(steps):
         try:
-            made = operator.measured(basis[step])
+            applied = operator.measured(basis[step])
         except NonFiniteProduct:
             finite = False
             break
-        product, reach = made.value, made.length
+        product, reach = applied.value, applied.length
         columns = basis[: step + 1]
         overlaps = columns @ product
         product = product - columns.T @ overlaps

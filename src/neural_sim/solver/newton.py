@@ -1,6 +1,6 @@
 """A full-batch minimiser that ends at a stationary point: Newton steps by conjugate gradients with a line search.
 
-Deterministic, for finite differences through retrained problems; training proper is the detector's own business.
+Deterministic, for finite differences through retrained problems; detectors are trained by :mod:`detector.training`.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def minimise(
         forcing = max(min(0.1, (size / first) ** 0.5), 0.1 * tolerance / size)
         direction, shift, spent = _direction(operator, slope, min(forcing, 0.5), max_products, 0.25 * shift)
         products += spent
-        found = _search(terms, params, point, direction, value, slope)
+        accepted = _search(terms, params, point, direction, value, slope)
         step += 1
-        if found is None:
+        if accepted is None:
             break
-        point, value, slope = found
+        point, value, slope = accepted
         size = norm(slope)
     return Minimum(dict(unflatten(point, params)), value, size, size <= tolerance, step, products)
 

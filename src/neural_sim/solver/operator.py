@@ -1,4 +1,4 @@
-"""Linear operators as callables: the shift, the counter that watches every product, the dense matrix."""
+"""Linear operators as callables: the shift, a wrapper that counts and checks products, the dense matrix."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Shifted:
 
 
 def numbers(*scalars: Float[Tensor, ""]) -> list[float]:
-    """Several scalars as numbers, in one trip: the host waits for the device once instead of for each."""
+    """Several scalars as Python numbers, by one transfer: the host waits for the device once."""
     return torch.stack([scalar.double() for scalar in scalars]).tolist()
 
 
@@ -94,7 +94,7 @@ class Watched:
         return self.measured(vector).value
 
     def measured(self, vector: Float[Tensor, "n"]) -> Product:
-        """The product with what a solver wants to know of it, all of which comes to the host in one trip."""
+        """The product with its energy and norms, by one transfer to the host."""
         product = self._matvec(vector)
         if product.shape != vector.shape:
             raise ValueError(

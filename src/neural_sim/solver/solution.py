@@ -1,4 +1,4 @@
-"""What a linear solve hands back: a value and how far to trust it. A numerical outcome is data, not a print."""
+"""The result of a linear solve: a value, and how far to trust it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Solution:
     """Result of ``A x = b``. Every field is finite whatever the inputs were.
 
     ``residual`` is ``|b - A x| / |b|`` recomputed from a fresh product, never the recursion's, hence
-    unchanged when A and b are rescaled; 0 for b = 0, and 1 where no finite value was found and ``value`` is
+    unchanged when A and b are rescaled; 0 for b = 0, and 1 where no value is finite and ``value`` is
     zero. Only an APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest
     Rayleigh quotient ``p^T A p / p^T p`` of all products taken (0, 0 if none). ``products`` counts all
     applications of A, ``steps`` the solver's own iterations. ``warm_started`` says whether x0 was used (it is

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.still import StillLoop
+from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.temperatures import Temperatures
 from neural_sim.report.temperatures import report_temperatures
 from neural_sim.stages.context import Context
@@ -28,14 +28,14 @@ class TemperaturesStep(Temperatures):
         x, begun = context.experiment, time.time()
         if not isinstance(x.loop.gradient, PathwiseEstimator):
             raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
-        loop, images = still_loop(context, x.run.seed), x.loop.outer.images_per_object
+        loop, images = frozen_loop(context, x.run.seed), x.loop.outer.images_per_object
         rows, truths = self.measure(loop, x.loop.gradient, images, x.run.seed)
         named = x.run.name, x.run.seed, x.config
         run = report_temperatures(rows, truths, *named, context.uri, context.folder, begun)
         print(f"v {loop.solve}; {time.time() - begun:.0f} s\nresults: {context.folder}\n{run.where}")
 
 
-def still_loop(context: Context, seed: int) -> StillLoop:
+def frozen_loop(context: Context, seed: int) -> FrozenLoop:
     """The psi loop at its start, at rest: images of the initial psi, the warm-started detector, the solved v."""
     graph, results, generator = context.graph, context.results, torch.Generator().manual_seed(seed)
     psi, scene = graph.psi("initial"), results(graph.scene)
@@ -43,4 +43,4 @@ def still_loop(context: Context, seed: int) -> StillLoop:
     drawn = join(scene.training_set(psi, images, generator))
     theta, validation = results(graph.warm_start).params, results(graph.targets).val
     detector, solver = graph.warm_start.build(), context.experiment.loop.solver
-    return StillLoop.at(scene, detector, theta, psi, drawn, validation, solver, generator)
+    return FrozenLoop.at(scene, detector, theta, psi, drawn, validation, solver, generator)

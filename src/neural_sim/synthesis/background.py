@@ -42,11 +42,11 @@ class ProceduralClutter:
         octaves: octaves of noise, from 2 cells across the image and doubling.
         contrast: amplitude of the noise.
         shapes: shapes an image, drawn far to near.
-        distractors: share of shapes that are saturated red or blue, so that colour alone finds no object.
+        distractors: fraction of shapes that are saturated red or blue, so that colour alone finds no object.
         grain: standard deviation of pixel noise.
 
     Raises:
-        ValueError: a negative number, or a share above 1.
+        ValueError: a negative number, or a fraction above 1.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class ProceduralClutter:
         generator: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """``n`` images, float32; what is random is drawn on the CPU, all else is done on ``device``."""
+        """``n`` images, float32; random numbers are drawn on the CPU, all else is computed on ``device``."""
         images = torch.empty(n, 3, height, width, device=device)
         for start in range(0, n, CHUNK):
             part = images[start : start + CHUNK]
@@ -86,10 +86,10 @@ class ProceduralClutter:
     def _chunk(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str
     ) -> Tensor:
-        uniform = [torch.rand(shape, generator=generator) for shape in self._numbers(n)]
+        drawn = [torch.rand(shape, generator=generator) for shape in self._numbers(n)]
         grain = torch.randn((n, 3, height, width), generator=generator).to(device)
-        held = moved(uniform, device)
-        wall, shapes = held[: 2 + 2 * self.octaves], held[2 + 2 * self.octaves :]
+        uniform = moved(drawn, device)
+        wall, shapes = uniform[: 2 + 2 * self.octaves], uniform[2 + 2 * self.octaves :]
         images = self._wall(wall, height, width)
         for depth in range(self.shapes):
             # Far shapes are large, near ones small, so that none hides all the others.
@@ -143,7 +143,7 @@ class ProceduralClutter:
         return cover, level
 
     def _colour(self, u: Float[Tensor, "5 n"]) -> Float[Tensor, "n 3 1 1"]:
-        """Any hue, mostly dull; a ``distractors`` share is saturated, near red or near blue."""
+        """Any hue, mostly dull; a fraction ``distractors`` is saturated, near red or near blue."""
         strong = u[0] < self.distractors
         centre = torch.where(u[1] < 0.5, torch.zeros_like(u[1]), 0.61)
         hue = torch.where(strong, centre + 0.1 * (u[2] - 0.5), u[2])
@@ -155,7 +155,8 @@ class ProceduralClutter:
 
 
 class PhotoFolder:
-    """Random crops of the photographs under a folder, resized; ``smallest`` is the least crop, as a share of the most.
+    """Random crops of the photographs under a folder, resized; ``smallest`` is the side of the smallest
+    crop relative to the largest.
 
     Raises:
         ValueError: no folder, no photograph in it, or ``smallest`` outside (0, 1].

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 SMALLEST_SLOPE = 0.05
-"""Change of opacity per pixel below which an edge's derivative, which is one over it, is held."""
+"""Smallest change of opacity per pixel by which an edge's derivative is divided."""
 
 
 def boxes_from_opacity(
@@ -66,13 +66,13 @@ def _first_crossing(opacity: Float[Tensor, "n h w"], threshold: float) -> Float[
     before = (column - 1).clamp_min(0)
     within, outside = values[images, :, column], values[images, :, before]
     rise = within - outside
-    # How far outside the pixel's centre a row crosses, as a share of a pixel; rows below the threshold do not.
-    share = torch.where(within > threshold, (within - threshold) / rise.clamp_min(1e-12), -1.0)
-    share, row = share.max(-1)
+    # How far outside the pixel's centre a row crosses, as a fraction of a pixel; rows below the threshold do not.
+    fraction = torch.where(within > threshold, (within - threshold) / rise.clamp_min(1e-12), -1.0)
+    fraction, row = fraction.max(-1)
     slope = rise[images, row]
     inner, outer = opacity[images, row, column], opacity[images, row, before]
-    along = -((1.0 - share) * inner + share * outer) / slope.clamp_min(SMALLEST_SLOPE)
-    edge = column + 0.5 - share + (along - along.detach())
+    along = -((1.0 - fraction) * inner + fraction * outer) / slope.clamp_min(SMALLEST_SLOPE)
+    edge = column + 0.5 - fraction + (along - along.detach())
     return torch.where(column == 0, 0.0, edge)
 
 

@@ -1,4 +1,4 @@
-"""How psi moves images: which numbers of a draw depend on it, and how the camera follows each of them."""
+"""How images depend on psi: which numbers of a draw depend on it, and the camera's derivatives by each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neural_sim.parameter.factor import COORDINATES
 from neural_sim.types import SceneDraw
 
 RIGID = ("phi", "rho", "distance")
-"""The coordinates that place the camera; the fourth, the magnification, leaves it where it is."""
+"""The coordinates that place the camera; the fourth, the magnification, does not."""
 SHRINK = (-1.0, -1.0, 0.0, 0.0)
 """What a camera's axes x and y do to a pixel's direction, by the logarithm of the focal length."""
 
@@ -52,13 +52,15 @@ def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"
     if not names or set(names) - set(drawn):
         raise ValueError(f"pose_rates: want names of the draw's among {COORDINATES}, got {tuple(names)}")
     numbers = {name: drawn[name].detach() for name in RIGID}
-    still = {name: torch.zeros_like(number) for name, number in numbers.items()}
+    zeros = {name: torch.zeros_like(number) for name, number in numbers.items()}
 
     def rate(name: str) -> Float[Tensor, "n 4 4"]:
         if name == "magnification":
             shrink = torch.tensor(SHRINK).to(numbers["phi"]) / drawn[name].detach()[:, None, None]
             return cameras.orbit(**numbers, radius=draw.radius) * shrink
-        one = {**still, name: torch.ones_like(numbers[name])}
-        return torch.func.jvp(lambda moved: cameras.orbit(**moved, radius=draw.radius), (numbers,), (one,))[1]
+        unit = {**zeros, name: torch.ones_like(numbers[name])}
+        return torch.func.jvp(lambda moved: cameras.orbit(**moved, radius=draw.radius), (numbers,), (unit,))[
+            1
+        ]
 
     return torch.stack([rate(name) for name in names])

@@ -1,8 +1,7 @@
-"""A store of rendered maps per object and bin, over which training images are composed afresh.
+"""Rendered maps of every bin of every object, from which training images are composed with new backgrounds and shifts.
 
-While psi moves, the fields do not: an image of a bin is as good in the tenth iteration as in the first. Rendering every
-bin once and drawing from that store leaves out most of the rendering of the psi loop; backgrounds and shifts are new in
-each draw. Not for estimators that replay exact draws from psi (the pathwise ones).
+Fields do not change while psi is learned, so every bin is rendered once and its maps are reused in all iterations,
+which saves most rendering of the psi loop. Pathwise estimators cannot use a pool: they differentiate draws from psi.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from neural_sim.parameter.factor import BinnedFactor
@@ -21,17 +20,19 @@ from neural_sim.types import SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """Combinations of the factors' bins, and the maps of each that give every bin at least ``per_bin``."""
+    """How many cells (combinations of the factors' bins), and of maps a cell for at least ``per_bin`` a bin."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
 
 
 @dataclass(frozen=True)
 class ObjectPool:
-    """``per_cell`` rendered maps of every combination of the factors' bins of one object, the last factor's bins
-    changing fastest. RGBA premultiplied in 8 bits."""
+    """``per_cell`` maps of every cell of one object, cell by cell, the last factor's bins changing fastest.
 
-    maps: Tensor
+    ``maps`` are premultiplied RGBA in 8 bits, ``draw`` the scene of each.
+    """
+
+    maps: UInt8[Tensor, "n height width 4"]
     draw: SceneDraw
     per_cell: int
 
@@ -45,7 +46,7 @@ class ImagePool:
 
     @staticmethod
     def render(scene: Scene, per_bin: int, generator: torch.Generator) -> ImagePool:
-        """At least ``per_bin`` poses of every bin of every factor and object.
+        """Render at least ``per_bin`` maps of every bin of every factor and object.
 
         Raises:
             ValueError: fewer than one, or a light that moves with psi.
@@ -53,7 +54,7 @@ class ImagePool:
         if per_bin < 1:
             raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
         if scene.distribution.lights:
-            raise ValueError("outer.pool_per_bin: images under a light that moves are no pool's, want 0")
+            raise ValueError("outer.pool_per_bin: a pool has no images under a light that moves, want 0")
         factors = scene.distribution.binned
         cells, per_cell = pool_cells(factors, per_bin)
         every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
@@ -70,14 +71,14 @@ class ImagePool:
     def draw(
         self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator
     ) -> RenderedObject:
-        """``count`` images of one object from p_psi, with replacement among each bin's poses."""
+        """``count`` images of one object from p_psi, its maps drawn with replacement."""
         noise = self.scene.distribution.draw_noise(count, generator)
         return self._compose(label, self.scene.distribution.hard(psi.float(), noise).bins, generator)
 
     def probes(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
-        """``per_bin`` images of every bin of a factor on purpose, in the order of its bins; the rest from p_psi."""
+        """``per_bin`` images of every bin of a factor, in the order of its bins; other factors from p_psi."""
         distribution = self.scene.distribution
         bins = torch.arange(distribution.factor(factor).size).repeat_interleave(per_bin)
         if len(distribution.binned) == 1:

@@ -22,11 +22,11 @@ from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
 
 @dataclass(frozen=True)
 class RelaxedDraws:
-    """How images are drawn that the pathwise estimator will differentiate.
+    """How images for the pathwise estimator are drawn.
 
     ``relaxation`` and ``conditional_draws`` (of ``gumbel_rao``): see :meth:`BinnedFactor.relaxed`. ``antithetic``:
     Gumbel noise in pairs from u and 1 - u. ``common_backgrounds``: the images of a pair share background and shift.
-    ``tangents``: the maps' derivatives by the numbers that psi moves ride along with the render.
+    ``tangents``: also render the maps' derivatives by the numbers that depend on psi.
     """
 
     relaxation: Relaxation = "gumbel_softmax"
@@ -66,10 +66,10 @@ HARD = HardDraws()
 
 @dataclass(frozen=True)
 class RenderedObject:
-    """One object's images with all that made them: replaying ``noise`` and ``nuisance`` gives them again.
+    """One object's images, with the ``noise`` and ``nuisance`` that reproduce them.
 
-    ``noise`` is None for images that were not drawn from psi afresh, ``relaxed`` for hard draws. ``tangents``, where
-    the render carried them, are the maps' derivatives by the named numbers of the draw.
+    ``noise`` is None for images from a pool or of probes, ``relaxed`` for hard draws. ``tangents``, if rendered, are
+    the maps' derivatives by the named numbers of the draw.
     """
 
     images: LabelledImages
@@ -112,18 +112,18 @@ class Scene:
         """Premultiplied colour and opacity at given scene parameters."""
         poses, field = self._poses(label, draw), self.fields[label]
 
-        def made(camera: PinholeCamera, rows: slice) -> tuple[Tensor, Tensor]:
+        def rendered(camera: PinholeCamera, rows: slice) -> tuple[Tensor, Tensor]:
             if draw.weights is None:
                 return self.renderer.render(field, camera, poses[rows])
             return self.lit_renderer.render(field, camera, poses[rows], weights=draw.weights[rows])
 
         return _joined(
-            [Maps(*made(camera, rows)) for camera, rows in cameras_of(self.camera, draw.magnification)]
+            [Maps(*rendered(camera, rows)) for camera, rows in cameras_of(self.camera, draw.magnification)]
         )
 
     @property
     def lit_renderer(self) -> NerfWRenderer:
-        """The renderer, which must know lights. Raises ``ValueError`` for one that does not."""
+        """The renderer. Raises ``ValueError`` for one without lights."""
         if not isinstance(self.renderer, NerfWRenderer):
             raise ValueError(
                 f"parameter=illumination wants renderer=nerf_w, got {type(self.renderer).__name__}"
@@ -139,11 +139,11 @@ class Scene:
         return RenderedObject(images, noise, draw, nuisance, maps.rgb, maps.opacity)
 
     def dtype(self, label: int) -> torch.dtype:
-        """That of an object's field, in which its images are made."""
+        """The type of an object's field and images."""
         return next(self.fields[label].parameters()).dtype
 
     def device(self, label: int) -> torch.device:
-        """That of an object's field, on which its images are made; draws are on the CPU."""
+        """The device of an object's field and images; draws are on the CPU."""
         return next(self.fields[label].parameters()).device
 
     def _poses(self, label: int, draw: SceneDraw) -> Float[Tensor, "n 4 4"]:
@@ -177,19 +177,19 @@ class Scene:
         poses, field = self._poses(label, draw), self.fields[label]
         rates = pose_rates(draw, names).to(poses) if names else poses.new_zeros(0, *poses.shape)
         lights = 0 if draw.weights is None else draw.weights.shape[1]
-        turned = torch.eye(lights, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
+        weight_rates = torch.eye(lights, dtype=poses.dtype)[:, None].expand(-1, len(draw), -1)
 
-        def made(camera: PinholeCamera, rows: slice) -> list[Maps]:
+        def rendered(camera: PinholeCamera, rows: slice) -> list[Maps]:
             if draw.weights is None:
                 maps, moved = self.renderer.render_with_tangents(field, camera, poses[rows], rates[:, rows])
             else:
                 maps, moved = self.lit_renderer.render_with_tangents(
                     field, camera, poses[rows], rates[:, rows],
-                    weights=draw.weights[rows], weight_rates=turned[:, rows],
+                    weights=draw.weights[rows], weight_rates=weight_rates[:, rows],
                 )  # fmt: skip
             return [maps, *moved]
 
-        each = [made(camera, rows) for camera, rows in cameras_of(self.camera, draw.magnification)]
+        each = [rendered(camera, rows) for camera, rows in cameras_of(self.camera, draw.magnification)]
         maps, *moved = (_joined(parts) for parts in zip(*each, strict=True))
         return maps, dict(zip((*names, *light_names(lights)), moved, strict=True))
 
@@ -208,12 +208,12 @@ class Scene:
         maps, tangents = (
             self._maps_with_tangents(label, draw, names) if moving else (self._maps(label, draw), None)
         )
-        shared = 2 if relaxed.common_backgrounds else 1
-        nuisance = self._nuisance(label, count // shared, generator)
-        if shared > 1:
-            nuisance = nuisance.select(torch.arange(count) // shared)
-        made = self._compose(label, draw, noise, maps, nuisance)
-        return replace(made, relaxed=relaxed, tangents=tangents)
+        group = 2 if relaxed.common_backgrounds else 1
+        nuisance = self._nuisance(label, count // group, generator)
+        if group > 1:
+            nuisance = nuisance.select(torch.arange(count) // group)
+        rendered = self._compose(label, draw, noise, maps, nuisance)
+        return replace(rendered, relaxed=relaxed, tangents=tangents)
 
     def training_set(
         self,
@@ -228,10 +228,9 @@ class Scene:
     def probes(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
-        """``per_bin`` images from every bin of a factor on purpose, in the order of its bins; the rest from p_psi.
+        """``per_bin`` images of every bin of a factor, in the order of its bins; other factors from p_psi.
 
-        Of an illumination the anchor lights take the place of bins, and the same ``per_bin`` poses and backgrounds are
-        seen under each.
+        For an illumination the bins are the anchor lights, all with the same ``per_bin`` poses and backgrounds.
         """
         dtype = self.dtype(label)
         draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)

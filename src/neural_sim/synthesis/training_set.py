@@ -1,4 +1,4 @@
-"""Rendered maps to labelled images: what is random is drawn first, so that every pass can be replayed."""
+"""Rendered maps to labelled images; all randomness is drawn first, so that every pass can be replayed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Nuisance:
-    """What varies between images and is not learned. ``shifts`` are (right, down) in pixels, on the CPU."""
+    """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU."""
 
     backgrounds: Float[Tensor, "n 3 h w"]
     shifts: Int[Tensor, "n 2"]
@@ -94,11 +94,11 @@ class Synthesizer:
         moving = self.label_gradient == "differentiable"
         boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
         labels = torch.where(present, label, -1)[:, None]
-        made = LabelledImages(images, boxes, labels, bins.to(rgb.device))
+        labelled = LabelledImages(images, boxes, labels, bins.to(rgb.device))
         if _log.isEnabledFor(logging.DEBUG):  # counting makes the host wait for the device
-            missing = images_without_boxes(made)
-            _log.debug("class %d: %d of %d images without a box", label, missing, len(made))
-        return made
+            missing = images_without_boxes(labelled)
+            _log.debug("class %d: %d of %d images without a box", label, missing, len(labelled))
+        return labelled
 
 
 def images_without_boxes(images: LabelledImages) -> int:

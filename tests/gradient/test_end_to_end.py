@@ -1,4 +1,4 @@
-"""The estimators on the real rooms: pose parameter, grid field, renderer, composition and detector, in float64."""
+"""The estimators end to end: pose parameter, grid field, renderer, composition and detector, in float64."""
 
 from __future__ import annotations
 
@@ -34,75 +34,80 @@ DOUBLE = torch.float64
 COUNT = 4
 
 
-def test_pathwise_equals_autograd_through_every_room(rooms, pathwise):
-    psi = rooms.psi.clone().requires_grad_()
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in rooms.trainable.items()}
-    images = rooms.compose(*rooms.render(psi)).images
-    loss = rooms.loss_of(leaves, images, torch.arange(COUNT)).mean()
+def test_pathwise_equals_autograd_through_the_whole_pipeline(pipeline, pathwise):
+    psi = pipeline.psi.clone().requires_grad_()
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in pipeline.trainable.items()}
+    images = pipeline.compose(*pipeline.render(psi)).images
+    loss = pipeline.loss_of(leaves, images, torch.arange(COUNT)).mean()
     slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
-    along = sum((slope * rooms.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+    along = sum((slope * pipeline.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
     ours = pathwise(
-        rooms.loss_of, rooms.trainable, rooms.vector, rooms.object_images(), patch_size=700, chunk_size=3
+        pipeline.loss_of,
+        pipeline.trainable,
+        pipeline.vector,
+        pipeline.object_images(),
+        patch_size=700,
+        chunk_size=3,
     )
     assert float(reference.norm()) > 0.0
     torch.testing.assert_close(ours.value, reference, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_pathwise_with_moving_boxes_equals_autograd_through_every_room(rooms, pathwise, forward):
+def test_pathwise_with_moving_boxes_equals_autograd_through_the_whole_pipeline(pipeline, pathwise, forward):
     """The path through the regression targets is added, and is no rounding error beside the tolerance."""
-    moving = dataclasses.replace(rooms.synthesizer, label_gradient="differentiable")
+    moving = dataclasses.replace(pipeline.synthesizer, label_gradient="differentiable")
 
     def compose(rgb, opacity):
-        return moving.compose(rgb, opacity, rooms.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
+        return moving.compose(rgb, opacity, pipeline.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
 
-    psi = rooms.psi.clone().requires_grad_()
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in rooms.trainable.items()}
-    made = compose(*rooms.render(psi))
+    psi = pipeline.psi.clone().requires_grad_()
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in pipeline.trainable.items()}
+    made = compose(*pipeline.render(psi))
     assert made.present.all() and made.boxes.requires_grad
-    loss = rooms.loss_of(leaves, made.images, torch.arange(COUNT), made.boxes).mean()
+    loss = pipeline.loss_of(leaves, made.images, torch.arange(COUNT), made.boxes).mean()
     slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
-    along = sum((slope * rooms.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
+    along = sum((slope * pipeline.vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
-    batch = rooms.object_images()
+    batch = pipeline.object_images()
     path = dataclasses.replace(
         batch.path,
         boxes=lambda opacity: compose(batch.path.rgb, opacity).boxes,
-        tangents=rooms.tangents(batch.draw, ("phi",)) if forward else None,
+        tangents=pipeline.tangents(batch.draw, ("phi",)) if forward else None,
     )
-    arguments = (rooms.loss_of, rooms.trainable, rooms.vector)
+    arguments = (pipeline.loss_of, pipeline.trainable, pipeline.vector)
     ours = pathwise(*arguments, dataclasses.replace(batch, path=path), chunk_size=3)
     torch.testing.assert_close(ours.value, reference, rtol=1e-8, atol=1e-11)
     still = pathwise(*arguments, batch)
     assert float((ours.value - still.value).norm()) > 1e-4 * float(reference.norm())
 
 
-def test_patches_and_tangents_agree_on_the_field(rooms):
-    batch = rooms.object_images()
+def test_patches_and_tangents_agree_on_the_field(pipeline):
+    batch = pipeline.object_images()
     (cotangent,) = input_cotangents(
-        rooms.loss_of, rooms.trainable, rooms.vector, (batch.images,), batch.index, batch.weights
+        pipeline.loss_of, pipeline.trainable, pipeline.vector, (batch.images,), batch.index, batch.weights
     )
     maps = map_cotangents(batch.path, cotangent)
-    whole = draw_cotangents(rooms.render_rays, batch.path.camera, batch.draw, maps, 10**6)
-    patches = draw_cotangents(rooms.render_rays, batch.path.camera, batch.draw, maps, 500)
-    forward = contract(rooms.tangents(batch.draw, ("phi", "rho", "distance")), maps)
+    whole = draw_cotangents(pipeline.render_rays, batch.path.camera, batch.draw, maps, 10**6)
+    patches = draw_cotangents(pipeline.render_rays, batch.path.camera, batch.draw, maps, 500)
+    forward = contract(pipeline.tangents(batch.draw, ("phi", "rho", "distance")), maps)
     for name, value in whole.items():
         assert float((patches[name] - value).abs().max()) < 1e-10
         assert float((forward[name] - value).abs().max()) < 1e-8
-    assert moved_by(batch.path.relaxed, rooms.psi) == ("phi",)
+    assert moved_by(batch.path.relaxed, pipeline.psi) == ("phi",)
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_the_focal_length_of_every_image_against_central_differences(rooms, mode, generator):
+def test_the_focal_length_of_every_image_against_central_differences(pipeline, mode, generator):
     """From psi through the scene's own draw, each image at a focal length of its own, to random cotangents of maps."""
     distribution = SceneDistribution.of([Zoom(bins=3, by="focal_length", range=(0.6, 1.8), temperature=0.8)])
     scene = Scene(
         ("block",),
-        (rooms.field,),
+        (pipeline.field,),
         NerfRenderer(termination=0.0),
-        rooms.camera,
-        rooms.synthesizer,
+        pipeline.camera,
+        pipeline.synthesizer,
         distribution,
     )
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
@@ -128,7 +133,7 @@ def test_the_focal_length_of_every_image_against_central_differences(rooms, mode
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 @pytest.mark.parametrize("by", ["distance", "focal_length"])
-def test_an_off_centre_camera_and_metres_against_central_differences(rooms, mode, by, generator):
+def test_an_off_centre_camera_and_metres_against_central_differences(pipeline, mode, by, generator):
     """From psi to random cotangents of maps; the camera is not square, off centre, of unequal focal lengths, and the
     object's radius is 0.2 m."""
     ranges = {"distance": (0.5, 0.9), "focal_length": (0.6, 1.8)}
@@ -136,7 +141,7 @@ def test_an_off_centre_camera_and_metres_against_central_differences(rooms, mode
     distribution = SceneDistribution.of([zoom], Unlearned(distance=(0.5, 0.7), distance_unit="metres"))
     camera = cameras.opencv_camera(36, 24, 40.0, 30.0, 14.0, 13.5)
     renderer = NerfRenderer(termination=0.0)
-    scene = Scene(("block",), (rooms.field,), renderer, camera, rooms.synthesizer, distribution,
+    scene = Scene(("block",), (pipeline.field,), renderer, camera, pipeline.synthesizer, distribution,
                   radii=distribution.radii({"block": 0.2}))  # fmt: skip
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
     part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
@@ -160,53 +165,53 @@ def test_an_off_centre_camera_and_metres_against_central_differences(rooms, mode
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_tangents_replace_the_second_render(rooms, pathwise):
-    batch = rooms.object_images()
-    tangents = rooms.tangents(batch.draw, moved_by(batch.path.relaxed, rooms.psi))
+def test_tangents_replace_the_second_render(pipeline, pathwise):
+    batch = pipeline.object_images()
+    tangents = pipeline.tangents(batch.draw, moved_by(batch.path.relaxed, pipeline.psi))
 
     def refuse(rays):
         raise AssertionError("rendered twice")
 
     path = dataclasses.replace(batch.path, tangents=tangents, render_rays=refuse)
-    arguments = (rooms.loss_of, rooms.trainable, rooms.vector)
+    arguments = (pipeline.loss_of, pipeline.trainable, pipeline.vector)
     forward = pathwise(*arguments, dataclasses.replace(batch, path=path))
     reverse = pathwise(*arguments, batch)
     assert float((forward.value - reverse.value).abs().max()) < 1e-8
 
 
-def test_scores_of_the_detector_agree_in_both_modes_and_with_features_cached(rooms):
+def test_scores_of_the_detector_agree_in_both_modes_and_with_features_cached(pipeline):
     index = torch.arange(COUNT)
-    forward = scores(rooms.losses, rooms.trainable, rooms.vector, index, 3, "forward")
-    reverse = scores(rooms.losses, rooms.trainable, rooms.vector, index, 3, "reverse")
+    forward = scores(pipeline.losses, pipeline.trainable, pipeline.vector, index, 3, "forward")
+    reverse = scores(pipeline.losses, pipeline.trainable, pipeline.vector, index, 3, "reverse")
     torch.testing.assert_close(forward, reverse)
-    mean = gradient([lambda params: rooms.losses(params, index).mean()], rooms.trainable)
-    assert float(forward.mean()) == pytest.approx(float(mean @ flatten(rooms.vector)), rel=1e-10)
+    mean = gradient([lambda params: pipeline.losses(params, index).mean()], pipeline.trainable)
+    assert float(forward.mean()) == pytest.approx(float(mean @ flatten(pipeline.vector)), rel=1e-10)
 
 
-def test_hessian_products_of_the_detector_agree_and_are_cheap(rooms):
-    term = [lambda params: rooms.losses(params, torch.arange(COUNT)).mean()]
-    vector = flatten(rooms.vector)
+def test_hessian_products_of_the_detector_agree_and_are_cheap(pipeline):
+    term = [lambda params: pipeline.losses(params, torch.arange(COUNT)).mean()]
+    vector = flatten(pipeline.vector)
     with FlopCounterMode(display=False) as one_gradient:
-        gradient(term, rooms.trainable)
+        gradient(term, pipeline.trainable)
     products = {}
     for mode in ("reverse_over_reverse", "central_difference"):
-        operator = HessianOperator(term, rooms.trainable, mode)
+        operator = HessianOperator(term, pipeline.trainable, mode)
         with FlopCounterMode(display=False) as cost:
             products[mode] = operator(vector)
         assert cost.get_total_flops() <= 3 * one_gradient.get_total_flops(), mode
     exact = products["reverse_over_reverse"]
-    slope = torch.func.grad(lambda point: term[0](unflatten(point, rooms.trainable)))
-    forward = torch.func.jvp(slope, (flatten(rooms.trainable),), (vector,))[1]
+    slope = torch.func.grad(lambda point: term[0](unflatten(point, pipeline.trainable)))
+    forward = torch.func.jvp(slope, (flatten(pipeline.trainable),), (vector,))[1]
     torch.testing.assert_close(forward, exact, rtol=1e-9, atol=1e-10)
     assert float((products["central_difference"] - exact).norm() / exact.norm()) < 1e-5
 
 
-def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(rooms, pathwise):
+def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(pipeline, pathwise):
     """The whole of Eq. 2 on a detector's indefinite Hessian, against a tight solve by another method."""
-    inner = InnerProblem(rooms.trainable, rooms.losses, torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE))
-    validation = [lambda params: rooms.losses(params, torch.tensor([1, 3])).mean()]
-    batch = rooms.object_images()
-    estimates = {"can": lambda v: pathwise(rooms.loss_of, rooms.trainable, v, batch)}
+    inner = InnerProblem(pipeline.trainable, pipeline.losses, torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE))
+    validation = [lambda params: pipeline.losses(params, torch.tensor([1, 3])).mean()]
+    batch = pipeline.object_images()
+    estimates = {"can": lambda v: pathwise(pipeline.loss_of, pipeline.trainable, v, batch)}
     solver = AdjointSolver(
         ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-4, retain_graph=True
     )
@@ -214,35 +219,37 @@ def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(rooms, pathwi
     assert result.solution.status is Status.CONVERGED and result.solution.products <= 40
     assert result.damping.spectrum.smallest < 0.0 < result.damping.value
     operator = Shifted(
-        HessianOperator(inner.terms(), rooms.trainable, retain_graph=True), result.damping.value
+        HessianOperator(inner.terms(), pipeline.trainable, retain_graph=True), result.damping.value
     )
-    tight = MinimumResidual().solve(operator, gradient(validation, rooms.trainable), rtol=1e-8, max_steps=200)
+    tight = MinimumResidual().solve(
+        operator, gradient(validation, pipeline.trainable), rtol=1e-8, max_steps=200
+    )
     assert tight.status is Status.CONVERGED
-    expected = -estimates["can"](unflatten(tight.value, rooms.trainable)).value
+    expected = -estimates["can"](unflatten(tight.value, pipeline.trainable)).value
     error = (result.psi_gradients["can"] - expected).norm() / expected.norm()
     assert float(error) < 1e-2
 
 
-def last_layers(rooms):
+def last_layers(pipeline):
     """The predictor's last two convolutions as the inner parameters, and losses of any images under them."""
     small = {
         name: value
-        for name, value in rooms.trainable.items()
+        for name, value in pipeline.trainable.items()
         if ".cls_logits." in name or ".bbox_reg." in name
     }
 
     def loss_of(params, images, index):
-        return rooms.loss_of({**rooms.trainable, **params}, images, index)
+        return pipeline.loss_of({**pipeline.trainable, **params}, images, index)
 
     return small, loss_of
 
 
-def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms, pathwise):
+def test_hypergradient_of_a_detector_is_the_retrained_derivative(pipeline, pathwise):
     """Poses move the images, a proximal inner problem is retrained on them by Newton's method; sign included."""
-    anchor, loss_of = last_layers(rooms)
+    anchor, loss_of = last_layers(pipeline)
     proximal, every = 0.5, torch.arange(COUNT)
     weights = torch.full((COUNT,), 1.0 / COUNT, dtype=DOUBLE)
-    val_images = rooms.images.flip(-1).roll(3, -2)
+    val_images = pipeline.images.flip(-1).roll(3, -2)
 
     def inner_problem(params, images):
         return InnerProblem(
@@ -274,7 +281,7 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms, pathwise
     def validation(params):
         return loss_of(params, val_images, every).mean()
 
-    batch = rooms.object_images()
+    batch = pipeline.object_images()
     params = minimiser(batch.images, anchor)
     estimates = {"can": lambda v: pathwise(loss_of, params, v, batch)}
     solver = AdjointSolver(
@@ -287,9 +294,9 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(rooms, pathwise
     slopes = []
     for direction in 1e-4 * torch.eye(4, dtype=DOUBLE):
         ends = []
-        for psi in (rooms.psi + direction, rooms.psi - direction):
+        for psi in (pipeline.psi + direction, pipeline.psi - direction):
             with torch.no_grad():
-                images = rooms.compose(*rooms.render(psi)).images
+                images = pipeline.compose(*pipeline.render(psi)).images
             ends.append(validation(minimiser(images, params)))
         slopes.append(float(ends[0] - ends[1]) / 2e-4)
     reference = torch.tensor(slopes, dtype=DOUBLE)

@@ -26,7 +26,7 @@ from neural_sim.types import LabelledImages
 
 
 @dataclass(frozen=True)
-class StillLoop:
+class FrozenLoop:
     """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta, and
     ``solve`` says how that ended."""
 
@@ -48,7 +48,7 @@ class StillLoop:
         validation: LabelledImages,
         solver: AdjointSolver,
         generator: torch.Generator,
-    ) -> StillLoop:
+    ) -> FrozenLoop:
         """v for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
         backbone, trainable = detector.split(theta)
         cached = CachedSet.of(detector, backbone, images)
@@ -61,9 +61,9 @@ class StillLoop:
             f"{solution.status.name.lower()} in {solution.steps} steps at lambda {found.damping.value:.2g}"
         )
         vector = unflatten(solution.value, trainable)
-        return StillLoop(scene, detector, backbone, trainable, vector, psi, solve)
+        return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
-    def with_factor(self, factor: BinnedFactor) -> StillLoop:
+    def with_factor(self, factor: BinnedFactor) -> FrozenLoop:
         """The same moment of a distribution whose only factor is ``factor``, which has the same bins."""
         distribution = replace(self.scene.distribution, factors=(factor,))
         return replace(self, scene=replace(self.scene, distribution=distribution))
