@@ -64,3 +64,19 @@ def test_pixels_that_nobody_knows_carve_nothing_and_train_nothing():
     pool = build_pool(seen, None, torch.Generator().manual_seed(0))
     assert len(pool) == int(known.sum())
     assert torch.equal(seen.select(torch.tensor([2])).known, known[2:3])
+
+
+def test_a_tenth_of_photographs_may_be_wrong():
+    """Two of 24 cameras are said to be elsewhere: of renders that is an error, of photographs it is life."""
+    views, middle = ball(CENTRED)
+    poses = views.camera_to_world.clone()
+    poses[[3, 11], :3, 3] += 0.8 * poses[[3, 11], :3, 0]
+    known = torch.ones(views.images.shape[:3], dtype=torch.bool)
+    exact, lenient = (PosedViews(views.images, poses, CENTRED, known=k) for k in (None, known))
+    carved, far, _ = distances(exact, middle)
+    assert not bool(carved[far < RADIUS].all())
+    kept, far, _ = distances(lenient, middle)
+    assert bool(kept[far < RADIUS].all())
+    poses[:6, :3, 3] += 0.8 * poses[:6, :3, 0]
+    kept, far, _ = distances(PosedViews(views.images, poses, CENTRED, known=known), middle)
+    assert not bool(kept[far < RADIUS].all())

@@ -14,6 +14,8 @@ from neural_sim.field.occupancy import subdivide
 from neural_sim.types import PosedViews
 
 COARSEST = 32
+DISSENT = 0.1
+"""Share of the photographs that see a cell and may show no object there: their poses and masks are not exact."""
 
 
 def visual_hull(
@@ -22,8 +24,9 @@ def visual_hull(
     """Cells of the unit sphere that the object may occupy; the cube [-1, 1]^3 has ``resolution`` along each edge.
 
     ``resolution`` is 32 times a power of two. A cell goes when some view that sees its centre has no pixel above
-    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small. Returns cells,
-    origin and edge length in object radii.
+    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small; of photographs
+    (``views.known``), more than ``DISSENT`` of those that see it. Returns cells, origin and edge length in object
+    radii.
     Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
     """
     if resolution < COARSEST or resolution & (resolution - 1):
@@ -69,6 +72,8 @@ def _inside_all(
     mask = functional.max_pool2d(mask, (1, 2 * reach + 1), 1, (0, reach))[:, 0] > 0
     inside = torch.ones(len(centres), dtype=torch.bool, device=centres.device)
     remaining = torch.arange(len(centres), device=centres.device)
+    allowed = 0.0 if views.known is None else DISSENT
+    seen_by, missed_by = torch.zeros(2, len(centres), device=centres.device)
     for pose, silhouette in zip(views.camera_to_world, mask, strict=True):
         local = (centres[remaining] - pose[:3, 3]) @ pose[:3, :3]
         depth = (-local[:, 2]).clamp_min(1e-6)
@@ -78,6 +83,10 @@ def _inside_all(
             (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] < 0)
         )
         hit = silhouette[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        if allowed:
+            seen_by += seen
+            missed_by += seen & ~hit
+            continue
         inside[remaining[seen & ~hit]] = False
         remaining = remaining[~seen | hit]
-    return inside
+    return inside & (missed_by <= allowed * seen_by)
