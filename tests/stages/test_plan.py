@@ -17,10 +17,10 @@ def left_out(*overrides):
 def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     found = left_out("scale=quick")
     assert {"appearance codes", "view-dependent colour", "the renderer's derivative"} <= set(found)
-    assert found["images in Hessian products"].share == pytest.approx(1 - 64 / 300)
+    assert found["images in Hessian products"].fraction == pytest.approx(1 - 64 / 300)
     # 192 renders an object in place of 6 iterations of 50 images and 16 probes in each of 8 bins, half of them anew
-    assert found["renders of the loop"].share == pytest.approx(1 - 192 / (6 * 50 + 128 + 5 * 64))
-    assert found["backbone passes of the loop's training"].share == pytest.approx(1 - 1 / 12)
+    assert found["renders of the loop"].fraction == pytest.approx(1 - 192 / (6 * 50 + 128 + 5 * 64))
+    assert found["backbone passes of the loop's training"].fraction == pytest.approx(1 - 1 / 12)
 
 
 def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
@@ -39,7 +39,7 @@ def test_a_loop_on_drafts_is_said_to_be_one():
 
 def test_objects_whose_psi_is_fixed_are_left_out():
     found = left_out("outer.learned=[mug,can]")
-    assert found["probes and second derivatives"].share == pytest.approx(4 / 6)
+    assert found["probes and second derivatives"].fraction == pytest.approx(4 / 6)
 
 
 def test_what_is_needed_is_not_left_out():
@@ -53,5 +53,5 @@ def test_what_is_needed_is_not_left_out():
 
 
 def test_methods_without_a_hypergradient_say_so():
-    assert left_out("baseline=lts")["hypergradients"].share == 1.0
+    assert left_out("baseline=lts")["hypergradients"].fraction == 1.0
     assert "the psi loop" in left_out("baseline=ns") and "hypergradients" not in left_out("baseline=ns")

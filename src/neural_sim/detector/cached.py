@@ -68,7 +68,7 @@ class CachedSet:
 
     @property
     def inputs(self) -> tuple[Tensor, ...]:
-        """The inputs of the losses that move with images and boxes: features by level, encoded boxes [n, anchors, 4]."""
+        """Inputs of the losses that move with images and boxes: features by level, encoded boxes [n, anchors, 4]."""
         return (*self.features, self.targets.deltas)
 
     def losses_from(

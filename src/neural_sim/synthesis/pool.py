@@ -20,7 +20,7 @@ from neural_sim.types import SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """Number of cells (combinations of the factors' bins), and of maps a cell that give every bin ``per_bin`` or more."""
+    """Number of combinations of the factors' bins, and of maps of each that give every bin at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
 

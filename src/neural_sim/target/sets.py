@@ -18,7 +18,7 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 @dataclass(frozen=True)
 class RenderedTarget:
-    """Images per object in ``val``, which steers psi, and in ``test``, which is scored once.
+    """Images per object in ``val``, from which psi is learned, and in ``test``, which is scored once.
 
     ``test_per_biased_object`` is for objects named in some parameter's ``biased``, whose scores are compared.
     """
@@ -44,7 +44,7 @@ class RenderedTarget:
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
         biased, target = set(distribution.biased), distribution.psi("target", list(meshes)).float()
-        made = {}
+        parts = {}
         for part, name in enumerate(("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
             draws = []
@@ -52,7 +52,7 @@ class RenderedTarget:
                 test_count = self.test_per_biased_object if item.name in biased else self.test_per_object
                 count = test_count if name == "test" else self.val_per_object
                 draws.append(distribution.hard(psi, distribution.draw_noise(count, generator)))
-            made[name] = render_target(
+            parts[name] = render_target(
                 list(meshes.values()), renderer, draws, camera, synthesizer, generator, rig
             )
-        return made
+        return parts
