@@ -73,7 +73,7 @@ def fields(context: Context, name: str) -> list[Row]:
         {"omission": "as configured", "seconds": plain["seconds"], "error": f"{plain['psnr']:.2f} dB"},
         {"omission": "view-dependent colour, undone", "seconds": headed["seconds"],
          "error": f"{headed['psnr']:.2f} dB"},
-        {"omission": "rays far from silhouettes", "share": 1.0 - near / every, "error": "none"},
+        {"omission": "rays far from silhouettes", "fraction": 1.0 - near / every, "error": "none"},
     ]  # fmt: skip
 
 
@@ -170,7 +170,7 @@ def beside(found: Tensor, truth: Tensor, error: Tensor) -> str:
 def table(title: str, rows: list[Row]) -> str:
     lines = [f"{title:<58}{'seconds':>9}  error"]
     for row in rows:
-        spent = f"{row['seconds']:9.3f}" if "seconds" in row else f"{row['share']:8.0%} "
+        spent = f"{row['seconds']:9.3f}" if "seconds" in row else f"{row['fraction']:8.0%} "
         lines.append(f"  {row['omission']:<56}{spent}  {row['error']}")
     return "\n".join(lines)
 

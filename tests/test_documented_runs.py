@@ -147,7 +147,7 @@ def _temperatures(folder, config):
     assert len(held["rows"]) == len(names) * len(values) and all(row["images"] > 0 for row in held["rows"])
     # Nearly exact draws lie where p puts them: 0.86 on the first object's dominant bin, 7.
     cold = held["rows"][0]
-    assert cold["temperature"] == min(values) and cold["shares"][6] > 0.8
+    assert cold["temperature"] == min(values) and cold["frequencies"][6] > 0.8
     assert (folder / "figures" / "temperatures.png").stat().st_size > 5000
 
 

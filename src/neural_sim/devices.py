@@ -56,9 +56,9 @@ def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False
     )
 
 
-def at_once(cacheful: int, device: torch.device) -> int:
-    """How much to work on at a time: what fits a CPU's cache, more where each launch and each wait costs."""
-    return cacheful if device.type == "cpu" else CACHES * cacheful
+def at_once(on_cpu: int, device: torch.device) -> int:
+    """A batch size: ``on_cpu``, which fits a CPU's cache, or ``CACHES`` times that on a GPU, where launches cost."""
+    return on_cpu if device.type == "cpu" else CACHES * on_cpu
 
 
 def moved(tensors: Sequence[torch.Tensor], device: torch.device | str) -> list[torch.Tensor]:
@@ -78,10 +78,10 @@ def synchronise(device: torch.device) -> None:
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
     """Most memory so far in MB: of the process (``peak_memory_mb``) and a GPU's tensors (``peak_gpu_memory_mb``)."""
-    found = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+    peaks = {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
     if device.type == "cuda":
-        found["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20
-    return found
+        peaks["peak_gpu_memory_mb"] = torch.cuda.max_memory_allocated(device) / 2**20
+    return peaks
 
 
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:

@@ -9,7 +9,7 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.outer.temperatures import Temperatures, against, bin_shares
+from neural_sim.outer.temperatures import Temperatures, against, bin_frequencies
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
@@ -40,7 +40,7 @@ def test_noise_alone_is_no_bias(generator):
 def test_draws_follow_p_at_low_temperatures_and_meet_in_the_middle_at_high_ones(temperature, expected):
     factor = BinnedFactor("pose", "phi", 5, 0.0, 5.0, temperature=temperature)
     p = torch.tensor([0.1, 0.5, 0.05, 0.05, 0.3], dtype=torch.float64)
-    shares = torch.tensor(bin_shares(factor, factor.psi_of(p), 20_000, 0), dtype=torch.float64)
+    shares = torch.tensor(bin_frequencies(factor, factor.psi_of(p), 20_000, 0), dtype=torch.float64)
     wanted = p if expected is None else torch.tensor(expected, dtype=torch.float64)
     torch.testing.assert_close(shares, wanted, rtol=0.0, atol=0.02)
 

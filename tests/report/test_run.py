@@ -36,7 +36,7 @@ def results():
         {"initial": {"pose": uniform}, "learned": {"pose": peaked}, "target": {"pose": peaked}}, [record, record],
         {"ns": scores, "learned": scores, "matched": scores}, {"a": [{"psnr": 30.0, "ssim": 0.9}], "b": []},
         {"psi": 1.5}, {"peak_memory_mb": 512.0},
-        [{"stage": "views", "what": "views of a", "why": "found in the store", "share": 1.0, "seconds": 2.0}],
+        [{"stage": "views", "what": "views of a", "why": "found in the store", "fraction": 1.0, "seconds": 2.0}],
         {"seed": 3, "parameter": {"pose": {"bins": 4}}}, 0.25,
     )  # fmt: skip
 

@@ -19,11 +19,11 @@ def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     assert {"appearance codes", "view-dependent colour", "the renderer's derivative"} <= set(found)
     # 192 renders an object in place of 7 iterations of 50 images and, but for the last, which takes no derivative, 16
     # probes in each of 8 bins, half of them anew
-    assert found["renders of the loop"].share == pytest.approx(1 - 192 / (7 * 50 + 128 + 5 * 64))
+    assert found["renders of the loop"].fraction == pytest.approx(1 - 192 / (7 * 50 + 128 + 5 * 64))
     assert "images in Hessian products" not in found
     implicit = left_out("scale=quick", "outer.adjoint=implicit")
-    assert implicit["images in Hessian products"].share == pytest.approx(1 - 64 / 300)
-    assert found["backbone passes of the loop's training"].share == pytest.approx(1 - 1 / 12)
+    assert implicit["images in Hessian products"].fraction == pytest.approx(1 - 64 / 300)
+    assert found["backbone passes of the loop's training"].fraction == pytest.approx(1 - 1 / 12)
 
 
 def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
@@ -42,7 +42,7 @@ def test_a_loop_on_drafts_is_said_to_be_one():
 
 def test_objects_whose_psi_is_fixed_are_left_out():
     found = left_out("outer.learned=[mug,can]")
-    assert found["probes and second derivatives"].share == pytest.approx(4 / 6)
+    assert found["probes and second derivatives"].fraction == pytest.approx(4 / 6)
 
 
 def test_what_is_needed_is_not_left_out():
@@ -56,5 +56,5 @@ def test_what_is_needed_is_not_left_out():
 
 
 def test_methods_without_a_hypergradient_say_so():
-    assert left_out("baseline=lts")["hypergradients"].share == 1.0
+    assert left_out("baseline=lts")["hypergradients"].fraction == 1.0
     assert "the psi loop" in left_out("baseline=ns") and "hypergradients" not in left_out("baseline=ns")

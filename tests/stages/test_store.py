@@ -23,7 +23,7 @@ def test_made_once_then_found(tmp_path):
         return {"x": torch.arange(3)}
 
     first, second = fetch(store, make), fetch(store, make)
-    assert len(calls) == 1 and not first.found and second.found
+    assert len(calls) == 1 and not first.reused and second.reused
     assert torch.equal(second.value["x"], torch.arange(3))
     assert second.seconds == first.seconds
     fetch(store, make, "b")
@@ -77,7 +77,7 @@ def other():
 def test_two_processes_never_make_one_entry_twice(tmp_path, other):
     process = other(tmp_path, 0.5)
     entry = fetch(Store(tmp_path), lambda: pytest.fail("made twice"))
-    assert entry.found and entry.value == process.pid
+    assert entry.reused and entry.value == process.pid
     assert len(list(tmp_path.glob("made by *"))) == 1
 
 

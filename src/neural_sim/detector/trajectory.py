@@ -148,7 +148,7 @@ class Recorder:
             )
 
     def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
-        """Record a step before it is taken. ``state`` and ``gradient`` give copies where they are needed."""
+        """Record a step before it is taken. ``state`` and ``gradient`` return copies, and are called if needed."""
         number = len(self._rates)
         self._rates.append(rate)
         if number < self._first:

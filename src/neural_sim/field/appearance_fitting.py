@@ -25,13 +25,13 @@ class AppearanceFitting(Fitting):
 
     Args:
         grid: makes the fitting of the field's grid.
-        shared_lights: views whose light weights are known share the anchors' codes in these proportions; then what a
-            side looks like under one light is learned from all views of that side. Otherwise, and for photographs,
-            each view learns a code of its own (NeRF in the Wild).
+        shared_lights: the code of a view of known light weights is their combination of the anchors' codes, so that the
+            look of a side under one light is learned from all views of that side. Otherwise, and for photographs, each
+            view learns its own code (NeRF in the Wild).
         anchors: how many views' codes become the anchors where no light weights are known, evenly spread.
         transients: learn what single views show in front of the object, and how uncertain each pixel is; for
-            photographs, where somebody walks through the picture. Rendered views have none. They join when the grid's
-            cells were first refined or pruned: before, they would explain the object itself.
+            photographs, where somebody walks through the picture. Rendered views have none. They are used once
+            the grid's cells have been refined or pruned: before, they would explain the object itself.
         transient_penalty: lambda_u of NeRF in the Wild, on the transients' optical depth.
     """
 

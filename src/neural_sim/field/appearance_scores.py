@@ -1,4 +1,4 @@
-"""Views of a field under codes of their own, and codes fitted to views whose light nobody knows."""
+"""Views of a field, each under its own code, and codes fitted to views of unknown light."""
 
 from __future__ import annotations
 

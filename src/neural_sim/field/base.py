@@ -1,4 +1,4 @@
-"""What a radiance field offers: densities and colours at points, and the distances worth asking for along rays."""
+"""The interface of a radiance field: densities and colours at points, and the distances to sample along rays."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class RadianceField(nn.Module, ABC):
 
     @abstractmethod
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
-        """The distances at which ``query`` is worth asking for rays of shape (rays, 3).
+        """The distances at which to ``query`` the field along rays of shape (rays, 3).
 
         Deterministic and detached: the same rays always give the same distances. Samples behind a transmittance
         below ``termination`` may be left out; 0 leaves nothing out.
@@ -75,8 +75,8 @@ class RadianceField(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the samples of ``sample``.
 
-        Without derivatives. ``span`` is what ``span`` says of these rays, and ``skip_empty`` whether space known to be
-        empty is stepped over; neither changes a pixel. A field that knows no empty space ignores both.
+        Without derivatives. ``span`` is that of these rays from :meth:`span`; ``skip_empty``: skip space known to be
+        empty. Neither changes a pixel. A field that knows no empty space ignores both.
         """
         samples = self.sample(rays, termination)
         return composite(*self.query(*sample_points(rays, samples)), samples)

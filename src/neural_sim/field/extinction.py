@@ -1,4 +1,4 @@
-"""Light along rays that are walked wave by wave: how much reaches each sample, and which rays have none left."""
+"""Transmittance along rays that are marched wave by wave, and which rays are terminated."""
 
 from __future__ import annotations
 

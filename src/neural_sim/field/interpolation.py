@@ -89,7 +89,7 @@ def interpolate(
 
 
 class _ScatterInterpolate(torch.autograd.Function):
-    """``gather_weighted`` with a backward pass to the table alone, as flat scatters of a cacheful each."""
+    """``gather_weighted`` with a backward pass to the table alone, as flat scatters of pieces that fit the cache."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, corners: Tensor, weights: Tensor) -> Tensor:

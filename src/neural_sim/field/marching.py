@@ -151,11 +151,11 @@ def lookup(local: Float[Tensor, "*samples 3"], occupancy: Occupancy) -> Int[Tens
     shape = occupancy.index.shape
     x, y, z = (axis.contiguous() for axis in local.unbind(-1))
     flat = _flat((x, y, z), shape)
-    found = occupancy.index.flatten().index_select(0, flat.flatten()).view(flat.shape)
-    outside = torch.zeros_like(found, dtype=torch.bool)
+    cells = occupancy.index.flatten().index_select(0, flat.flatten()).view(flat.shape)
+    outside = torch.zeros_like(cells, dtype=torch.bool)
     for axis, size in zip((x, y, z), shape, strict=True):
         outside |= (axis < 0) | (axis >= size)
-    return found.masked_fill(outside, -1)
+    return cells.masked_fill(outside, -1)
 
 
 def _enter(

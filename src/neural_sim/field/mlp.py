@@ -179,9 +179,9 @@ def inverse_cumulative(
     right = torch.searchsorted(cumulative, quantiles.contiguous(), right=True).clamp(1, weights.shape[1])
     left = right - 1
     start, end = cumulative.gather(1, left), cumulative.gather(1, right)
-    share = ((quantiles - start) / (end - start).clamp_min(1e-12)).clamp(0.0, 1.0)
+    fraction = ((quantiles - start) / (end - start).clamp_min(1e-12)).clamp(0.0, 1.0)
     low, high = edges.gather(1, left), edges.gather(1, right)
-    return low + share * (high - low)
+    return low + fraction * (high - low)
 
 
 def _offsets(shape: torch.Size | tuple[int, int], like: Tensor, generator: torch.Generator | None) -> Tensor:

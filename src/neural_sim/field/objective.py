@@ -33,7 +33,7 @@ def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Fl
 
 
 class Fitting(ABC):
-    """One field with its training rays. ``start`` before the first step, then ``render`` and ``advance`` in turn."""
+    """One field with its training rays. Calls: ``start`` once, then ``loss`` and ``advance`` in each step."""
 
     def __init__(self, field: RadianceField, batch_rays: int) -> None:
         if batch_rays < 1:
@@ -68,7 +68,7 @@ class Fitting(ABC):
 
 
 class RayBlocks:
-    """Walks a shuffled pool block by block, from its beginning again when it is used up."""
+    """Consecutive blocks of a shuffled pool of rays, again from its beginning when fewer than a block are left."""
 
     def __init__(self, pool: RayPool) -> None:
         self._pool, self._next = pool, 0

@@ -74,12 +74,12 @@ def composite_with_tangents(
     and D its exclusive sum along the ray, the weight T alpha changes at T (exp(-tau) tau' - alpha D'). Distances and
     widths are constants.
     """
-    depth, weights, held = _passage(sigma, samples)
+    depth, weights, passed = _passage(sigma, samples)
     parts = [weights[:, None] * rgb, weights[:, None]]
     for sigma_rate, rgb_rate in zip(sigma_rates, rgb_rates[: len(sigma_rates)], strict=True):
         depth_rate = sigma_rate * samples.width
         counted = depth_rate.masked_fill(depth > OPAQUE_DEPTH, 0.0)
-        rate = held * depth_rate - weights * _exclusive(counted, samples)
+        rate = passed * depth_rate - weights * _exclusive(counted, samples)
         parts += [torch.addcmul(rate[:, None] * rgb, weights[:, None], rgb_rate), rate[:, None]]
     parts += [weights[:, None] * rgb_rate for rgb_rate in rgb_rates[len(sigma_rates) :]]
     pixels = sum_rays(torch.cat(parts, -1), samples)
@@ -104,14 +104,14 @@ def composite_with_gradient(
     own colour, as far as light passes through it, and takes away all behind it: with tau = sigma delta the pixel C
     changes by T exp(-tau) c - sum_{j behind} w_j c_j.
     """
-    depth, weights, held = _passage(sigma, samples)
+    depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]
     colour = torch.nn.functional.pad(rgb, (0, 1), value=1.0)
     running = torch.nn.functional.pad(_running((weights * colour).double()), (0, 0, 1, 0))
     ends = running.index_select(0, samples.starts)
     behind = (ends[1:].index_select(0, samples.ray) - running[1:]).to(sigma.dtype)
     behind = behind.masked_fill((depth > OPAQUE_DEPTH)[:, None], 0.0)
-    by_depth = torch.addcmul(-behind, held[:, None], colour) * samples.width[:, None]
+    by_depth = torch.addcmul(-behind, passed[:, None], colour) * samples.width[:, None]
     gradient = sigma.new_empty(len(sigma), 3, 4)
     for axis in range(3):
         torch.mul(by_depth, sigma_rates[axis][:, None], out=gradient[:, axis])

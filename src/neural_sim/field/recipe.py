@@ -1,4 +1,4 @@
-"""A field's kind, its fitting and its budget in one configured object; each object's field is fitted by it afresh."""
+"""A field's kind, its fitting and its budget in one configured object, from which each object's field is fitted."""
 
 from __future__ import annotations
 

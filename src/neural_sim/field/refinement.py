@@ -21,10 +21,10 @@ def interpolate_from(
         nudge = (corner.to(local) - 0.5) * 1e-2
         here = local.index_select(0, missing)
         cell = lookup(here + nudge, occupancy)
-        found = (cell >= 0).nonzero()[:, 0]
-        base = (here + nudge).floor().index_select(0, found)
-        weights = corner_weights(*(here.index_select(0, found) - base).t().contiguous())
-        rows = corners.index_select(0, cell.index_select(0, found))
-        result.index_copy_(0, missing.index_select(0, found), gather_weighted(table, rows, weights))
+        hit = (cell >= 0).nonzero()[:, 0]
+        base = (here + nudge).floor().index_select(0, hit)
+        weights = corner_weights(*(here.index_select(0, hit) - base).t().contiguous())
+        rows = corners.index_select(0, cell.index_select(0, hit))
+        result.index_copy_(0, missing.index_select(0, hit), gather_weighted(table, rows, weights))
         missing = missing[cell < 0]
     return result

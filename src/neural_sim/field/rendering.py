@@ -16,9 +16,9 @@ from neural_sim.field.samples import PackedSamples, sample_points
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2
-"""Up to so many rates each is taken through the samples; of more, a ray's derivatives by its six numbers."""
+"""Up to this many rates are propagated through the samples; for more, derivatives by a ray's six numbers are."""
 SAMPLES_AT_ONCE = 16_384
-"""Samples asked for derivatives together on a CPU: they keep to its cache."""
+"""Samples differentiated together on a CPU, to fit its cache."""
 
 
 def render_samples(
@@ -88,8 +88,8 @@ def _by_ray_numbers(
     derivatives by the ray's origin, and weighted by distance those by its direction."""
     positions, directions = sample_points(rays, samples)
     unit = torch.eye(3, dtype=positions.dtype, device=positions.device)[:, None].expand(-1, len(samples), -1)
-    still = torch.zeros_like(unit)
-    moves, turns = (torch.cat([unit, still]), torch.cat([still, unit])) if field.directed else (unit, still)
+    zeros = torch.zeros_like(unit)
+    moves, turns = (torch.cat([unit, zeros]), torch.cat([zeros, unit])) if field.directed else (unit, zeros)
     queried = field.query_with_tangents(positions, directions, moves, turns)
     pixels, by_origin, by_direction, of_colour = composite_with_gradient(*queried, samples)
     if field.directed:

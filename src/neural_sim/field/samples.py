@@ -1,4 +1,4 @@
-"""Where along rays a field is asked: samples without padding, and the spans that hold them."""
+"""Samples along rays without padding, and the spans of distances that contain them."""
 
 from __future__ import annotations
 

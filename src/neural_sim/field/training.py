@@ -1,4 +1,4 @@
-"""Fit a field to posed views in one call; take a field apart to be stored."""
+"""Fit a field to posed views in one call; convert a field to tensors and settings for storage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in front of the object in some photographs only (NeRF in the Wild, Martin-Brualla et al. 2021)."""
+"""Transients: occluders in front of the object in single photographs (NeRF in the Wild, Martin-Brualla et al. 2021)."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def composite_both(
     the Wild adds the alphas of the two, which exceed 1 together where both are opaque.)
     """
     sigma = static[0] + transient[0]
-    share = (transient[0] / sigma.clamp_min(torch.finfo(sigma.dtype).tiny))[:, None]
-    rgb = torch.lerp(static[1], transient[1], share)
+    fraction = (transient[0] / sigma.clamp_min(torch.finfo(sigma.dtype).tiny))[:, None]
+    rgb = torch.lerp(static[1], transient[1], fraction)
     weights = render_weights(sigma, samples)[:, None]
-    beta = sum_rays(weights * share * transient[2][:, None], samples)[:, 0]
+    beta = sum_rays(weights * fraction * transient[2][:, None], samples)[:, 0]
     return composite(sigma, rgb, samples), SMALLEST_BETA + beta
 
 

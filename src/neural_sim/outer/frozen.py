@@ -1,4 +1,4 @@
-"""The psi loop held still at one psi, detector and v, where estimators can be held against the truth."""
+"""The psi loop frozen at one psi, detector and v, to compare estimators with the truth."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class FrozenLoop:
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
     def with_factor(self, factor: BinnedFactor) -> FrozenLoop:
-        """The same moment of a distribution whose only factor is ``factor``, which has the same bins."""
+        """The same state with a distribution whose only factor is ``factor``, which has the same bins."""
         distribution = replace(self.scene.distribution, factors=(factor,))
         return replace(self, scene=replace(self.scene, distribution=distribution))
 

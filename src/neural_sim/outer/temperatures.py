@@ -19,15 +19,15 @@ from neural_sim.parameter.factor import BinnedFactor, BinNoise
 class AtTemperature:
     """One object at one tau, all from the same noise.
 
-    ``shares`` is the part of the relaxed draws that lies in each bin. ``bias`` is |mean estimate - truth| of centred
-    logits, the noise of both taken off (0 where it explains all), ``bias_error`` its standard error; ``spread`` is
-    the root of the variance, summed over components, of an estimate from ``images`` images; ``cosine`` is the mean
+    ``frequencies`` is the part of the relaxed draws that lies in each bin. ``bias`` is |mean estimate - truth| of
+    centred logits, the noise of both taken off (0 where it explains all), ``bias_error`` its standard error; ``spread``
+    is the root of the variance, summed over components, of an estimate from ``images`` images; ``cosine`` is the mean
     estimate's with the truth.
     """
 
     object: str
     temperature: float
-    shares: list[float]
+    frequencies: list[float]
     bias: float
     bias_error: float
     spread: float
@@ -55,7 +55,7 @@ class Temperatures:
         values: the temperatures tau.
         rounds: estimates at each tau, from ``outer.images_per_object`` images each.
         truth_per_bin: images of every bin for the truth.
-        draws: of the relaxed bin, for the shares.
+        draws: of the relaxed bin, for the frequencies.
 
     Raises:
         ValueError: no temperature, one that is not positive, or fewer than two rounds, images or draws.
@@ -100,10 +100,14 @@ class Temperatures:
                 [centred(moved.pathwise(estimator, images, generator)) for _ in range(self.rounds)]
             )
             for label, name in enumerate(names):
-                shares = bin_shares(moved.bins, moved.psi[label], self.draws, seed + 2)
+                frequencies = bin_frequencies(moved.bins, moved.psi[label], self.draws, seed + 2)
                 rows.append(
                     AtTemperature(
-                        name, value, shares, *against(found[:, label], truth[label], errors[label]), images
+                        name,
+                        value,
+                        frequencies,
+                        *against(found[:, label], truth[label], errors[label]),
+                        images,
                     )
                 )
         return rows, truths
@@ -124,7 +128,7 @@ def against(
     return bias, error, float(variance.sum().sqrt()), cosine
 
 
-def bin_shares(factor: BinnedFactor, psi: Float[Tensor, "k"], draws: int, seed: int) -> list[float]:
+def bin_frequencies(factor: BinnedFactor, psi: Float[Tensor, "k"], draws: int, seed: int) -> list[float]:
     """Part of the relaxed draws that lies in each bin, where the uniform offset within the bin is left out."""
     generator = torch.Generator().manual_seed(seed)
     noise = BinNoise(gumbel((draws, factor.bins), generator, torch.float64))

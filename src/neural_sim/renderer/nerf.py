@@ -26,7 +26,8 @@ Quality = Literal["draft", "normal", "final"]
 
 @dataclass(frozen=True)
 class Omissions:
-    """What a quality leaves out: samples behind a transmittance of ``termination``, and all but each ``step``-th."""
+    """The approximations of a quality: samples behind a transmittance of ``termination`` are skipped, and ``step``
+    multiplies the field's step."""
 
     termination: float
     step: float
@@ -46,10 +47,10 @@ class NerfRenderer:
     quality are those of the same function.
 
     Args:
-        quality: what is left out; conf/renderer/nerf.yaml has the measured error of each.
-        rays_per_chunk: rays under way at once, which bounds the working memory.
-        termination: transmittance behind which samples are left out (0: none are) instead of the quality's.
-        step: the field's own step is multiplied by this, instead of by the quality's.
+        quality: the approximations; conf/renderer/nerf.yaml has the measured error of each.
+        rays_per_chunk: rays rendered at once, which bounds the working memory.
+        termination: transmittance behind which samples are skipped (0: none), instead of the quality's.
+        step: factor of the field's step, instead of the quality's.
         cull: cast rays only for pixels that may see the field's occupied cells; changes no pixel.
         skip_empty: step over space that the field knows to be empty; changes no pixel.
 
@@ -114,7 +115,7 @@ class NerfRenderer:
         """What ``render`` gives, and its m derivatives where the cameras move at ``rates`` (then a moving light's).
 
         Rays' directions stay of unit length whatever the rates, so that those of a focal length can be among them.
-        The derivatives ride along with the render; memory beyond the maps is that of ``rays_per_chunk`` rays.
+        One pass computes both; memory beyond the maps is that of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)

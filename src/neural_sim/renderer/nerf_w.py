@@ -71,8 +71,8 @@ class NerfWRenderer(NerfRenderer):
                 camera_to_world.index_select(0, views),
                 rates.index_select(1, views),
             )
-            for number, made in enumerate([value, *moved]):
-                maps[number, views] = torch.cat([made.rgb, made.opacity[..., None]], -1)
+            for number, map_ in enumerate([value, *moved]):
+                maps[number, views] = torch.cat([map_.rgb, map_.opacity[..., None]], -1)
         value, *tangents = (Maps(image[..., :3], image[..., 3]) for image in maps)
         return value, tangents
 
@@ -98,8 +98,8 @@ class NerfWRenderer(NerfRenderer):
 def _checked(
     field: RadianceField, weights: Float[Tensor, "n k"] | None, count: int
 ) -> tuple[AppearanceField, Float[Tensor, "n k"]]:
-    """The field with codes that this renderer wants, and weights for ``count`` views or rays, in its type, where they
-    are: draws are on the CPU."""
+    """The field, which must have appearance codes, and weights [count, k] in its type, on their own device: draws are
+    on the CPU."""
     if not isinstance(field, AppearanceField):
         raise ValueError(
             f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"
@@ -115,7 +115,7 @@ def _checked(
 def _groups(
     rows: Float[Tensor, "views c"], device: torch.device
 ) -> Iterator[tuple[Float[Tensor, "c"], Int[Tensor, "some"]]]:
-    """The different rows, and which views have each, on ``device``; told apart on the CPU."""
+    """The distinct rows and the views of each, on ``device``; compared on the CPU."""
     different, number = rows.cpu().unique(dim=0, return_inverse=True)
     for place, row in enumerate(different.to(device)):
         yield row, (number == place).nonzero()[:, 0].to(device)

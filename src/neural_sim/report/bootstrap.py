@@ -34,14 +34,14 @@ class Matches:
 def match(predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int) -> Matches:
     """Greedy matching by COCO's rules: an image's best detection first, each to the free box it overlaps most."""
     rows, scores, correct, counts = [], [], [], []
-    for index, found in enumerate(predictions):
+    for index, detections in enumerate(predictions):
         truth = images.boxes[index][images.labels[index] == label]
         counts.append(len(truth))
-        mine = found["labels"] == label
-        order = found["scores"][mine].argsort(descending=True, stable=True)[:100]
-        overlap = box_iou(found["boxes"][mine][order].float(), truth.float()).numpy()
+        own = detections["labels"] == label
+        order = detections["scores"][own].argsort(descending=True, stable=True)[:100]
+        overlap = box_iou(detections["boxes"][own][order].float(), truth.float()).numpy()
         rows += [index] * len(order)
-        scores += found["scores"][mine][order].tolist()
+        scores += detections["scores"][own][order].tolist()
         correct += list(_greedy(overlap))
     best_first = np.argsort(-np.asarray(scores), kind="stable")
     table = np.asarray(correct, dtype=bool).reshape(len(rows), len(THRESHOLDS))

@@ -22,7 +22,7 @@ class Compare:
 
     Args:
         experiments: MLflow experiments whose runs are compared, each by itself and at each gap.
-        reference: the method that the others are held against.
+        reference: the method that the others are compared with.
         draws: of the bootstrap.
         clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
 
@@ -59,25 +59,25 @@ class Compare:
         labels = [group.label for group in chosen.groups]
         tags = {"compared": ",".join(labels)}
         with tracking.opened(uri, "compare", ", ".join(labels), tags, tracking.flatten(config)) as tracked:
-            found, text = self._compared(chosen, seed, folder)
+            comparisons, text = self._compared(chosen, seed, folder)
             tracked.log(
-                {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in found for method in c.methods}
+                {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in comparisons for method in c.methods}
             )
             tracked.log_files(folder)
         print(text)
         tables = [logged.where_runs(uri, name) for name in dict.fromkeys(self.experiments)]
         lines = dict.fromkeys(line for table in tables for line in table.splitlines())  # one command for all
         print(f"results: {folder}", *lines, sep="\n")
-        return found
+        return comparisons
 
     def _compared(self, chosen: Selection, seed: int, folder: Path) -> tuple[list[Comparison], str]:
         """Every group's comparison, with the files in ``folder``; and the text of compare.md."""
-        found, parts, documents = [], [], []
+        comparisons, parts, documents = [], [], []
         for group in chosen.groups:
             runs = [read_run(run) for run in group.runs]
             comparison = compare(runs, self.reference, self.draws, seed, self.clock)
             comparison = dataclasses.replace(comparison, setting=group.label)
-            found.append(comparison)
+            comparisons.append(comparison)
             parts.append(markdown(comparison, runs, group.heading))
             documents.append(dataclasses.asdict(comparison) | _sources(group))
             figures.save(curves(comparison, runs), folder / "figures" / f"{_slug(comparison)}.png")
@@ -87,7 +87,7 @@ class Compare:
             json.dumps({"comparisons": documents, "left_out": left}, indent=1)
         )
         (folder / "compare.md").write_text(text + "\n")
-        return found, text
+        return comparisons, text
 
 
 def _slug(comparison: Comparison) -> str:
@@ -103,10 +103,10 @@ def _sources(group: Group) -> dict[str, Any]:
 
 def by_reason(left_out: Sequence[LeftOut]) -> list[tuple[str, list[str]]]:
     """Runs with the first digits of their ids, by why they were left out."""
-    found: dict[str, list[str]] = {}
+    grouped: dict[str, list[str]] = {}
     for run in left_out:
-        found.setdefault(run.reason, []).append(f"{run.run} ({run.run_id[:8]})")
-    return list(found.items())
+        grouped.setdefault(run.reason, []).append(f"{run.run} ({run.run_id[:8]})")
+    return list(grouped.items())
 
 
 def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
@@ -121,8 +121,8 @@ def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
 
 
 def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
-    """The table of one setting, its differences, and the distances of the learned distributions. ``heading`` says what
-    these runs have for themselves among others of the setting."""
+    """The table of one setting, its differences, and the distances of the learned distributions. ``heading`` is
+    how these runs differ from others of the setting."""
     c, count = comparison, len(comparison.seeds)
     unit = "seconds" if c.clock == "seconds" else "CPU seconds"
     lines = [
@@ -170,7 +170,7 @@ def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
 
 
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
-    """A share in points with its interval; in bold where it is certain and that is asked for."""
+    """A fraction in percentage points with its interval; with ``sure``, in bold where the interval excludes 0."""
     digits = 0 if unit else 1
     text = f"{100 * estimate.value:.{digits}f}" + (f" {unit}" if unit else "")
     if estimate.low is None or estimate.high is None:
@@ -188,7 +188,7 @@ def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]
             means = []
             for method in comparison.methods:
                 each = [table[method, seed][name][factor] for seed in comparison.seeds]
-                means.append({w: sum(held[w] for held in each) / len(each) for w in ("initial", "learned")})
+                means.append({w: sum(row[w] for row in each) / len(each) for w in ("initial", "learned")})
             cells = " | ".join(f"{mean['learned']:.2f}" for mean in means)
             rows.append(f"| {name}, {factor} | {means[0]['initial']:.2f} | {cells} |")
     return rows

@@ -23,7 +23,7 @@ CLASS_COLOURS = ("#2f6db5", "#e08a1e", "#4c9f70", "#b5417a", "#7b5cc4", "#b08d3c
 
 
 def style(axes: Any) -> None:
-    """The quiet frame that all figures share."""
+    """The frame of all figures."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -69,12 +69,12 @@ def psi_figure(
         width = max(1.0, 0.12 * len(p))
         axes.stackplot(steps, p.T, colors=shades, linewidth=0)
         bottom = 0.0
-        for group, share, shade in zip(joined, wanted, shades, strict=True):
-            axes.bar(len(p) - 1 + 1.1 * width, share, width, bottom=bottom, color=shade, linewidth=0)
-            if share > 0.25:
-                axes.text(len(p) - 1 + 1.1 * width, bottom + share / 2, "=".join(map(str, group)), ha="center",
+        for group, mass, shade in zip(joined, wanted, shades, strict=True):
+            axes.bar(len(p) - 1 + 1.1 * width, mass, width, bottom=bottom, color=shade, linewidth=0)
+            if mass > 0.25:
+                axes.text(len(p) - 1 + 1.1 * width, bottom + mass / 2, "=".join(map(str, group)), ha="center",
                           va="center", color="white", fontsize=8)  # fmt: skip
-            bottom += share
+            bottom += mass
         axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=_titled(name, joined))
         axes.title.set_fontsize(9)
         ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
@@ -160,7 +160,7 @@ def _best_prediction(
     axes: Any, prediction: Mapping[str, torch.Tensor], origin: tuple[int, int], class_names: Sequence[str]
 ) -> str:
     if not len(prediction["scores"]):
-        return "nothing found"
+        return "no detection"
     best = int(prediction["scores"].argmax())
     label = int(prediction["labels"][best])
     _box(axes, prediction["boxes"][best].tolist(), origin, label, dashed=False)

@@ -1,4 +1,4 @@
-"""Finished runs, read back from MLflow: what each method's detectors found, image by image."""
+"""Finished runs, read back from MLflow: results and detections, image by image."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Candidate(Recorded):
-    """A run found in MLflow: its results.json, or why there is none to compare (``unusable``).
+    """A run in MLflow: its results.json, or why there is none to compare (``unusable``).
 
     ``detections`` fetches its detections.json.
     """
@@ -90,12 +90,12 @@ def _candidate(run: logged.LoggedRun, experiment: str) -> Candidate:
 def read_run(candidate: Candidate) -> FinishedRun:
     """A run with biased objects, its detections matched to the test set's boxes."""
     results = candidate.results
-    held = json.loads(candidate.detections().read_text())
-    names, count = list(results["psi"]), held["images"]
-    truth = _images(held["truth"], count)
+    stored = json.loads(candidate.detections().read_text())
+    names, count = list(results["psi"]), stored["images"]
+    truth = _images(stored["truth"], count)
     labels = [names.index(name) for name in results["biased"]]
-    found = {which: _detections(held[which], count) for which in WHICH}
-    return FinishedRun(results, {w: [match(found[w], truth, label) for label in labels] for w in WHICH})
+    detections = {which: _detections(stored[which], count) for which in WHICH}
+    return FinishedRun(results, {w: [match(detections[w], truth, label) for label in labels] for w in WHICH})
 
 
 def _detections(rows: Sequence[Mapping[str, Any]], count: int) -> list[dict[str, Tensor]]:
@@ -103,22 +103,22 @@ def _detections(rows: Sequence[Mapping[str, Any]], count: int) -> list[dict[str,
     grouped: list[list[Mapping[str, Any]]] = [[] for _ in range(count)]
     for row in rows:
         grouped[row["image_id"]].append(row)
-    found = []
+    detections = []
     for group in grouped:
         boxes = torch.tensor([row["bbox"] for row in group]).reshape(-1, 4)
         corners = torch.cat([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], -1)
         labels = torch.tensor([row["category_id"] - 1 for row in group], dtype=torch.long)
         scores = torch.tensor([row["score"] for row in group])
-        found.append({"boxes": corners, "labels": labels, "scores": scores})
-    return found
+        detections.append({"boxes": corners, "labels": labels, "scores": scores})
+    return detections
 
 
 def _images(rows: Sequence[Mapping[str, Any]], count: int) -> LabelledImages:
     """The truth's boxes as a set without pixels."""
-    found = _detections(rows, count)
-    most = max(len(image["labels"]) for image in found)
+    boxes_by_image = _detections(rows, count)
+    most = max(len(image["labels"]) for image in boxes_by_image)
     boxes, labels = torch.zeros(count, most, 4), torch.full((count, most), -1)
-    for index, image in enumerate(found):
+    for index, image in enumerate(boxes_by_image):
         boxes[index, : len(image["labels"])] = image["boxes"]
         labels[index, : len(image["labels"])] = image["labels"]
     return LabelledImages(torch.zeros(count, 3, 1, 1), boxes, labels, torch.zeros(count, dtype=torch.long))

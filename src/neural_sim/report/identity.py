@@ -1,4 +1,4 @@
-"""What makes two runs comparable: digests of what is scored, of a run's whole settings, and of its test set."""
+"""Which runs are comparable, by digests of what is scored, of all settings of a run, and of its test set."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint", "l
 """Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the rest says where
 it starts and what it aims at."""
 RUN_KEYS = ("seed", "score_at", "stages", "progress", "paths", "trainer")
-"""What runs of the same settings may differ by."""
+"""Keys by which runs of the same settings may differ."""
 SHOWN = 3
 """Differences that are named; the rest is counted."""
 
@@ -80,8 +80,8 @@ def all_values(results: Mapping[str, Any]) -> dict[str, Any]:
 def differing(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names whose values are not the same in all mappings; ``_target_``, the class that a group names, comes first."""
     names = list(dict.fromkeys(name for values in all_of for name in values))
-    found = [n for n in names if any(v.get(n, _ABSENT) != all_of[0].get(n, _ABSENT) for v in all_of)]
-    return sorted(found, key=lambda name: not name.endswith("_target_"))
+    different = [n for n in names if any(v.get(n, _ABSENT) != all_of[0].get(n, _ABSENT) for v in all_of)]
+    return sorted(different, key=lambda name: not name.endswith("_target_"))
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
@@ -92,7 +92,7 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
 
 
 def headings(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What each mapping has for itself: ``views.count=8, ... and 4 more``; empty for a single one."""
+    """How each mapping differs from the others: ``views.count=8, ... and 4 more``; empty for a single one."""
     names = differing(all_of)
     return [", ".join(f"{n}={_shown(v, n)}" for n in names[:SHOWN]) + _more(names) for v in all_of]
 

@@ -1,4 +1,4 @@
-"""The way between two lights of a field: colour changes, geometry does not (the paper's figure of NeRF in the Wild)."""
+"""Interpolation between two lights of a field: colour changes, geometry does not (the paper's figure of NeRF-W)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from neural_sim.report.figures import INK, MUTED
 from neural_sim.types import PinholeCamera
 
 UNCHANGED = 1e-6
-"""Largest difference of opacity along the way that counts as none."""
+"""Largest difference of opacity between lights that counts as none."""
 
 
 @dataclass(frozen=True)
-class Way:
-    """One object's images between two lights; ``opacity_change`` is the largest along the way, over all pixels."""
+class InterpolatedViews:
+    """One object's images between two lights; ``opacity_change`` is the largest from the first, over all pixels."""
 
     images: Float[Tensor, "steps height width 3"]
     opacity_change: float
@@ -36,7 +36,7 @@ class Interpolation:
 
     Args:
         ends: numbers of the two anchor lights, from 1.
-        steps: images on the way, the ends included.
+        steps: number of images, the ends included.
         image_size: in pixels.
         phi_deg, rho_deg, distance: the camera's place; degrees and object radii.
 
@@ -59,14 +59,14 @@ class Interpolation:
                 f"interpolation: want 2 steps and a pixel or more, got {self.steps} and {self.image_size}"
             )
 
-    def ways(
+    def interpolated_views(
         self,
         fields: Mapping[str, RadianceField],
         renderer: NerfWRenderer,
         camera: PinholeCamera,
         anchors: int,
-    ) -> dict[str, Way]:
-        """Every object's way. Raises ``ValueError`` for a light that there is not."""
+    ) -> dict[str, InterpolatedViews]:
+        """Every object's images, by name. Raises ``ValueError`` for a light that there is not."""
         if max(self.ends) > anchors:
             raise ValueError(f"interpolation.ends: there are {anchors} anchor lights, got {list(self.ends)}")
         place = [math.radians(self.phi_deg), math.radians(self.rho_deg), self.distance]
@@ -85,7 +85,7 @@ def interpolate(
     camera_to_world: Float[Tensor, "4 4"],
     ends: tuple[Float[Tensor, "k"], Float[Tensor, "k"]],
     steps: int = 7,
-) -> Way:
+) -> InterpolatedViews:
     """Views over white from one camera under ``steps`` weights evenly spaced between two ends, these included.
 
     Raises ``ValueError`` for fewer than two steps, and ``RuntimeError`` where opacity changes by more than
@@ -103,25 +103,25 @@ def interpolate(
     change = float((torch.stack(opacities) - opacities[0]).abs().max())
     if not change <= UNCHANGED:
         raise RuntimeError(f"interpolate: opacity changes by {change:.3g} with the light, want {UNCHANGED:g}")
-    return Way(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
+    return InterpolatedViews(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
 
 
-def interpolation_figure(ways: Mapping[str, Way], title: str) -> Figure:
+def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> Figure:
     """A row for each object, from its first light on the left to its second on the right."""
-    count, height, width = next(iter(ways.values())).images.shape[:3]
+    count, height, width = next(iter(views.values())).images.shape[:3]
     canvas = np.concatenate(
-        [np.concatenate(list(way.images.cpu().numpy()), axis=1) for way in ways.values()], axis=0
+        [np.concatenate(list(row.images.cpu().numpy()), axis=1) for row in views.values()], axis=0
     )
-    figure = Figure(figsize=(1.4 * count + 0.9, 1.4 * len(ways) + 0.8))
-    left, bottom = 0.9 / (1.4 * count + 0.9), 0.35 / (1.4 * len(ways) + 0.8)
-    axes = figure.add_axes((left, bottom, 1.0 - left - 0.01, 1.4 * len(ways) / (1.4 * len(ways) + 0.8)))
+    figure = Figure(figsize=(1.4 * count + 0.9, 1.4 * len(views) + 0.8))
+    left, bottom = 0.9 / (1.4 * count + 0.9), 0.35 / (1.4 * len(views) + 0.8)
+    axes = figure.add_axes((left, bottom, 1.0 - left - 0.01, 1.4 * len(views) / (1.4 * len(views) + 0.8)))
     axes.imshow(canvas)
-    axes.set_yticks([(row + 0.5) * height for row in range(len(ways))], list(ways))
-    shares = [f"{i / (count - 1):.2g}" for i in range(count)]
-    axes.set_xticks([(column + 0.5) * width for column in range(count)], shares)
+    axes.set_yticks([(row + 0.5) * height for row in range(len(views))], list(views))
+    fractions = [f"{i / (count - 1):.2g}" for i in range(count)]
+    axes.set_xticks([(column + 0.5) * width for column in range(count)], fractions)
     axes.tick_params(length=0, colors=MUTED, labelsize=8)
     for side in axes.spines.values():
         side.set_visible(False)
-    change = max(way.opacity_change for way in ways.values())
+    change = max(row.opacity_change for row in views.values())
     figure.suptitle(f"{title} (opacity changes by at most {change:.0e})", color=INK, fontsize=10)
     return figure

@@ -60,8 +60,8 @@ def _logged(client: Any, info: Any) -> LoggedRun:
 
 
 def _experiment_id(client: Any, uri: str, experiment: str) -> str:
-    found = client.get_experiment_by_name(experiment)
-    if found is None:
+    logged = client.get_experiment_by_name(experiment)
+    if logged is None:
         known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
         raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
-    return found.experiment_id
+    return logged.experiment_id

@@ -104,15 +104,15 @@ class RunResults:
 
     def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
         """Distance of the initial and the learned distribution from the target, by object and factor, over groups."""
-        found: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
+        distances: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
         for label, name in enumerate(self.names):
             for factor in self.factors:
                 groups = self.groups(name, factor)
-                p = {which: merged(held[factor][label], groups) for which, held in self.probabilities.items()}
-                found[name][factor] = {
+                p = {which: merged(p[factor][label], groups) for which, p in self.probabilities.items()}
+                distances[name][factor] = {
                     which: float(total_variation(p[which], p["target"])) for which in ("initial", "learned")
                 }
-        return found
+        return distances
 
     def summary(self) -> str:
         """The table printed at the end of a run."""
@@ -130,9 +130,9 @@ class RunResults:
             for which in ("initial", "learned"):
                 row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
                 lines.append(f"  {which:<18}{row}")
-        held = untrusted(self.records)
-        if held["steps"]:
-            lines.append(_trust_line(held))
+        trust = untrusted(self.records)
+        if trust["steps"]:
+            lines.append(_trust_line(trust))
         if self.images_without_box():
             lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
@@ -147,25 +147,26 @@ class RunResults:
 
 
 def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
-    """Shares of the work that was spared, and what the store had."""
-    found = [o for o in left_out if o["why"] == "found in the store"]
-    parts = [f"{o['what']} {o['share']:.0%}" for o in left_out if o not in found and o["share"] is not None]
-    if found:
-        spared = sum(o["seconds"] for o in found)
-        parts.append(f"{len(found)} results found in the store ({spared:.0f} s)")
+    """Fractions of the work that was left out, and the results that the store had."""
+    stored = [o for o in left_out if o["why"] == "found in the store"]
+    others = [o for o in left_out if o not in stored and o["fraction"] is not None]
+    parts = [f"{o['what']} {o['fraction']:.0%}" for o in others]
+    if stored:
+        spared = sum(o["seconds"] for o in stored)
+        parts.append(f"{len(stored)} results from the store ({spared:.0f} s)")
     return "left out: " + ", ".join(parts)
 
 
-def _trust_line(held: Mapping[str, Any]) -> str:
+def _trust_line(trust: Mapping[str, Any]) -> str:
     """How many psi steps of objects and factors were not trusted, why, and what became of them."""
-    text = f"untrusted psi steps of objects: {held['untrusted']} of {held['steps']}"
+    text = f"untrusted psi steps of objects: {trust['untrusted']} of {trust['steps']}"
     for part in ("actions", "doubts"):
-        if held[part]:
-            text += "; " + ", ".join(f"{name} {count}" for name, count in held[part].items())
-    if held["judged"]:
-        text += f"; undone by the next training {held['undone']} of {held['judged']}"
-    if held["cosines"]:
-        text += "; cosine with what outer.certify measured " + ", ".join(f"{c:.2f}" for c in held["cosines"])
+        if trust[part]:
+            text += "; " + ", ".join(f"{name} {count}" for name, count in trust[part].items())
+    if trust["judged"]:
+        text += f"; undone by the next training {trust['undone']} of {trust['judged']}"
+    if trust["cosines"]:
+        text += "; cosine with what outer.certify measured " + ", ".join(f"{c:.2f}" for c in trust["cosines"])
     return text
 
 
@@ -185,7 +186,7 @@ def write_figures(
     folder: Path,
 ) -> list[Path]:
     """The run's figures as PNG files."""
-    names, made = list(results.names), []
+    names, paths = list(results.names), []
     for factor in results.factors if results.records else ():
         target = results.probabilities["target"][factor].tolist()
         steps = [*(r["probabilities"][factor] for r in results.records)]
@@ -194,28 +195,28 @@ def write_figures(
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
         groups = {name: results.groups(name, factor) for name in names}
         drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor, groups)
-        made.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
+        paths.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
     if results.ap:
-        made.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))
+        paths.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))
     chosen = _spread(drawn, 32)
     grid = figures.image_grid(
         drawn.select(chosen), names, title="Training images drawn from the learned distribution"
     )
-    made.append(figures.save(grid, folder / "training_images.png"))
+    paths.append(figures.save(grid, folder / "training_images.png"))
     if detections:
         chosen = _spread(test, 32)
         shown = [detections[int(i)] for i in chosen]
         title = "Detections on the test set (dashed: truth)"
         grid = figures.image_grid(test.select(chosen), names, predictions=shown, title=title)
-        made.append(figures.save(grid, folder / "detections.png"))
-    return made
+        paths.append(figures.save(grid, folder / "detections.png"))
+    return paths
 
 
 def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], folder: Path) -> Path:
     """The final training set as COCO: images and a JSON that holds every image's pose."""
     named = ("phi", "rho", "distance", "magnification", "bins")
-    held = {key: [getattr(part.draw, key) for part in parts] for key in named}
-    poses = {key: torch.cat(values) for key, values in held.items() if values[0] is not None}
+    drawn = {key: [getattr(part.draw, key) for part in parts] for key in named}
+    poses = {key: torch.cat(values) for key, values in drawn.items() if values[0] is not None}
     poses["distance"] = torch.cat([part.draw.distance / part.draw.radius for part in parts])  # object radii
     poses["camera_to_world"] = orbit(poses["phi"], poses["rho"], poses["distance"])
     return write_coco(join(parts), list(names), folder, poses)
@@ -229,7 +230,7 @@ def write_detections(
         {"boxes": b[k], "labels": n[k]} for b, n, k in zip(test.boxes, test.labels, test.present, strict=True)
     ]
     rows = {"images": len(test), "truth": _rows(truth)}
-    rows |= {which: _rows(found) for which, found in detections.items()}
+    rows |= {which: _rows(images) for which, images in detections.items()}
     path = folder / "detections.json"
     path.write_text(json.dumps(rows))
     return path

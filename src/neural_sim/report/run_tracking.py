@@ -19,7 +19,7 @@ _CERTIFIED = (
 
 
 class LiveRun:
-    """A run in MLflow while its stages go on. Iterations and fields that are told again are written once."""
+    """A run in MLflow while its stages run. Iterations and fields are written once, even if given again."""
 
     def __init__(self, run: tracking.Run, names: Sequence[str]) -> None:
         self._run, self._names = run, names
@@ -99,35 +99,35 @@ def _final(results: RunResults) -> dict[str, float]:
 
 
 def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     certificate = record["certificate"]
     for i, name in enumerate(names):
         for factor, probabilities in record["probabilities"].items():
             own = f"psi/{name}/{factor}"
-            found |= {f"{own}/bin_{b}": p for b, p in enumerate(probabilities[i], 1)}
-            found[f"{own}/entropy"] = record["entropies"][factor][i]
+            metrics |= {f"{own}/bin_{b}": p for b, p in enumerate(probabilities[i], 1)}
+            metrics[f"{own}/entropy"] = record["entropies"][factor][i]
         if certificate:
             p_values, actions = (certificate[key].get(name, {}) for key in ("p_values", "actions"))
-            found |= {f"psi/{name}/{factor}/p_value": value for factor, value in p_values.items()}
-            found |= {f"psi/{name}/{factor}/trusted": float(a == "kept") for factor, a in actions.items()}
-            found[f"psi/{name}/gradient_norm"] = record["gradient_norms"][i]
+            metrics |= {f"psi/{name}/{factor}/p_value": value for factor, value in p_values.items()}
+            metrics |= {f"psi/{name}/{factor}/trusted": float(a == "kept") for factor, a in actions.items()}
+            metrics[f"psi/{name}/gradient_norm"] = record["gradient_norms"][i]
         if record["scores"]:
-            found[f"psi/{name}/score"] = record["scores"][i]
+            metrics[f"psi/{name}/score"] = record["scores"][i]
         if name in record["verdicts"]:
-            found[f"psi/{name}/accepted"] = float(record["verdicts"][name]["accepted"])
-    found |= {f"psi/{key}": record[key] for key in _COUNTED}
-    found |= {f"psi/{key}": certificate[key] for key in (_CERTIFIED if certificate else ())}
-    return found | {f"psi/seconds_{phase}": spent for phase, spent in record["seconds"].items()}
+            metrics[f"psi/{name}/accepted"] = float(record["verdicts"][name]["accepted"])
+    metrics |= {f"psi/{key}": record[key] for key in _COUNTED}
+    metrics |= {f"psi/{key}": certificate[key] for key in (_CERTIFIED if certificate else ())}
+    return metrics | {f"psi/seconds_{phase}": spent for phase, spent in record["seconds"].items()}
 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:
     """AP of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by side."""
-    found: dict[str, dict[int, float]] = {}
+    series: dict[str, dict[int, float]] = {}
     for point in results.curve:
         scores = {"ap": point["ap"]["ap"]}
         if results.biased:
             per_class = point["ap"]["per_class"]
             scores["biased_ap"] = sum(per_class[name] for name in results.biased) / len(results.biased)
         for by, (what, value) in itertools.product(("iteration", "images", "seconds"), scores.items()):
-            found.setdefault(f"curve/{what}_by_{by}", {})[round(point[by])] = value
-    return found
+            series.setdefault(f"curve/{what}_by_{by}", {})[round(point[by])] = value
+    return series

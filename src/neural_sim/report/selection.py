@@ -17,7 +17,7 @@ from neural_sim.report.statistics import FIXED
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A run that a comparison does not use, and why in plain words."""
+    """A run that a comparison does not use, and the reason."""
 
     run: str
     run_id: str
@@ -29,8 +29,8 @@ class LeftOut:
 class Group:
     """Runs to compare: one of each method at each of ``seeds``.
 
-    ``label`` names the group among all of a comparison. ``heading`` says what it has for itself where several groups
-    have one setting; it is empty for the only one.
+    ``label`` names the group among all of a comparison. ``heading`` says how it differs from other groups of the
+    same setting; it is empty for the only one.
     """
 
     setting: str
@@ -43,13 +43,13 @@ class Group:
 class Selection:
     """The groups of runs that a comparison with ``reference`` is made of, and what it leaves out.
 
-    ``found`` are the runs of all experiments asked for, those of each the newest first.
+    ``candidates`` are the runs of all experiments asked for, those of each the newest first.
     """
 
-    def __init__(self, found: Sequence[Candidate], reference: str) -> None:
+    def __init__(self, candidates: Sequence[Candidate], reference: str) -> None:
         self.reference = reference
         self.left_out: list[LeftOut] = []
-        usable = [run for run in found if self._usable(run)]
+        usable = [run for run in candidates if self._usable(run)]
         keyed: dict[tuple[str, str], list[Candidate]] = {}
         for run in usable:
             keyed.setdefault((run.setting, run.results["scoring"]), []).append(run)
@@ -92,8 +92,9 @@ class Selection:
         methods = sorted({run.method for run in runs}, key=lambda m: (m != self.reference, m))
         alike = {method: self._one_configuration(_of(runs, method)) for method in methods}
         own = self._newest(alike.pop(self.reference))
-        others = {method: self._newest(self._same_test_set(held, own)) for method, held in alike.items()}
-        return self._common_seeds({self.reference: own} | {m: held for m, held in others.items() if held})
+        others = {m: self._newest(self._same_test_set(theirs, own)) for m, theirs in alike.items()}
+        others = {m: theirs for m, theirs in others.items() if theirs}
+        return self._common_seeds({self.reference: own} | others)
 
     def _one_configuration(self, runs: Sequence[Candidate]) -> list[Candidate]:
         newest = runs[0]
@@ -129,25 +130,25 @@ class Selection:
                 kept.append(run)
         return kept
 
-    def _common_seeds(self, held: dict[str, dict[int, Candidate]]) -> list[Candidate]:
+    def _common_seeds(self, runs: dict[str, dict[int, Candidate]]) -> list[Candidate]:
         """Methods with many seeds come first; one that would leave no seed in common is left out."""
-        seeds = set(held[self.reference])
+        seeds = set(runs[self.reference])
         chosen = [self.reference]
-        others = sorted((m for m in held if m != self.reference), key=lambda m: (-len(held[m]), m))
+        others = sorted((m for m in runs if m != self.reference), key=lambda m: (-len(runs[m]), m))
         for method in others:
-            if seeds & set(held[method]):
+            if seeds & set(runs[method]):
                 chosen.append(method)
-                seeds &= set(held[method])
+                seeds &= set(runs[method])
             else:
                 what = f"it shares no seed with all of {', '.join(chosen)}"
-                self._leave(held[method].values(), what)
+                self._leave(runs[method].values(), what)
         for method in chosen:
-            for seed, run in held[method].items():
+            for seed, run in runs[method].items():
                 if seed not in seeds:
-                    lacking = [other for other in chosen if seed not in held[other]]
+                    lacking = [other for other in chosen if seed not in runs[other]]
                     self._leave([run], f"there is no run of seed {seed} of {', '.join(lacking)}")
         order = [self.reference, *sorted(chosen[1:])]
-        return [held[method][seed] for method in order for seed in sorted(seeds)]
+        return [runs[method][seed] for method in order for seed in sorted(seeds)]
 
 
 def _of(runs: Iterable[Candidate], method: str) -> list[Candidate]:

@@ -1,4 +1,4 @@
-"""What methods differ by, and whether the differences exceed the spread over seeds and test images.
+"""Differences between methods, and whether they exceed the spread over seeds and test images.
 
 All methods of a seed are scored on one test set, so that they are compared in pairs: a bootstrap draw takes the same
 seeds and the same images for all of them.
@@ -43,7 +43,7 @@ class Estimate:
 class Comparison:
     """The methods of one setting over the seeds that all of them have.
 
-    ``ap`` is the biased objects' mean AP, ``won_back`` the share of the gap from ns to matched, ``ahead`` the
+    ``ap`` is the biased objects' mean AP, ``won_back`` the fraction of the gap from ns to matched, ``ahead`` the
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
     unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
     took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`. ``spent`` are means over seeds, the warm
@@ -81,13 +81,13 @@ def compare(
     if not seeds:
         raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
     columns = (*BOUNDS, *methods)
-    held = [
+    matches = [
         [table[reference, s].matches[bound] for bound in BOUNDS]
         + [table[method, s].matches["learned"] for method in methods]
         for s in seeds
     ]
-    point = np.asarray([[mean_ap(matches) for matches in row] for row in held]).mean(0)
-    spread = resampled(held, draws, seed)
+    point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
+    spread = resampled(matches, draws, seed)
     ap = dict(zip(columns, _estimates(point, spread), strict=True))
     gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
     won = _estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
@@ -106,16 +106,16 @@ def mean_ap(matches: Sequence[Matches], weights: Float[np.ndarray, "images"] | N
 
 
 def resampled(
-    held: Sequence[Sequence[Sequence[Matches]]], draws: int, seed: int
+    matches: Sequence[Sequence[Sequence[Matches]]], draws: int, seed: int
 ) -> Float[np.ndarray, "draws columns"]:
-    """Mean AP of each column of ``held`` [seeds][columns][classes] under resampled seeds and images."""
+    """Mean AP of each column of ``matches`` [seeds][columns][classes] under resampled seeds and images."""
     random, rows = np.random.default_rng(seed), []
     for _ in range(draws):
         each = []
-        for i in random.integers(len(held), size=len(held)):
-            count = len(held[i][0][0].boxes_per_image)
+        for i in random.integers(len(matches), size=len(matches)):
+            count = len(matches[i][0][0].boxes_per_image)
             weights = np.bincount(random.integers(count, size=count), minlength=count).astype(float)
-            each.append([mean_ap(matches, weights) for matches in held[i]])
+            each.append([mean_ap(classes, weights) for classes in matches[i]])
         rows.append(np.mean(each, 0))
     return np.asarray(rows)
 
@@ -132,7 +132,7 @@ def biased_ap(
 def area_under(
     seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
 ) -> float:
-    """Mean of AP over log seconds in [first, last]: a method is worth what it has reached, until it reaches more."""
+    """Mean of AP over log seconds in [first, last], AP as a step function of the scored points."""
     edges = np.concatenate([[first], seconds[(seconds > first) & (seconds < last)], [last]])
     reached = np.searchsorted(seconds, edges[:-1], side="right") - 1
     return float((ap[reached.clip(0)] * np.diff(np.log(edges))).sum() / math.log(last / first))
@@ -183,15 +183,15 @@ def _areas(
 
 
 def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
-    """Means over seeds, resampled alone: images on the way are scored, their detections not kept."""
-    found = {}
+    """Means over seeds; seeds alone are resampled, since detections of intermediate psi are not kept."""
+    estimates = {}
     for method, each in values.items():
         numbers, random = np.asarray(each), np.random.default_rng(seed)
         chosen = random.integers(len(each), size=(draws, len(each)))
-        found[method] = _estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
+        estimates[method] = _estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
         if len(each) == 1:
-            found[method] = Estimate(found[method].value)
-    return found
+            estimates[method] = Estimate(estimates[method].value)
+    return estimates
 
 
 def _estimates(point: np.ndarray, spread: Float[np.ndarray, "draws columns"]) -> list[Estimate]:

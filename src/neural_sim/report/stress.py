@@ -28,10 +28,10 @@ def table(results: Sequence[Check]) -> str:
     """One line a case: its checks, the largest part of a tolerance that was used up, its seconds; then what failed."""
     head = f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"
     lines = [head]
-    for name, held in by_case(results).items():
-        used = max(result.used for result in held)
-        spent = sum(result.seconds for result in held)
-        lines.append(f"{name:<38}{len(held):>7}{len(failures(held)):>7}{used:>9.1g}{spent:>9.2f}")
+    for name, checks in by_case(results).items():
+        used = max(result.used for result in checks)
+        spent = sum(result.seconds for result in checks)
+        lines.append(f"{name:<38}{len(checks):>7}{len(failures(checks)):>7}{used:>9.1g}{spent:>9.2f}")
     wrong = failures(results)
     lines += [
         f"FAILED {r.case}: {r.quantity}: {r.value:.3g}, tolerance {r.tolerance:.3g} {r.status}" for r in wrong
@@ -46,11 +46,11 @@ def table(results: Sequence[Check]) -> str:
 def markdown(results: Sequence[Check]) -> str:
     """Every check as a table, case by case."""
     parts = ["# Stress suite", f"{len(results)} checks, {len(failures(results))} failed."]
-    for name, held in by_case(results).items():
+    for name, checks in by_case(results).items():
         rows = [
             f"| {r.quantity.replace('|', chr(92) + '|')} | {r.value:.3g} | {r.tolerance:.3g} | {r.status} | "
             f"{'passed' if r.passed else '**failed**'} | {r.seconds:.3f} |"
-            for r in held
+            for r in checks
         ]
         header = ["| quantity | value | tolerance | status | | seconds |", "|---|---|---|---|---|---|"]
         parts += [f"## {name}", "\n".join([*header, *rows])]
@@ -71,11 +71,11 @@ def track(
 ) -> tracking.Run:
     """The suite as a run in MLflow that began at ``begun`` (seconds since 1970), with ``folder`` as its artifacts."""
     metrics = {"checks": float(len(results)), "failed": float(len(failures(results)))}
-    for name, held in by_case(results).items():
+    for name, checks in by_case(results).items():
         metrics |= {
-            f"{name}/failed": float(len(failures(held))),
-            f"{name}/used": max(result.used for result in held),
-            f"{name}/seconds": sum(result.seconds for result in held),
+            f"{name}/failed": float(len(failures(checks))),
+            f"{name}/used": max(result.used for result in checks),
+            f"{name}/seconds": sum(result.seconds for result in checks),
         }
     name = f"seed {config['seed']}"
     parameters = tracking.flatten({"stress": config["stress"], "seed": config["seed"]})

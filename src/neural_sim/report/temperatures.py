@@ -17,7 +17,7 @@ from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 
 BIAS, SPREAD = METHOD_COLOURS["learned"], "#e08a1e"
 LEAST = 1e-2
-"""Lengths of the derivative below which the figure does not look."""
+"""Lower limit of the figure, in lengths of the derivative."""
 
 
 def report_temperatures(
@@ -34,7 +34,7 @@ def report_temperatures(
     since 1970)."""
     folder.mkdir(parents=True, exist_ok=True)
     document = {
-        key: [dataclasses.asdict(x) for x in held] for key, held in (("rows", rows), ("truths", truths))
+        key: [dataclasses.asdict(x) for x in entries] for key, entries in (("rows", rows), ("truths", truths))
     }
     (folder / "temperatures.json").write_text(json.dumps(document, indent=1))
     text = table(rows, truths)
@@ -76,7 +76,7 @@ def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:
 
 def agreement(row: AtTemperature, truth: Truth) -> float:
     """1 - total variation between where relaxed draws lie and p."""
-    return 1.0 - 0.5 * float(np.abs(np.subtract(row.shares, truth.probabilities)).sum())
+    return 1.0 - 0.5 * float(np.abs(np.subtract(row.frequencies, truth.probabilities)).sum())
 
 
 def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> Figure:
@@ -85,7 +85,7 @@ def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -
     grid = figure.subplots(2, len(truths), squeeze=False)
     for column, truth in enumerate(truths):
         own = [row for row in rows if row.object == truth.object]
-        _shares(grid[0, column], own, truth)
+        _frequencies(grid[0, column], own, truth)
         _errors(grid[1, column], own, truth, column == 0)
     figure.suptitle(
         f"Gumbel-softmax: relaxed draws, and the derivative from {rows[0].images} of them",
@@ -99,8 +99,8 @@ def temperature_figure(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -
     return figure
 
 
-def _shares(axes: Any, rows: Sequence[AtTemperature], truth: Truth) -> None:
-    values = np.array([*(row.shares for row in rows), truth.probabilities])
+def _frequencies(axes: Any, rows: Sequence[AtTemperature], truth: Truth) -> None:
+    values = np.array([*(row.frequencies for row in rows), truth.probabilities])
     axes.imshow(values, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
     for (y, x), value in np.ndenumerate(values):
         if value >= 0.005:

@@ -65,11 +65,11 @@ class Run:
         return where(self.uri, self.experiment_id, self.run_id)
 
     def log(self, metrics: Mapping[str, float], step: int = 0) -> None:
-        """Write numbers of now."""
+        """Write numbers with the current time."""
         self.log_series({key: {step: value} for key, value in metrics.items()})
 
     def log_series(self, series: Mapping[str, Sequence[float] | Mapping[int, float]]) -> None:
-        """Write values by step, or one a step from 0, with the time of now."""
+        """Write values by step, or one a step from 0, with the current time."""
         from mlflow.entities import Metric
 
         now = int(1000 * self._clock())
@@ -150,10 +150,10 @@ def opened(
             with _guard(uri):
                 experiment_id = _experiment_id(client, uri, experiment)
                 tags = {**tags, "source": "neural-sim"}
-                made = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
+                created = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
         except MlflowException as error:
             raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error
-    run = Run(client, uri, made.info, clock)
+    run = Run(client, uri, created.info, clock)
     try:
         run.parameters(parameters)
         yield run
@@ -247,17 +247,17 @@ def _experiment_id(client: Any, uri: str, name: str) -> str:
     """The experiment, made where there is none, with the tag of model training unless it has one of its kind."""
     from mlflow.exceptions import MlflowException
 
-    found = client.get_experiment_by_name(name)
-    if found is None:
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
         database = _database(uri)
         location = None if database is None else (database.parent / "mlartifacts" / name).as_uri()
         try:
             return client.create_experiment(name, artifact_location=location, tags=dict([KIND]))
         except MlflowException as error:  # another machine was first at a server
             _log.info("mlflow: %s", error)
-            found = client.get_experiment_by_name(name)
-            if found is None:
+            experiment = client.get_experiment_by_name(name)
+            if experiment is None:
                 raise
-    if KIND[0] not in found.tags:
-        client.set_experiment_tag(found.experiment_id, *KIND)
-    return found.experiment_id
+    if KIND[0] not in experiment.tags:
+        client.set_experiment_tag(experiment.experiment_id, *KIND)
+    return experiment.experiment_id

@@ -11,13 +11,13 @@ from neural_sim.stages.store import Entry
 
 @dataclass(frozen=True)
 class Omission:
-    """Work that a run does not do, and why. ``share`` is the part of that kind of work, ``seconds`` what it would
+    """Work that a run leaves out, and why. ``fraction`` is relative to all work of that kind, ``seconds`` what it would
     take, where they are known."""
 
     stage: str
     what: str
     why: str
-    share: float | None = None
+    fraction: float | None = None
     seconds: float | None = None
 
 
@@ -28,6 +28,6 @@ class Account:
     seconds: dict[str, float] = field(default_factory=dict)
     left_out: list[Omission] = field(default_factory=list)
 
-    def found(self, stage: Stage[Any], entry: Entry) -> None:
+    def reused(self, stage: Stage[Any], entry: Entry) -> None:
         """Count a result that the store had."""
         self.left_out.append(Omission(stage.name, stage.title, "found in the store", 1.0, entry.seconds))

@@ -1,4 +1,4 @@
-"""What the stages of one run share: its parts, its stages' results, its folder, its account."""
+"""The context of a run's stages: its parts, the stages' results, its folder, its account."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ T = TypeVar("T")
 
 
 class StageFailure(RuntimeError):
-    """A stage has written all that it found, and what it found is a failure: the program's exit status is 1."""
+    """A stage has written its results, which include a failure: the program's exit status is 1."""
 
 
 class Step(Protocol):
-    """What an entry of ``stages`` does: makes or finds results, writes to the run's folder."""
+    """An entry of ``stages``: computes or reads results, writes to the run's folder."""
 
     def run(self, context: Context) -> None: ...
 
@@ -68,7 +68,7 @@ class Context:
 
     @cached_property
     def results(self) -> Results:
-        return Results(Store(self.experiment.run.store), self.stages, self.account.found)
+        return Results(Store(self.experiment.run.store), self.stages, self.account.reused)
 
     @property
     def uri(self) -> str:

@@ -25,7 +25,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class TrainedDetector:
-    """Parameters, and what rendering and training took; fields, which all methods share, are not counted."""
+    """Parameters, and the cost of rendering and training, without that of the fields, which all methods use."""
 
     params: Parameters
     cost: Cost
@@ -33,10 +33,10 @@ class TrainedDetector:
 
 @dataclass(frozen=True)
 class DetectorStage(Stage[TrainedDetector]):
-    """The budget of ``training`` spent on images drawn from psi, the same whatever method chose psi.
+    """A detector trained from scratch on images drawn from psi, with the same budget for every method.
 
     ``probabilities`` is the digest of p, see :meth:`SceneDistribution.digest_of`; ``name`` is that of the stage that
-    asks for the detector, ``called`` says in words whose it is.
+    needs the detector, ``called`` describes psi in messages.
     """
 
     kind: ClassVar[str] = "detector"
@@ -62,7 +62,7 @@ class DetectorStage(Stage[TrainedDetector]):
         return self.detector(num_classes=len(self.scene.names), image_size=(camera.height, camera.width))
 
     def images(self, scene: Scene, generator: torch.Generator | None = None) -> list[RenderedObject]:
-        """The images that it trains on, equal in every call."""
+        """The training images, equal in every call."""
         generator = self.generator() if generator is None else generator
         return scene.training_set(self.psi, self.training.images_per_object, generator)
 

@@ -1,4 +1,4 @@
-"""Stage ``interpolation``: the way between two lights, as conf/experiment/illumination_interpolation.yaml says."""
+"""Stage ``interpolation``: images between two lights, as conf/experiment/illumination_interpolation.yaml says."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ class InterpolationStep(Interpolation):
             raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
         scene = context.results(context.graph.scene)
         fields = dict(zip(scene.names, scene.fields, strict=True))
-        ways = self.ways(fields, scene.lit_renderer, views.camera(self.image_size), views.rig.anchors)
+        interpolated = self.interpolated_views(
+            fields, scene.lit_renderer, views.camera(self.image_size), views.rig.anchors
+        )
         title = "From light {} to light {}".format(*self.ends)
-        figures.save(interpolation_figure(ways, title), folder / "figures" / "interpolation.png")
-        changes = {name: way.opacity_change for name, way in ways.items()}
+        figures.save(interpolation_figure(interpolated, title), folder / "figures" / "interpolation.png")
+        changes = {name: images.opacity_change for name, images in interpolated.items()}
         (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))
         print(f"largest change of opacity: {max(changes.values()):.1e}\nresults: {folder}")

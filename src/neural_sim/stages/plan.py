@@ -1,4 +1,4 @@
-"""What a run will not do because its scene does not need it, said before it begins, with the reason and the share."""
+"""Work that a run leaves out because its scene does not need it, logged before it begins, with reason and fraction."""
 
 from __future__ import annotations
 
@@ -70,18 +70,18 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
             "psi", "the boxes' derivative", "synthesis.label_gradient=ignored, as in the paper", 1.0
         )
     if outer.learned is not None and len(outer.learned) < objects:
-        share = 1.0 - len(outer.learned) / objects
+        fraction = 1.0 - len(outer.learned) / objects
         yield Omission(
-            "psi", "probes and second derivatives", "outer.learned fixes the other objects' psi", share
+            "psi", "probes and second derivatives", "outer.learned fixes the other objects' psi", fraction
         )
     images = objects * outer.images_per_object
     if outer.adjoint == "implicit" and 0 < outer.curvature_images < images:
-        share = 1.0 - outer.curvature_images / images
-        yield Omission("psi", "images in Hessian products", "outer.curvature_images stand for all", share)
+        fraction = 1.0 - outer.curvature_images / images
+        yield Omission("psi", "images in Hessian products", "outer.curvature_images stand for all", fraction)
 
 
 def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
-    """Renders that a pool of every bin spares, of all that the loop's images would take."""
+    """The fraction of the loop's renders that a pool of every bin saves."""
     factors, outer = x.imaging.distribution.binned, x.loop.outer
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
     probes = 0.0
@@ -90,5 +90,7 @@ def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
         anew = 1.0 + (derived - 1) * outer.refresh
         probes = anew * x.loop.gradient.probes_per_bin * sum(factor.bins for factor in factors)
     wanted = rounds * outer.images_per_object + probes
-    share = max(0.0, 1.0 - rendered / wanted)
-    return Omission("psi", "renders of the loop", "fields do not change: every bin is rendered once", share)
+    fraction = max(0.0, 1.0 - rendered / wanted)
+    return Omission(
+        "psi", "renders of the loop", "fields do not change: every bin is rendered once", fraction
+    )

@@ -33,7 +33,7 @@ Method = Fixed | HypergradientLoop | Response | RewardMethod
 
 @dataclass(frozen=True)
 class HypergradientParts:
-    """What a method needs that follows the hypergradient."""
+    """Estimator and solver of a method that follows the hypergradient."""
 
     estimator: Estimator
     solver: AdjointSolver
@@ -43,8 +43,8 @@ class HypergradientParts:
 class PsiStage(Stage[LearnedPsi]):
     """The psi loop of ``method`` from the warm start's distribution.
 
-    ``parts`` are those of a method that follows the hypergradient, None for others. ``on_record`` is told of every
-    iteration as it ends.
+    ``parts`` are those of a method that follows the hypergradient, None for others. ``on_record`` is called with every
+    iteration's record as it ends.
     """
 
     name: ClassVar[str] = "psi"

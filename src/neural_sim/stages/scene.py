@@ -1,4 +1,4 @@
-"""The fields of all objects with what renders and composes their images; assembled in memory."""
+"""The fields of all objects, with the renderer and synthesizer of their images; assembled in memory."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from neural_sim.types import PinholeCamera
 @dataclass(frozen=True)
 class SceneStage(Stage[Scene]):
     """Of ``distribution`` the key holds what draws of given probabilities depend on (``drawn``): methods that relax
-    draws in different ways share all that is made from hard ones. ``radii`` are the objects' in metres, None where
-    distances are in radii."""
+    draws differently use the same results of hard draws. ``radii`` are the objects' in metres, None where distances are
+    in radii."""
 
     name: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"

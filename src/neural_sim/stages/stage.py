@@ -1,4 +1,4 @@
-"""A stage: a result, what it is made from, its key, how it is made and how it is stored. And the walk over stages."""
+"""A stage: its inputs, the key of its result, how that is computed and stored. And the evaluation of stages."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Stage(ABC, Generic[T]):
     """A frozen dataclass. Its fields that are stages, alone or in a tuple, are its inputs; the rest are settings.
 
     The key of the result covers the settings, the keys of the inputs, and the version of all code that the stage's
-    module and its settings' modules import. Fields whose metadata is ``UNKEYED`` are left out: they say how fast a
-    result is made, or are told by other fields.
+    module and its settings' modules import. Fields whose metadata is ``UNKEYED`` are left out: they affect how fast a
+    result is computed, or follow from other fields.
     """
 
     name: str
@@ -90,18 +90,18 @@ class Stage(ABC, Generic[T]):
 
 
 class Results:
-    """The walk over stages: a result is read once, from memory or the store, or made from its inputs' results.
+    """Evaluates stages: a result is read once, from memory or the store, or computed from its inputs' results.
 
     Args:
         store: where results are kept.
         asked: names of the stages that may be made; results of others must be in the store.
-        found: told of every result that the store had.
+        reused: called with every result that the store had.
     """
 
     def __init__(
-        self, store: Store, asked: Collection[str], found: Callable[[Stage[Any], Entry], None] | None = None
+        self, store: Store, asked: Collection[str], reused: Callable[[Stage[Any], Entry], None] | None = None
     ) -> None:
-        self._store, self._asked, self._found = store, tuple(asked), found
+        self._store, self._asked, self._reused = store, tuple(asked), reused
         self._kept: dict[str, Any] = {}
 
     def __call__(self, stage: Stage[T]) -> T:
@@ -125,8 +125,8 @@ class Results:
             self._kept[name] = stage.make(self)
             return self._kept[name]
         entry = self._store.fetch(stage.kind, stage.key, stage.description, make)
-        if entry.found and self._found is not None:
-            self._found(stage, entry)
+        if entry.reused and self._reused is not None:
+            self._reused(stage, entry)
         value = stage.unpack(entry.value)
         if stage.keep:
             self._kept[name] = value

@@ -1,8 +1,8 @@
-"""A content-addressed store of stage results: what was made once from the same inputs is not made again.
+"""A content-addressed store of stage results: equal inputs are computed once.
 
-Entries are written to a temporary name and moved into place, so that a killed run leaves none half written. Making is
-locked between processes: runs side by side wait for a result that one of them is making, and a lock goes with the
-process that holds it.
+Entries are written to a temporary name and moved into place, so that a killed run leaves none half written. Computation
+is locked between processes: concurrent runs wait for a result that one of them is computing. A lock ends with its
+process.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Entry:
-    """A stored result. ``seconds`` is what it took to make, also when it was found rather than made."""
+    """A stored result. ``seconds`` is the time of its computation, also where it is ``reused`` from the store."""
 
     value: Any
     seconds: float
-    found: bool
+    reused: bool
 
 
 @dataclass(frozen=True)
@@ -48,21 +48,21 @@ class Store:
         a warning.
         """
         path = self.root / kind / f"{key}.pt"
-        found = _read(path)
-        if found is not None:
-            return found
+        entry = _read(path)
+        if entry is not None:
+            return entry
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path):
-            found = _read(path)  # another process may have made it meanwhile
-            if found is not None:
-                return found
+            entry = _read(path)  # another process may have written it meanwhile
+            if entry is not None:
+                return entry
             begin = time.perf_counter()
             value = make()
             seconds = time.perf_counter() - begin
             text = json.dumps(description, indent=1, sort_keys=True)
             _write(path.with_suffix(".json"), lambda name: Path(name).write_text(text))
             _write(path, lambda name: torch.save({"value": value, "seconds": seconds}, name))
-        return Entry(value, seconds, found=False)
+        return Entry(value, seconds, reused=False)
 
 
 @contextmanager
@@ -85,7 +85,7 @@ def _read(path: Path) -> Entry | None:
         return None
     try:
         stored = torch.load(path, weights_only=True)
-        return Entry(stored["value"], stored["seconds"], found=True)
+        return Entry(stored["value"], stored["seconds"], reused=True)
     except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError) as error:
         _log.warning("store: %s cannot be read (%s); it is made again", path, error)
         return None

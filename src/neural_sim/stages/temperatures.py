@@ -36,7 +36,7 @@ class TemperaturesStep(Temperatures):
 
 
 def frozen_loop(context: Context, seed: int) -> FrozenLoop:
-    """The psi loop at its start, at rest: images of the initial psi, the warm-started detector, the solved v."""
+    """The psi loop frozen at its start: images of the initial psi, the warm-started detector, the solved v."""
     graph, results, generator = context.graph, context.results, torch.Generator().manual_seed(seed)
     psi, scene = graph.psi("initial"), results(graph.scene)
     images = context.experiment.loop.outer.images_per_object

@@ -1,4 +1,4 @@
-"""The version of the code that a result depends on: all modules that its maker imports, computed from their source."""
+"""The version of the code that a result depends on: a digest of the source of all modules that it imports."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def code_version(modules: Iterable[str], root: Path = ROOT) -> str:
 
 def closure(modules: Iterable[str], root: Path = ROOT) -> set[str]:
     """``modules`` and all modules of the package under ``root`` that they import, directly or not."""
-    found: set[str] = set()
+    names: set[str] = set()
     waiting = [name for name in modules if _source(name, root) is not None]
     while waiting:
         name = waiting.pop()
-        if name in found:
+        if name in names:
             continue
-        found.add(name)
+        names.add(name)
         path = _source(name, root)
         if path is not None and path.is_relative_to(root):
             waiting += _read(path, root).imports
-    return found
+    return names
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def _read(path: Path, root: Path) -> _File:
 @cache
 def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
     tree = ast.parse(path.read_text())
-    found = set()
+    imports = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -70,9 +70,9 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         else:
             continue
-        found |= {name for name in names if name.split(".")[0] == root.name and _source(name, root)}
+        imports |= {name for name in names if name.split(".")[0] == root.name and _source(name, root)}
     meaning = hashlib.sha256(ast.dump(_without_docstrings(tree)).encode()).digest()
-    return _File(meaning, tuple(sorted(found)))
+    return _File(meaning, tuple(sorted(imports)))
 
 
 def _source(name: str, root: Path) -> Path | None:

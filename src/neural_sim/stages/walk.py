@@ -71,8 +71,8 @@ def walk(context: Context, others: Mapping[str, Step]) -> float | None:
     if asked:
         context.account.left_out += plan(context.graph)
     for omission in context.account.left_out:
-        share = "" if omission.share in (None, 1.0) else f" ({omission.share:.0%})"
-        _log.info("left out: %s%s: %s", omission.what, share, omission.why)
+        fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
+        _log.info("left out: %s%s: %s", omission.what, fraction, omission.why)
     with context.tracked():
         for name in asked:
             with context.timed(name):

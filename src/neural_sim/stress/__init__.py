@@ -1,1 +1,1 @@
-"""Stiff and extreme cases, each held to a tolerance from theory or from a float64 reference."""
+"""Stiff and extreme cases, each with a tolerance from theory or from a float64 reference."""

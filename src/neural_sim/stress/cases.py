@@ -43,7 +43,7 @@ class Scope:
 
 @dataclass(frozen=True)
 class Check:
-    """One number held against its bound: passes where ``value <= tolerance`` and the status is a wanted one.
+    """One number compared with its bound: passes where ``value <= tolerance`` and the status is a wanted one.
 
     ``value`` is an error (0 is perfect), ``tolerance`` what theory allows it, ``wanted`` the statuses that
     are right here (empty: the quantity has none). NaN never passes. The suite adds the case and the ``seconds`` that

@@ -38,11 +38,15 @@ def constant_scores(scope: Scope) -> Checks:
         scores = torch.full((len(KNOWN),), value, dtype=DOUBLE)
         for label, log_p in P_OF_PSI.items():
             for depth in (0.0, 1.7, 1000.0):
-                found = stratified(scores, KNOWN, _peaked(depth), log_p)
-                yield Check(f"stratified: score {value:g}, psi {depth:g}, {label}", worst(found.value), 0.0)
-        found = reinforce(scores, lambda psi: binned.log_probabilities(psi)[KNOWN], _peaked(1.7))
+                estimate = stratified(scores, KNOWN, _peaked(depth), log_p)
+                yield Check(
+                    f"stratified: score {value:g}, psi {depth:g}, {label}", worst(estimate.value), 0.0
+                )
+        estimate = reinforce(scores, lambda psi: binned.log_probabilities(psi)[KNOWN], _peaked(1.7))
         # Its baseline is a mean of all scores, known to n eps, times a slope of at most 1.
-        yield Check(f"reinforce: score {value:g}", worst(found.value), len(KNOWN) * eps(DOUBLE) * abs(value))
+        yield Check(
+            f"reinforce: score {value:g}", worst(estimate.value), len(KNOWN) * eps(DOUBLE) * abs(value)
+        )
 
 
 @case
@@ -53,14 +57,16 @@ def score_scales(scope: Scope) -> Checks:
     scores, psi = scope.normal(len(KNOWN)), scope.normal(BINS)
     plain = stratified(scores, KNOWN, psi, _floored)
     for power in (-400, -100, 100, 400):
-        found = stratified(scores * 2.0**power, KNOWN, psi, _floored)
-        yield Check(f"derivative in units of 2^{power}", worst(found.value * 2.0**-power - plain.value), 0.0)
-        change = worst(found.standard_error * 2.0**-power - plain.standard_error)
+        estimate = stratified(scores * 2.0**power, KNOWN, psi, _floored)
+        yield Check(
+            f"derivative in units of 2^{power}", worst(estimate.value * 2.0**-power - plain.value), 0.0
+        )
+        change = worst(estimate.standard_error * 2.0**-power - plain.standard_error)
         yield Check(f"standard error in units of 2^{power}", change, 0.0)
     for offset in (1e4, 1e12):
-        found = stratified(scores + offset, KNOWN, psi, _floored)
+        estimate = stratified(scores + offset, KNOWN, psi, _floored)
         bound = 2 * len(KNOWN) * eps(DOUBLE) * offset * worst(_floored(psi).exp())
-        yield Check(f"offset of {offset:g}", worst(found.value - plain.value), bound)
+        yield Check(f"offset of {offset:g}", worst(estimate.value - plain.value), bound)
 
 
 @case
@@ -105,6 +111,6 @@ def one_hot(scope: Scope) -> Checks:
             wrong = not_finite(stratified(scores[others], KNOWN[others], psi, log_p).value)
             yield Check(f"not finite, its own bin unseen: psi {depth:g}, {label}", wrong, 0.0)
         p = binned.log_probabilities(psi).exp()
-        found = stratified(scores, KNOWN, psi, binned.log_probabilities)
-        error = worst(found.value - p * (means - p @ means))
+        estimate = stratified(scores, KNOWN, psi, binned.log_probabilities)
+        error = worst(estimate.value - p * (means - p @ means))
         yield Check(f"closed form: psi {depth:g}", error, 4 * BINS * eps(DOUBLE) * worst(means))

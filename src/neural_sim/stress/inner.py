@@ -107,13 +107,13 @@ def far_from_stationary(scope: Scope) -> Checks:
         slope = float((problem.b.T @ (problem.b @ theta - problem.t)).norm())
         bound = lifted * slope * (rtol + 2 * SIZE**2 * eps(DOUBLE)) * float(torch.linalg.cond(hessian))
         for name, solver in TRIED.items():
-            found = problem.solved(theta, solver, rtol)
+            result = problem.solved(theta, solver, rtol)
             label = f"{name}, |delta| = {distance:g}"
-            error = abs(found.stationarity - float((hessian @ (theta - best)).norm()))
-            yield ended(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, found.solution)
-            value = float((found.psi_gradients["x"] - exact).norm())
+            error = abs(result.stationarity - float((hessian @ (theta - best)).norm()))
+            yield ended(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, result.solution)
+            value = float((result.psi_gradients["x"] - exact).norm())
             off = f"{relative(exact, truth):.1e} off the truth"
-            yield ended(f"gradient ({off}): {label}", value, bound, found.solution)
+            yield ended(f"gradient ({off}): {label}", value, bound, result.solution)
 
 
 @case
@@ -123,9 +123,9 @@ def units(scope: Scope) -> Checks:
     plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
     for power in (-200, -60, 60, 200):
         scaled = replace(problem, unit=2.0**power)
-        found = scaled.solved(problem.minimiser, ConjugateGradient(), 1e-10)
-        change = worst(found.psi_gradients["x"] - plain.psi_gradients["x"])
-        yield ended(f"change by a unit of 2^{power}", change, 0.0, found.solution)
+        result = scaled.solved(problem.minimiser, ConjugateGradient(), 1e-10)
+        change = worst(result.psi_gradients["x"] - plain.psi_gradients["x"])
+        yield ended(f"change by a unit of 2^{power}", change, 0.0, result.solution)
 
 
 @case
@@ -142,17 +142,19 @@ def degenerate(scope: Scope) -> Checks:
     }
     for name, solver in TRIED.items():
         for label, term in flat.items():
-            found = AdjointSolver(solver, FixedDamping(0.0, 0), rtol=1e-3).solve(
+            solved = AdjointSolver(solver, FixedDamping(0.0, 0), rtol=1e-3).solve(
                 [term], params, b, None, torch.Generator()
             )
-            yield ended(f"|v|: {name}, {label}", worst(found.vector), 0.0, found.solution, *UNTRUSTED)
+            yield ended(f"|v|: {name}, {label}", worst(solved.vector), 0.0, solved.solution, *UNTRUSTED)
             damped = AdjointSolver(solver, FixedDamping(1e-3, 0), rtol=1e-3)
-            found = damped.solve([term], params, b, None, torch.Generator())
-            error = relative(found.vector * 1e-3, b)
-            yield ended(f"v with damping: {name}, {label}", error, SIZE**2 * eps(DOUBLE), found.solution)
+            solved = damped.solve([term], params, b, None, torch.Generator())
+            error = relative(solved.vector * 1e-3, b)
+            yield ended(f"v with damping: {name}, {label}", error, SIZE**2 * eps(DOUBLE), solved.solution)
         for label, term in bad.items():
-            found = AdjointSolver(solver, LanczosDamping()).solve([term], params, b, None, torch.Generator())
-            yield ended(f"|v|: {name}, {label}", worst(found.vector), 0.0, found.solution, Status.NON_FINITE)
+            solved = AdjointSolver(solver, LanczosDamping()).solve([term], params, b, None, torch.Generator())
+            yield ended(
+                f"|v|: {name}, {label}", worst(solved.vector), 0.0, solved.solution, Status.NON_FINITE
+            )
 
 
 @case
@@ -177,14 +179,14 @@ def indefinite_hessians(scope: Scope) -> Checks:
         least, rounding = 1.25 * max(0.0, -float(values.min())), 24 * eps(DOUBLE) * worst(values)
         for name in ("cg", "minres"):
             adjoint = AdjointSolver(TRIED[name], damping, rtol=1e-10, max_steps=400)
-            found = adjoint.solve(terms, params, problem.x, None, scope.generator())
-            chosen = found.damping.value
+            solved = adjoint.solve(terms, params, problem.x, None, scope.generator())
+            chosen = solved.damping.value
             short = max(0.0, least - chosen)
             yield Check(f"lambda short of its margin: {name}, {label}", short, 4 * rounding)
             truth = torch.linalg.solve(problem.matrix + chosen * torch.eye(24, dtype=DOUBLE), problem.x)
             condition = float((values + chosen).abs().max() / (values + chosen).abs().min())
             bound = condition * (1e-10 + 2 * 24**2 * eps(DOUBLE))
-            yield ended(f"v: {name}, {label}", relative(found.vector, truth), bound, found.solution)
+            yield ended(f"v: {name}, {label}", relative(solved.vector, truth), bound, solved.solution)
 
 
 @case
@@ -205,7 +207,7 @@ def untrained_detector(scope: Scope) -> Checks:
         params = {name: factor * value for name, value in head.items()}
         inner = InnerProblem(params, cached.losses, torch.full((3,), 1.0 / 3.0, dtype=DOUBLE))
         along = torch.nn.functional.normalize(gradient(inner.terms(), params), dim=0)
-        found = hypergradient(inner, cached.mean_terms(), {}, adjoint, scope.generator())
+        result = hypergradient(inner, cached.mean_terms(), {}, adjoint, scope.generator())
 
         def loss(step: float, inner: InnerProblem = inner, along: Tensor = along) -> float:
             moved = unflatten(flatten(inner.params) + step * along, inner.params)
@@ -216,7 +218,7 @@ def untrained_detector(scope: Scope) -> Checks:
         coarse, fine = ((loss(h) - loss(-h)) / (2 * h) for h in (step, 0.5 * step))
         truth = fine + (fine - coarse) / 3.0
         bound = abs(truth - fine) + 64 * eps(DOUBLE) * abs(loss(0.0)) / step
-        quantity = f"stationarity, {found.stationarity:.1e}: {factor:g} times the start"
-        yield Check(quantity, abs(found.stationarity - truth), bound)
-        wrong = not_finite(found.solution.value)
+        quantity = f"stationarity, {result.stationarity:.1e}: {factor:g} times the start"
+        yield Check(quantity, abs(result.stationarity - truth), bound)
+        wrong = not_finite(result.solution.value)
         yield Check(f"numbers not finite: {factor:g} times the start", wrong, 0.0)

@@ -96,10 +96,10 @@ def krylov_steps(condition: float, rtol: float) -> int:
     return math.ceil(math.sqrt(condition) * math.log(2.0 * math.sqrt(condition) / rtol)) + 2 * SIZE
 
 
-def ended(quantity: str, value: float, tolerance: float, found: Solution, *wanted: Status) -> Check:
+def ended(quantity: str, value: float, tolerance: float, solution: Solution, *wanted: Status) -> Check:
     """A check of a solve, which must have ended as ``wanted`` says (converged)."""
     names = tuple(status.name for status in wanted or (Status.CONVERGED,))
-    return Check(quantity, value, tolerance, found.status.name, names)
+    return Check(quantity, value, tolerance, solution.status.name, names)
 
 
 @case
@@ -124,18 +124,18 @@ def condition_numbers(scope: Scope) -> Checks:
             bound = condition * 2.0 * backward_error(dtype)
             steps = krylov_steps(condition, rtol) if dtype is DOUBLE else 2000
             for name in SOLVERS if dtype is DOUBLE else ("cg", "minres", "exact"):
-                found = problem.solve(SOLVERS[name], rtol, steps)
+                solution = problem.solve(SOLVERS[name], rtol, steps)
                 label = f"{name}, condition {condition:.0e}, {short(dtype)}"
                 if bound >= 1.0:
-                    value, b = found.value.double(), problem.b.double()
+                    value, b = solution.value.double(), problem.b.double()
                     residual = float((b - problem.matrix.double() @ value).norm() / b.norm())
                     slack = SIZE * eps(dtype) * float(value.norm() / b.norm())
-                    claimed = rtol if found.status is Status.CONVERGED else 1.0
-                    yield Check(f"claimed residual: {label}", residual, claimed + slack, found.status.name)
-                elif name == "minres" and condition > eps(DOUBLE) ** -0.5 and found.status in UNTRUSTED:
-                    yield ended(f"residual: {label}", found.residual, 1.0, found, Status.STAGNATED)
+                    claimed = rtol if solution.status is Status.CONVERGED else 1.0
+                    yield Check(f"claimed residual: {label}", residual, claimed + slack, solution.status.name)
+                elif name == "minres" and condition > eps(DOUBLE) ** -0.5 and solution.status in UNTRUSTED:
+                    yield ended(f"residual: {label}", solution.residual, 1.0, solution, Status.STAGNATED)
                 else:
-                    yield ended(f"error: {label}", relative(found.value, problem.x), bound, found)
+                    yield ended(f"error: {label}", relative(solution.value, problem.x), bound, solution)
 
 
 @case
@@ -149,12 +149,12 @@ def neumann_series(scope: Scope) -> Checks:
     generator = scope.generator()
     for condition, steps in ((1.0, 20), (1e1, 300), (1e2, 3000), (1e12, 500)):
         problem = system(logarithmic(condition), generator)
-        found = problem.solve(ALL["neumann"], 1e-9, steps)
-        left = (1.0 - problem.values / problem.values.max()) ** found.steps * (problem.basis.T @ problem.b)
-        error = abs(found.residual - float(left.norm() / problem.b.norm()))
-        bound = (found.steps + SIZE) * SIZE * eps(DOUBLE) * problem.lift
+        solution = problem.solve(ALL["neumann"], 1e-9, steps)
+        left = (1.0 - problem.values / problem.values.max()) ** solution.steps * (problem.basis.T @ problem.b)
+        error = abs(solution.residual - float(left.norm() / problem.b.norm()))
+        bound = (solution.steps + SIZE) * SIZE * eps(DOUBLE) * problem.lift
         wanted = Status.CONVERGED if condition < 1e3 else Status.MAX_STEPS
-        yield ended(f"residual against (1 - eta lambda)^k, {condition:.0e}", error, bound, found, wanted)
+        yield ended(f"residual against (1 - eta lambda)^k, {condition:.0e}", error, bound, solution, wanted)
 
 
 @case
@@ -175,14 +175,14 @@ def indefinite(scope: Scope) -> Checks:
             rtol = backward_error() * problem.lift
             for name in PLAIN:
                 # On a spectrum of both signs k stands where sqrt(k) does on a definite one.
-                found = problem.solve(ALL[name], rtol, krylov_steps(condition**2, rtol))
+                solution = problem.solve(ALL[name], rtol, krylov_steps(condition**2, rtol))
                 quantity = f"{name}, {label}, condition {condition:.0e}"
                 if name in ("minres", "exact"):
                     bound = condition * 2.0 * backward_error()
-                    yield ended(f"error: {quantity}", relative(found.value, problem.x), bound, found)
+                    yield ended(f"error: {quantity}", relative(solution.value, problem.x), bound, solution)
                 else:
                     wanted = Status.NEGATIVE_CURVATURE
-                    yield ended(f"residual: {quantity}", found.residual, 1.0, found, wanted)
+                    yield ended(f"residual: {quantity}", solution.residual, 1.0, solution, wanted)
 
 
 @case
@@ -205,23 +205,23 @@ def singular(scope: Scope) -> Checks:
     rtol = backward_error() * float(truth.norm() / inside.norm())
     least = float((problem.basis[:, rank:].T @ b).norm() / b.norm())
 
-    def bound(found: Solution) -> float:
-        return condition * 2.0 * max(1.0, found.steps / SIZE) * backward_error()
+    def bound(solution: Solution) -> float:
+        return condition * 2.0 * max(1.0, solution.steps / SIZE) * backward_error()
 
     for name in PLAIN:
         if name in ("cg", "minres", "exact"):
             steps = krylov_steps(condition, rtol)
-            found = ALL[name].solve(problem.matrix.mv, inside, rtol=rtol, max_steps=steps)
-            error = relative(found.value, truth)
-            yield ended(f"error: {name}", error, bound(found), found, Status.CONVERGED, Status.SINGULAR)
-        found = ALL[name].solve(problem.matrix.mv, b, rtol=1e-8, max_steps=400)
+            solution = ALL[name].solve(problem.matrix.mv, inside, rtol=rtol, max_steps=steps)
+            error = relative(solution.value, truth)
+            yield ended(f"error: {name}", error, bound(solution), solution, Status.CONVERGED, Status.SINGULAR)
+        solution = ALL[name].solve(problem.matrix.mv, b, rtol=1e-8, max_steps=400)
         if name in ("minres", "exact"):
-            error = abs(found.residual - least)
-            yield ended(f"least residual: {name}", error, bound(found), found, Status.LEAST_SQUARES)
+            error = abs(solution.residual - least)
+            yield ended(f"least residual: {name}", error, bound(solution), solution, Status.LEAST_SQUARES)
         else:
-            yield ended(f"residual: {name}", found.residual, 1.0, found, *UNTRUSTED)
-        found = ALL[name].solve(lambda v: 0.0 * v, b, rtol=1e-8)
-        yield ended(f"|x| of the zero operator: {name}", worst(found.value), 0.0, found, *UNTRUSTED)
+            yield ended(f"residual: {name}", solution.residual, 1.0, solution, *UNTRUSTED)
+        solution = ALL[name].solve(lambda v: 0.0 * v, b, rtol=1e-8)
+        yield ended(f"|x| of the zero operator: {name}", worst(solution.value), 0.0, solution, *UNTRUSTED)
 
 
 @case
@@ -239,15 +239,17 @@ def units(scope: Scope) -> Checks:
             label = f"{name}, {short(dtype)}"
             yield ended(f"|x| for b = 0: {label}", worst(nothing.value), 0.0, nothing)
             for power in (100, -100):
-                found = solve(matrix.mv, b * 2.0**power)
-                change = worst(found.value * 2.0**-power - plain.value)
-                yield ended(f"change, b in units of 2^{power}: {label}", change, 0.0, found, plain.status)
+                solution = solve(matrix.mv, b * 2.0**power)
+                change = worst(solution.value * 2.0**-power - plain.value)
+                yield ended(f"change, b in units of 2^{power}: {label}", change, 0.0, solution, plain.status)
             for power in powers if name != "identity" else ():
-                found = solve((matrix * 2.0**power).mv, b)
-                change = worst(found.value.double() * 2.0**power - plain.value.double())
-                size = found.steps * SIZE * eps(dtype) * float(plain.value.norm())
+                solution = solve((matrix * 2.0**power).mv, b)
+                change = worst(solution.value.double() * 2.0**power - plain.value.double())
+                size = solution.steps * SIZE * eps(dtype) * float(plain.value.norm())
                 bound = size if name == "neumann" else 0.0
-                yield ended(f"change, A in units of 2^{power}: {label}", change, bound, found, plain.status)
+                yield ended(
+                    f"change, A in units of 2^{power}: {label}", change, bound, solution, plain.status
+                )
 
 
 @case
@@ -256,13 +258,13 @@ def one_parameter(scope: Scope) -> Checks:
     b = torch.tensor([6.0], dtype=DOUBLE)
     for entry in (3.0, 1e-300, 1e-20, 1e20, 1e300, -3.0):
         for name in PLAIN:
-            found = ALL[name].solve(lambda v, entry=entry: entry * v, b, rtol=1e-9)
+            solution = ALL[name].solve(lambda v, entry=entry: entry * v, b, rtol=1e-9)
             label = f"{name}, a = {entry:g}"
             if entry < 0.0 and name not in ("minres", "exact"):
-                yield ended(f"residual: {label}", found.residual, 1.0, found, Status.NEGATIVE_CURVATURE)
+                yield ended(f"residual: {label}", solution.residual, 1.0, solution, Status.NEGATIVE_CURVATURE)
             else:
-                error = abs(float(found.value) * entry / 6.0 - 1.0)
-                yield ended(f"error: {label}", error, 8 * eps(DOUBLE), found)
+                error = abs(float(solution.value) * entry / 6.0 - 1.0)
+                yield ended(f"error: {label}", error, 8 * eps(DOUBLE), solution)
 
 
 @case
@@ -288,9 +290,9 @@ def non_finite_operators(scope: Scope) -> Checks:
         if name != "identity":  # which takes one product in all
             trials["NaN from the third product"] = (late(), problem.b)
         for label, (operator, b) in trials.items():
-            found = solver.solve(Shifted(operator, 0.5) if name == "nystrom" else operator, b, rtol=1e-12)
-            wrong = not_finite(found.value, torch.tensor([found.residual, *found.curvature]))
-            yield ended(f"numbers not finite: {name}, {label}", wrong, 0.0, found, Status.NON_FINITE)
+            solution = solver.solve(Shifted(operator, 0.5) if name == "nystrom" else operator, b, rtol=1e-12)
+            wrong = not_finite(solution.value, torch.tensor([solution.residual, *solution.curvature]))
+            yield ended(f"numbers not finite: {name}, {label}", wrong, 0.0, solution, Status.NON_FINITE)
     for name in ("cg", "minres", "neumann"):
         cold = ALL[name].solve(plain, problem.b, rtol=0.1)
         warm = ALL[name].solve(plain, problem.b, torch.full_like(problem.b, math.nan), rtol=0.1)

@@ -121,8 +121,8 @@ def slab_opacity(scope: Scope) -> Checks:
 
 @case
 def ball_opacity(scope: Scope) -> Checks:
-    """The network's samples share out a ray's chord of the unit sphere: their widths add up to it, whatever
-    the density.
+    """The network's samples partition a ray's chord of the unit sphere: their widths add up to it, whatever the
+    density.
 
     Rays from outside, from inside and almost tangent. Rounding: the near and far ends to a few eps of the
     distance, which half a chord of 1e-3 takes up 1e3-fold through the square root, and 192 widths; and the
@@ -241,5 +241,5 @@ def grazing_rays(scope: Scope) -> Checks:
         leaves = origins.clone().requires_grad_(), away.clone().requires_grad_()
         rgb, opacity = EXACT.render_rays(field, Rays(*leaves))
         total = rgb.sum() + opacity.sum()
-        found = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-        yield Check(f"rays that miss, and their derivatives: {label}", worst(total, *found), 0.0)
+        derivatives = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+        yield Check(f"rays that miss, and their derivatives: {label}", worst(total, *derivatives), 0.0)

@@ -31,7 +31,7 @@ CAP = 0.1
 
 
 def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
-    """How far a share of ``draws`` lies from p but with probability ``alarm`` (Bernstein's inequality)."""
+    """Deviation of a frequency in ``draws`` from p, exceeded with probability ``alarm`` (Bernstein's inequality)."""
     logarithm = math.log(2.0 / alarm)
     linear = logarithm / (3.0 * draws)
     return linear + (linear**2 + 2.0 * p * (1.0 - p) * logarithm / draws).sqrt()
@@ -61,7 +61,7 @@ def one_hot(scope: Scope) -> Checks:
         yield Check(f"dp/dpsi, {short(dtype)}", worst(slope), 8 * eps(dtype))
     wanted = torch.eye(8, dtype=DOUBLE)[2]
     back = pose.log_probabilities(pose.psi_of(wanted)).exp()
-    # psi_of() raises zeros to 1e-6, which the normalisation shares out
+    # psi_of() clamps zeros to 1e-6, which the normalisation distributes
     yield Check("logits of a one-hot p", worst(back - wanted), 7.1e-6)
 
 
@@ -78,8 +78,8 @@ def floor(scope: Scope) -> Checks:
     for dtype in (DOUBLE, SINGLE):
         for depth in (0.0, 5.0, 20.0, 800.0, 1e6):
             leaf = (-depth * torch.eye(count, dtype=dtype)[3]).requires_grad_()
-            share = torch.softmax(leaf.detach().double(), -1)
-            truth = (1.0 - count * smallest) * share + smallest
+            softmax = torch.softmax(leaf.detach().double(), -1)
+            truth = (1.0 - count * smallest) * softmax + smallest
             log_p = binned.log_probabilities(leaf, smallest)
             p = log_p.detach().double().exp()
             # An error of psi's rounding in the exponent counts only as far as the softmax part is there.
@@ -88,7 +88,7 @@ def floor(scope: Scope) -> Checks:
             yield Check(f"p: {label}", worst((p - truth) / truth), bound)
             yield Check(f"sum of p - 1: {label}", abs(float(p.sum()) - 1.0), count * bound)
             (slope,) = torch.autograd.grad(log_p[3], leaf)
-            exact = float((1.0 - count * smallest) * share[3] * (1.0 - share[3]) / truth[3])
+            exact = float((1.0 - count * smallest) * softmax[3] * (1.0 - softmax[3]) / truth[3])
             yield Check(f"d log p / dpsi: {label}", abs(float(slope[3]) - exact), 4.0 * bound)
 
 
@@ -136,7 +136,7 @@ def temperatures(scope: Scope) -> Checks:
 
 @case
 def gumbel_max(scope: Scope) -> Checks:
-    """Shares of drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at
+    """Frequencies of drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at
     every tau; the noise is finite where it is drawn for (float64, float32, float16, bfloat16).
     """
     draws = 200_000 if scope.full else 20_000
@@ -152,7 +152,7 @@ def gumbel_max(scope: Scope) -> Checks:
             drawn[f"tau = {temperature:g}"] = y.argmax(-1)
         for label, bins in drawn.items():
             over = (bins.bincount(minlength=count) / draws - p) / bernstein(p, draws, FALSE_ALARM / count)
-            yield Check(f"shares over their bounds: k = {count}, {label}", worst(over), 1.0)
+            yield Check(f"frequencies over their bounds: k = {count}, {label}", worst(over), 1.0)
     for dtype in (DOUBLE, SINGLE, torch.float16, torch.bfloat16):
         wrong = not_finite(binned.gumbel((1000, 64), scope.generator(), dtype))
         yield Check(f"noise not finite: {short(dtype)}", wrong, 0.0)

@@ -20,7 +20,7 @@ from neural_sim.types import SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """How many cells (combinations of the factors' bins), and of maps a cell for at least ``per_bin`` a bin."""
+    """Number of combinations of the factors' bins, and of maps of each that give every bin at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
 

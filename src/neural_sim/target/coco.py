@@ -56,7 +56,8 @@ class CocoTarget:
         images: the folder its ``file_name`` entries start from; None: the file's own.
         categories: category name -> object name, null to leave a category out. Names not listed stand for
             themselves.
-        val_fraction: share of the images that steers psi; the rest is scored once. With ``split_by`` as near to it as
+        val_fraction: fraction of the images for validation, which psi is learned from; the rest is scored once. With
+        ``split_by`` as near to it as
             whole groups come, see :func:`neural_sim.target.split.split`.
         split_by: what images belong together and so lie in one part, as frames of one video must:
             ``attribute:<name>`` of the file's image entries, or a regular expression on ``file_name``, see
@@ -108,7 +109,7 @@ class CocoTarget:
 
     @cached_property
     def _groups(self) -> Sequence[str | int]:
-        """Of each entry, what it must not be parted from."""
+        """The group of each entry, which the split keeps together."""
         if self.split_by is None:
             return range(len(self._entries))
         return groups_of(self._entries, self.split_by, self._file)
@@ -185,15 +186,15 @@ class CocoTarget:
         return photos
 
     def _warn_of_duplicates(self, thumbnails: Tensor, val: Tensor, test: Tensor) -> None:
-        """Detectors that have steered psi on one frame of a video know the next: AP on it says little."""
-        found = near_duplicates(thumbnails[val], thumbnails[test])
-        if found.test:
+        """Warn: where psi was learned from one frame of a video, AP on the next frame says little."""
+        duplicates = near_duplicates(thumbnails[val], thumbnails[test])
+        if duplicates.test:
             names = [str(self._entries[int(rows[i[0]])]["file_name"])
-                     for rows, i in ((test, found.test), (val, found.val))]  # fmt: skip
+                     for rows, i in ((test, duplicates.test), (val, duplicates.val))]  # fmt: skip
             _log.warning(
                 "%s: %d of %d test images look like one of val (%s like %s); if they are of one video, scene or "
                 "capture, keep them together by target.split_by",
-                self._file, len(found.test), found.compared, *names,
+                self._file, len(duplicates.test), duplicates.compared, *names,
             )  # fmt: skip
 
     def _labels(self, categories: list[dict[str, Any]], class_names: Sequence[str]) -> dict[Any, int | None]:

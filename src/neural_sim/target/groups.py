@@ -41,8 +41,8 @@ def _matches(entries: Sequence[Mapping[str, Any]], split_by: str, where: str) ->
         pattern = re.compile(split_by)
     except re.error as error:
         raise ValueError(f"{where}: not a regular expression ({error})") from error
-    found = [pattern.search(str(entry["file_name"])) for entry in entries]
-    return [None if match is None else match[min(1, pattern.groups)] for match in found]
+    matches = [pattern.search(str(entry["file_name"])) for entry in entries]
+    return [None if match is None else match[min(1, pattern.groups)] for match in matches]
 
 
 def _attributes(entries: Sequence[Mapping[str, Any]], split_by: str, where: str) -> list[Any]:

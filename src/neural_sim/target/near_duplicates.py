@@ -45,12 +45,12 @@ def thumbnail(photo: Float[Tensor, "3 height width"]) -> Float[Tensor, "24 24"]:
 def correlation(first: Float[Tensor, "n 24 24"], second: Float[Tensor, "m 24 24"]) -> Float[Tensor, "n m"]:
     """Normalised cross-correlation of thumbnails, the largest over the shifts; that with a plain photograph is 0."""
     inner, width = slice(SHIFT, -SHIFT), CELLS - 2 * SHIFT
-    still = _normalised(first[:, inner, inner])
+    centre = _normalised(first[:, inner, inner])
     best = torch.full((len(first), len(second)), -1.0)
     for down in range(2 * SHIFT + 1):
         for right in range(2 * SHIFT + 1):
             moved = _normalised(second[:, down : down + width, right : right + width])
-            best = torch.maximum(best, still @ moved.T)
+            best = torch.maximum(best, centre @ moved.T)
     return best
 
 
@@ -59,9 +59,9 @@ def near_duplicates(
 ) -> NearDuplicates:
     """Test images that look like one of validation; of more than ``limit``, evenly spaced ones are compared."""
     rows = torch.linspace(0, len(test) - 1, min(limit, len(test))).round().long()
-    best, found = correlation(test[rows], val).max(1)
+    best, nearest = correlation(test[rows], val).max(1)
     alike = best >= ALIKE
-    return NearDuplicates(rows[alike].tolist(), found[alike].tolist(), len(rows))
+    return NearDuplicates(rows[alike].tolist(), nearest[alike].tolist(), len(rows))
 
 
 def _normalised(cells: Float[Tensor, "n h w"]) -> Float[Tensor, "n hw"]:

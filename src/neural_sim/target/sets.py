@@ -17,7 +17,7 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 @dataclass(frozen=True)
 class RenderedTarget:
-    """Images per object in ``val``, which steers psi, and in ``test``, which is scored once.
+    """Images per object in ``val``, from which psi is learned, and in ``test``, which is scored once.
 
     ``test_per_biased_object`` is for objects named in some parameter's ``biased``, whose scores are compared.
     """
@@ -43,7 +43,7 @@ class RenderedTarget:
         """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
         biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
         radii = distribution.radii({name: item.radius for name, item in objects.items()})
-        made = {}
+        parts = {}
         for part, name in enumerate(("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
             draws = []
@@ -52,5 +52,5 @@ class RenderedTarget:
                 count = test_count if name == "test" else self.val_per_object
                 drawn = distribution.hard(psi, distribution.draw_noise(count, generator))
                 draws.append(drawn if radii is None else replace(drawn, radius=radii[label]))
-            made[name] = render_target(list(objects.values()), draws, camera, synthesizer, generator, rig)
-        return made
+            parts[name] = render_target(list(objects.values()), draws, camera, synthesizer, generator, rig)
+        return parts
