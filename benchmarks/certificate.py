@@ -214,7 +214,7 @@ TEXT = """
 An object whose derivative is zero passes with the probability `outer.trust.level`, 0.05, or less often. How often noise
 passes, by the law of the scores and by how much more the widest bin scatters than the narrowest (standard deviations,
 rare bins widest): {objects} objects a number, each number known to {noise:.3f}, {draws} random changes a p-value. In
-brackets: Welch's analysis of variance of the same scores. The rule of old held the best component's ratio to its
+brackets: Welch's analysis of variance of the same scores. The earlier rule compared the best component's ratio to its
 standard error against 1, for the best of all objects; {old:.3f} of such objects pass it by themselves (normal, 16
 images of each bin).
 

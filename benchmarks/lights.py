@@ -1,4 +1,4 @@
-"""Which way an illumination should move: by blends of light in every image, by shares of images, and in truth.
+"""Which way an illumination should move: by blends of light in every image, by proportions of images, and in truth.
 
 `python benchmarks/lights.py` writes docs/numerics.md. `+experiment=illumination_gap scale=quick`: on the way from the
 initial to the target weights, a detector is trained as the psi loop trains it; its validation loss is the truth.
@@ -31,7 +31,7 @@ WAY = (0.0, 0.2, 0.4, 0.7, 1.0)
 
 
 def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, Any]:
-    """Validation loss at a point of the way, and its slopes along the way as both derivatives foretell them."""
+    """Validation loss at a point of the way, and its slopes along the way as both derivatives predict them."""
     start, target = context.graph.psi("initial"), context.graph.psi("target")
     psi, way = torch.lerp(start, target, part), target - start
     x, graph, results, rows = context.experiment, context.graph, context.results, []
@@ -52,18 +52,18 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
             x.loop.solver,
             generator,
         )
-        blends = loop.pathwise(PathwiseEstimator(), x.outer.images_per_object, generator)
-        shares = loop.truth(per_light, generator)
-        rows.append([inner.validation_loss(), *foretold(blends, way), *foretold(shares, way)])
+        blends = loop.pathwise(PathwiseEstimator(), x.loop.outer.images_per_object, generator)
+        proportions = loop.truth(per_light, generator)
+        rows.append([inner.validation_loss(), *predicted(blends, way), *predicted(proportions, way)])
     table = torch.tensor(rows)
     spread = table.std(0) if seeds > 1 else torch.full_like(table[0], math.nan)
-    keys = ("loss", "blend", "blend_error", "share", "share_error")
+    keys = ("loss", "blend", "blend_error", "proportion", "proportion_error")
     return {"part": part, "loss_error": float(spread[0]) / math.sqrt(seeds)} | dict(
         zip(keys, table.mean(0).tolist(), strict=True)
     )
 
 
-def foretold(found: list[MixedDerivative], way: torch.Tensor) -> tuple[float, float]:
+def predicted(found: list[MixedDerivative], way: torch.Tensor) -> tuple[float, float]:
     """dL_val along the way: minus the objects' derivatives, each object's images being one part of the training set."""
     slopes = [-float(part.value.double() @ way[label]) for label, part in enumerate(found)]
     errors = [float((part.standard_error.double() * way[label]).norm()) for label, part in enumerate(found)]
@@ -74,10 +74,10 @@ INTRODUCTION = """    python benchmarks/lights.py --seeds {seeds} --per-light {p
 
 `illumination_gap` at `scale=quick`: the biased objects' weights at a part of the way from the initial lights to the
 target's; validation loss of the detector trained there, mean of {seeds}; and the loss's slope along the whole way as it
-is foretold by the derivative by the blend of light in every image (`gradient=pathwise`), and by that by the shares of
-images under each anchor (`gradient=stratified`, {per_light} scenes seen under all six).
+is predicted by the derivative by the blend of light in every image (`gradient=pathwise`), and by that by the
+proportions of images under each anchor (`gradient=stratified`, {per_light} scenes seen under all six).
 
-| part of the way | validation loss | foretold by blends | by shares |
+| part of the way | validation loss | predicted by blends | by proportions |
 |---|---|---|---|
 """
 
@@ -85,7 +85,7 @@ images under each anchor (`gradient=stratified`, {per_light} scenes seen under a
 def report(rows: list[dict[str, Any]], seeds: int, per_light: int) -> str:
     return INTRODUCTION.format(seeds=seeds, per_light=per_light) + "\n".join(
         f"| {row['part']:g} | {row['loss']:.3f} ± {row['loss_error']:.3f} "
-        f"| {row['blend']:+.3f} ± {row['blend_error']:.3f} | {row['share']:+.3f} ± {row['share_error']:.3f} |"
+        f"| {row['blend']:+.3f} ± {row['blend_error']:.3f} | {row['proportion']:+.3f} ± {row['proportion_error']:.3f} |"
         for row in rows
     )
 

@@ -19,8 +19,8 @@ class ScoreFunction:
     def estimate(self, losses, params, vector, images, probes):
         return _along(scores(losses.cached, params, vector, images.index, self.chunk_size), images)
 
-    def accumulated(self, found, images, probes):
-        return _along(found.images[images.index] / images.weights, images)
+    def accumulated(self, sums, images, probes):
+        return _along(sums.images[images.index] / images.weights, images)
 
 
 def _along(scored, images):

@@ -35,10 +35,10 @@ def test_factors_are_drawn_independently_and_by_their_own_p(generator):
     draw = JOINT.hard(psi, JOINT.draw_noise(count, generator, torch.float64))
     assert torch.equal(JOINT.bins_of(draw), draw.bins)
     p = JOINT.probabilities(psi)
-    shares = torch.zeros(6, 4, dtype=torch.float64)
-    shares.index_put_(draw.bins.unbind(1), torch.full((count,), 1.0 / count, dtype=torch.float64), True)
+    frequencies = torch.zeros(6, 4, dtype=torch.float64)
+    frequencies.index_put_(draw.bins.unbind(1), torch.full((count,), 1.0 / count, dtype=torch.float64), True)
     wanted = p["pose"][:, None] * p["zoom"]
-    assert ((shares - wanted).abs() < 5 * (wanted / count).sqrt()).all()
+    assert ((frequencies - wanted).abs() < 5 * (wanted / count).sqrt()).all()
 
 
 def test_log_prob_is_that_of_the_cell():
