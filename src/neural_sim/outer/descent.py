@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 from jaxtyping import Float
 from torch import Tensor
@@ -19,7 +20,7 @@ from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
 
 
-class GradientLoop(OuterLoop):
+class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass says in :meth:`_derivative` where the derivative comes from.
 
     Where steps are checked, the last iteration trains only to judge the last step.
@@ -105,11 +106,11 @@ class GradientLoop(OuterLoop):
     def _prepare(self) -> None:
         """Make what the derivative needs beside the iteration's training."""
 
+    @abstractmethod
     def _derivative(
         self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
     ) -> Hypergradient:
         """dL_val/dpsi of the objects that are learned, zeros for others."""
-        raise NotImplementedError
 
     def _cosine(self, result: Hypergradient) -> float:
         """Of the derivative with an independent one; nan where there is none."""

@@ -1,0 +1,152 @@
+"""What is wrong with a capture is named: its file, the frame, and what is wanted."""
+
+import json
+
+import pytest
+from captures import capture
+from PIL import Image
+
+from neural_sim.objects.photos import Photos
+
+KINDS = ("transforms", "colmap_text", "colmap_binary")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return {kind: capture(tmp_path_factory.mktemp(kind), kind=kind) for kind in KINDS}
+
+
+def broken(made, tmp_path, change):
+    """A copy of the capture whose transforms.json ``change`` has spoilt."""
+    home = tmp_path / "can"
+    for path in sorted(made["transforms"].folder.rglob("*.*")):
+        target = home / path.relative_to(made["transforms"].folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    document = json.loads((home / "transforms.json").read_text())
+    change(document, home)
+    (home / "transforms.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+def no_pose(document, home):
+    del document["frames"][2]["transform_matrix"]
+
+
+def mirrored(document, home):
+    document["frames"][2]["transform_matrix"][0] = [-x for x in document["frames"][2]["transform_matrix"][0]]
+
+
+def stretched(document, home):
+    document["frames"][2]["transform_matrix"][0][0] += 0.2
+
+
+def not_numbers(document, home):
+    document["frames"][2]["transform_matrix"] = "identity"
+
+
+def no_image(document, home):
+    (home / "images" / "002.png").unlink()
+
+
+def other_size(document, home):
+    Image.new("RGB", (100, 75)).save(home / "images" / "002.png")
+
+
+def other_model(document, home):
+    document["camera_model"] = "THIN_PRISM_FISHEYE"
+
+
+def no_focal_length(document, home):
+    del document["fl_x"]
+
+
+def no_frames(document, home):
+    document["frames"] = []
+
+
+def bad_up(document, home):
+    document["up"] = [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (no_pose, r"transforms\.json: frames\[2\] \(images/002\.png\): has no pose; want a transform_matrix"),
+        (mirrored, r"frames\[2\].*transform_matrix.*no rotation.*determinant -1"),
+        (stretched, r"frames\[2\].*transform_matrix.*no rotation"),
+        (not_numbers, r"frames\[2\].*want a matrix of 4 x 4 numbers, got 'identity'"),
+        (no_image, r"frames\[2\].*no such image: .*002\.png"),
+        (other_size, r"frames\[2\].*has 100 x 75 pixels, its intrinsics w and h say 200 x 150"),
+        (other_model, r"frames\[0\].*camera_model: want one of .*got 'THIN_PRISM_FISHEYE'"),
+        (no_focal_length, r"frames\[0\].*want intrinsics fl_x or camera_angle_x"),
+        (no_frames, r"transforms\.json: want a list 'frames' with at least one frame"),
+        (bad_up, r"transforms\.json: up: want three numbers"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(made, tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        Photos(broken(made, tmp_path, change))
+
+
+def test_what_is_wrong_with_masks_is_named(made, tmp_path):
+    def small(document, home):
+        Image.new("L", (20, 15), 255).save(home / "masks" / "002.png")
+
+    with pytest.raises(
+        ValueError, match=r"masks/002\.png: the mask has 20 x 15 pixels, its image .*200 x 150"
+    ):
+        Photos(broken(made, tmp_path / "small", small)).placement("can")
+
+    def gone(document, home):
+        (home / "masks" / "002.png").unlink()
+
+    with pytest.raises(ValueError, match=r"002\.png: nothing says which of its pixels are the object's"):
+        Photos(broken(made, tmp_path / "gone", gone)).placement("can")
+
+    def empty(document, home):
+        for path in (home / "masks").iterdir():
+            Image.new("L", (200, 150)).save(path)
+
+    with pytest.raises(ValueError, match=r"transforms\.json: no object in the masks of can"):
+        Photos(broken(made, tmp_path / "empty", empty)).placement("can")
+
+
+def test_a_model_that_colmap_cannot_read_is_named(made, tmp_path):
+    model = tmp_path / "can" / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (model / name).write_bytes(b"\x07" * 9)
+    with pytest.raises(ValueError, match=r"sparse/0: pycolmap .* cannot read this model"):
+        Photos(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"up": "up"}, r"objects\.up: want one of \+x.* for can, got 'up'"),
+        ({"up": [0, 0]}, r"objects\.up"),
+        ({"size": -1.0}, r"objects\.size: want metres above 0 for can, got -1"),
+        ({"names": ["mug"]}, r"objects\.names: 'mug' is not in"),
+    ],
+)
+def test_bad_options_are_refused(made, options, message):
+    with pytest.raises(ValueError, match=message):
+        Photos(made["transforms"].folder.parent, **options)
+
+
+def test_folders_without_captures_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"holds no folder with a transforms\.json or a COLMAP model"):
+        Photos(tmp_path)
+
+
+def test_the_digest_follows_files_and_options(made, tmp_path):
+    def nothing(document, home):
+        pass
+
+    root = broken(made, tmp_path, nothing)
+    first = Photos(root).digests()["can"]
+    assert Photos(root).digests()["can"] == first != Photos(root, up="-y").digests()["can"]
+    mask = root / "can" / "masks" / "000.png"
+    mask.write_bytes((root / "can" / "masks" / "001.png").read_bytes())
+    assert Photos(root).digests()["can"] != first
