@@ -69,7 +69,7 @@ def test_a_step_is_as_long_as_its_radius(factor, start):
     assert float(variation(factor, moved, psi)[0]) == pytest.approx(0.1, abs=1e-6)
     assert torch.equal(moved[1], psi[1])
     short = within(factor, psi, direction, torch.ones(2, dtype=torch.float64), 1e-3)
-    assert float((short - psi).abs().max()) == pytest.approx(1e-3, rel=0.5)
+    assert float((short - psi).abs().max()) == pytest.approx(1e-3, rel=1e-9)
 
 
 def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order_gain():

@@ -100,7 +100,7 @@ class CheckedSteps:
         self._joined = self._averages
         self._promised = torch.zeros_like(psi[:, 0])
         self._moved = torch.zeros(len(psi), dtype=torch.bool)
-        self._left = torch.zeros(len(psi), dtype=torch.bool)
+        self._just_accepted = torch.zeros(len(psi), dtype=torch.bool)
         self._reference: Tensor | None = None
 
     @property
@@ -119,7 +119,7 @@ class CheckedSteps:
         scores = scores.double()
         if self._reference is None:
             self._reference = scores
-        change, rest = scores - self._reference, scores[self.labels]
+        change = scores - self._reference
         came, images = change.sum(1), change.shape[1]
         own, mean = came[self.labels], came.nanmean()
         error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(own)
@@ -134,23 +134,24 @@ class CheckedSteps:
         # An object whose step was undone is compared with its last training at the psi that it is back at.
         undone = self._moved & ~accepted
         reference = scores.clone()
-        reference[self.labels] = torch.where(undone[:, None], self._reference[self.labels], rest)
+        reference[self.labels] = torch.where(
+            undone[:, None], self._reference[self.labels], scores[self.labels]
+        )
         verdicts = {
             name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]), float(error[i]))
             for i, name in enumerate(self.names)
             if self._moved[i]
         }
-        self._left = accepted
+        self._just_accepted = accepted
         self._reference, self._moved = reference, torch.zeros_like(self._moved)
         return verdicts
 
     def observe(self, result: Hypergradient) -> PValues:
         gradient, error = stacked(result, self.names, self.accepted)
-        parts = (self.distribution.split(values) for values in (self.tried, gradient, error))
-        psi, slope, noise = parts
-        found: dict[str, dict[str, float]] = {name: {} for name in self.names}
+        psi, slope, noise = (self.distribution.split(values) for values in (self.tried, gradient, error))
+        p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
         # What was seen where an object still is stays as good as new.
-        keep = torch.where(self._left, self.settings.momentum, 1.0)[:, None].to(self.accepted)
+        keep = torch.where(self._just_accepted, self.settings.momentum, 1.0)[:, None].to(self.accepted)
         self._joined = {}
         for factor in self.distribution.factors:
             name = factor.name
@@ -160,8 +161,8 @@ class CheckedSteps:
             direction = direction - direction.mean(-1, keepdim=True)
             self._joined[name] = self._averages[name].joined(direction, (noise[name] / p).square(), keep)
             for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
-                found[object_name][name] = value
-        return found
+                p_values[object_name][name] = value
+        return p_values
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
         self._promised = torch.zeros_like(self._promised)

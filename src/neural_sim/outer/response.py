@@ -47,10 +47,9 @@ class Response:
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
             p = factor.log_probabilities(at[factor.name]).exp()
-            apart = values[factor.name] - (p * values[factor.name]).sum(1, keepdim=True) / p.sum(
-                1, keepdim=True
-            )
-            parts[factor.name] = -p * apart / len(psi)
+            value = values[factor.name]
+            mean = (p * value).sum(1, keepdim=True) / p.sum(1, keepdim=True)
+            parts[factor.name] = -p * (value - mean) / len(psi)
         return distribution.join(parts)
 
 
