@@ -192,7 +192,7 @@ def costs(world: World, repeats: int) -> dict[str, float]:
             "central differences": back(ALL),
             "reverse over reverse": back(EXACT),
             "gradients computed again": back(ALL, run=bare),
-            "with derivatives by features": back(ALL, with_inputs=True),
+            "with derivatives by features": back(ALL, wanted="inputs"),
             "and a probe of each bin a step": back(replace(ALL, probes_per_step=1), every),
             "and one every second step (default)": back(Unrolled(), every),
         }

@@ -221,7 +221,7 @@ def test_pathwise_is_the_derivative_of_the_training_on_images_that_move(problem,
     made = trained(problem.psi)
     point = made.end.clone().requires_grad_()
     (slope,) = torch.autograd.grad(outer(point), point)
-    found = EXACT.accumulate(made, examples(problem.psi), start, slope, generator, with_inputs=True)
+    found = EXACT.accumulate(made, examples(problem.psi), start, slope, generator, wanted="inputs")
     ours = PathwiseEstimator(chunk_size=3).accumulated(found, problem.object_images(), {}).value
     expected = [
         extrapolated(lambda step, e=e: float(outer(trained(problem.psi + step * e).end)), STEP)
@@ -255,7 +255,7 @@ def test_pathwise_goes_through_the_backbone_once_for_all_steps(pipeline):
 
     direction = flatten(pipeline.vector)
     made, held = trained(pipeline.psi)
-    found = EXACT.accumulate(made, held, pipeline.trainable, direction, torch.Generator(), with_inputs=True)
+    found = EXACT.accumulate(made, held, pipeline.trainable, direction, torch.Generator(), wanted="inputs")
     ours = PathwiseEstimator(chunk_size=3).accumulated(found, pipeline.object_images(), {}).value
     along = torch.tensor([1.0, -0.5, 0.3, -0.8], dtype=DOUBLE)
     expected = extrapolated(

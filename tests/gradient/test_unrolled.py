@@ -9,7 +9,7 @@ import torch
 from recorded_training import DOUBLE, EXACT, NAMES, RULES, SHAPE, STEP, Micro, extrapolated
 
 from neural_sim.detector.trajectory import Recording, train
-from neural_sim.gradient.accumulated import Unrolled
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.unrolled import Examples, reversed_steps
 from neural_sim.solver.flatten import flatten, unflatten
 
@@ -22,6 +22,12 @@ def micro():
 @pytest.fixture(scope="module")
 def pulled():
     return Micro(proximal=0.5)
+
+
+def least_memory(problem, rule):
+    """Megabytes of six steps in two segments of three, without room for gradients."""
+    theta = flatten(problem.like)
+    return ((2 + 3) * len(rule.begin(theta)) + 3) * 8 * theta.numel() / 2**20
 
 
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)
@@ -43,7 +49,7 @@ def test_the_derivative_by_image_weights_is_that_of_the_same_training(
 def test_the_derivative_by_inputs_is_that_of_the_same_training(micro, rule, generator):
     """Features of every level, and the boxes that anchors should predict."""
     directions = tuple(torch.randn(x.shape, generator=generator, dtype=DOUBLE) for x in micro.cached.inputs)
-    found = micro.accumulated(rule, with_inputs=True).inputs
+    found = micro.accumulated(rule, wanted="inputs").inputs
     along = sum(float((x * d).sum()) for x, d in zip(found, directions, strict=True))
     assert all(bool(part.any()) for part in found)
 
@@ -58,7 +64,7 @@ def test_the_derivative_by_inputs_is_that_of_the_same_training(micro, rule, gene
 def test_central_differences_stand_for_exact_products(pulled, rule):
     """Six steps, each within the order eps^(2/3) = 4e-11 times third derivatives; 1e-7 leaves room for those."""
     exact, near = (
-        pulled.accumulated(rule, Unrolled(product=product), with_inputs=True)
+        pulled.accumulated(rule, Unrolled(product=product), wanted="inputs")
         for product in ("reverse_over_reverse", "central_difference")
     )
     for ours, theirs in zip((near.images, *near.inputs), (exact.images, *exact.inputs), strict=True):
@@ -66,11 +72,36 @@ def test_central_differences_stand_for_exact_products(pulled, rule):
 
 
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)
+@pytest.mark.parametrize("kept", [True, False])
+def test_forward_differences_stand_for_exact_products_of_probes_scores(pulled, rule, kept):
+    """Six steps, each within the order eps^(1/2) = 1.5e-8 times second derivatives, from gradients that were kept or
+    computed again, the proximal term's taken out."""
+    probes = ProbeGroups(pulled.cached.losses, [torch.arange(8).view(4, 2)])
+    settings = {"probes_per_step": 0, "score_every": 1}
+    recording = Recording() if kept else Recording(max_memory_mb=least_memory(pulled, rule))
+    exact, near = (
+        pulled.accumulated(
+            rule, Unrolled(product=product, **settings), recording=recording, probes=probes, wanted="probes"
+        )
+        for product in ("reverse_over_reverse", "forward_difference")
+    )
+    assert float((near.probes - exact.probes).norm()) < 1e-5 * float(exact.probes.norm())
+    assert not near.images.numel() and not near.inputs
+
+
+def test_forward_differences_are_central_where_more_than_probes_is_wanted(pulled):
+    """A second gradient is taken in any case, which serves the product as well."""
+    one, other = (
+        pulled.accumulated(RULES[0], Unrolled(product=product), wanted="weights")
+        for product in ("forward_difference", "central_difference")
+    )
+    assert torch.equal(one.images, other.images)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
 def test_states_kept_and_states_computed_again_give_the_same(pulled, rule):
     """Six steps in two segments of three; without room for gradients they are computed again."""
-    vector = 8 * flatten(pulled.like).numel()
-    states = len(rule.begin(flatten(pulled.like)))
-    least = ((2 + 3) * states + 3) * vector / 2**20
+    least = least_memory(pulled, rule)
     made = pulled.trained(rule, pulled.examples, Recording(max_memory_mb=least))
     assert sorted(made.checkpoints) == [0, 3] and not made.gradients
     kept = pulled.accumulated(rule)
@@ -138,7 +169,7 @@ def test_it_is_autograd_through_the_whole_loop(generator, rule, segments):
     if segments == 1:
         made = dataclasses.replace(made, checkpoints={0: made.checkpoints[0]})
     assert len(made.segments()) <= segments
-    found = EXACT.accumulate(made, examples, like, 2.0 * made.end, generator, with_inputs=True)
+    found = EXACT.accumulate(made, examples, like, 2.0 * made.end, generator, wanted="inputs")
     torch.testing.assert_close(made.end, state[0].detach(), rtol=1e-13, atol=0.0)
     torch.testing.assert_close(found.images, by_weight, rtol=1e-11, atol=1e-14)
     torch.testing.assert_close(found.inputs[0], by_input, rtol=1e-11, atol=1e-14)

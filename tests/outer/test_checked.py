@@ -107,6 +107,19 @@ def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorte
     assert steps.judge(scored(0.7, 0.52, 0.5))["b"].came == pytest.approx(0.02)
 
 
+def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
+    zoom = BinnedFactor("zoom", "distance", 4, 1.0, 2.0)
+    psi = torch.zeros(2, 8, dtype=torch.float64)
+    steps = steps_at(psi, (POSE, zoom))
+    steps.judge(scored(0.5, 0.5, 0.5))
+    gradient = torch.cat([gradients([1, 2], psi[:, :4]), torch.zeros(2, 4, dtype=torch.float64)], 1)
+    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    assert bool((tried[:, :4] != 0.0).any(1).all()) and not bool(tried[:, 4:].any())
+    steps.judge(scored(0.6, 0.4, 0.5))
+    assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
+    assert steps.radius["zoom"].tolist() == [0.5, 0.5]
+
+
 def test_a_rise_within_the_error_of_its_images_is_not_believed():
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50

@@ -50,9 +50,11 @@ def test_scores_add_up_to_what_psi_lowers(made):
     objective, params = made("average_precision")
     with torch.no_grad():
         whole = float(sum(term(params) for term in objective.terms()))
-    assert float(objective.scores(params).sum(1).mean()) == pytest.approx(1.0 - whole, abs=1e-12)
+    assert float(objective.scores(objective.outputs(params)).sum(1).mean()) == pytest.approx(
+        1.0 - whole, abs=1e-12
+    )
     objective, params = made("loss")
-    scores = objective.scores(params).sum(1)
+    scores = objective.scores(objective.outputs(params)).sum(1)
     # As many images of each class: the mean over classes is that over images.
     with torch.no_grad():
         whole = float(sum(term(params) for term in objective.terms()))
@@ -66,7 +68,7 @@ def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
     fewer = Objective(
         objective.cached.select(rows), objective.images.select(rows), "average_precision", SmoothAP()
     )
-    scores = fewer.scores(params).sum(1)
+    scores = fewer.scores(fewer.outputs(params)).sum(1)
     assert bool(scores[1].isnan()) and bool(scores[0].isfinite())
     with torch.no_grad():
         assert float(sum(term(params) for term in fewer.terms())) == pytest.approx(

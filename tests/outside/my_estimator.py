@@ -12,7 +12,7 @@ from neural_sim.synthesis.scene import HardDraws
 @dataclass(frozen=True)
 class ScoreFunction:
     chunk_size: int = 16
-    through_images = False
+    wanted = "weights"
     probes_per_bin = 0
     draws = HardDraws(explore=True)
 

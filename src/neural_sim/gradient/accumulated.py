@@ -13,7 +13,7 @@ from torch import Tensor
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.gradient.base import IndexedLoss, Params
 from neural_sim.gradient.mixed import scores
-from neural_sim.gradient.unrolled import Examples, InputsOf, Product, ReversedStep, reversed_steps
+from neural_sim.gradient.unrolled import Examples, InputsOf, Product, ReversedStep, Wanted, reversed_steps
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,8 @@ class Accumulated:
     """Sums over the reversed steps; a_t is that of :mod:`gradient.unrolled`.
 
     ``images`` [N]: the derivative of L_val by each training image's weight, 1 in the means of its batches.
-    ``inputs``: the derivative by the training images' inputs, which ``inputs_of`` computes; empty unless asked for.
+    ``inputs``: the derivative by the training images' inputs, which ``inputs_of`` computes. Both are empty unless
+    wanted.
     ``probes`` [m]: every probe's score, estimated from the steps that scored it; the mean over the probes of a bin is
     unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group.
     ``scored`` counts the scored pairs of a probe and a step.
@@ -104,7 +105,7 @@ class Unrolled:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    product: Product = "central_difference"
+    product: Product = "forward_difference"
     part: float = 1.0
     max_memory_mb: float = 2048.0
     probes_per_step: int = 1
@@ -132,21 +133,22 @@ class Unrolled:
         slope: Float[Tensor, "n"],
         generator: torch.Generator,
         probes: ProbeGroups | None = None,
-        with_inputs: bool = False,
+        wanted: Wanted = "weights",
     ) -> Accumulated:
         """Reverse a training from ``slope``, ``dL_val/dtheta`` after its last step.
 
         ``like`` gives the parameters' names and shapes. ``generator`` draws which probes each step scores.
         """
-        steps = reversed_steps(trajectory, examples, like, slope, self.product, with_inputs)
+        steps = reversed_steps(trajectory, examples, like, slope, self.product, wanted)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
         columns = probe_columns(per_bin, self.probes_per_step or per_bin, generator)
         weights = step_weights(len(trajectory) - trajectory.first, self.score_every, generator)
-        images = torch.zeros_like(slope[:1]).expand(len(examples.inputs[0])).clone()
-        inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if with_inputs else ()
+        images = slope.new_zeros(0 if wanted == "probes" else len(examples.inputs[0]))
+        inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if wanted == "inputs" else ()
         for step in steps:
-            images.index_add_(0, step.rows, step.scores / len(step.rows))
+            if wanted != "probes":
+                images.index_add_(0, step.rows, step.scores / len(step.rows))
             for into, part in zip(inputs, step.inputs, strict=True):
                 into.index_add_(0, step.rows, part)
             if scoring is not None and (weight := next(weights)):

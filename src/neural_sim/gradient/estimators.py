@@ -16,6 +16,7 @@ from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
+from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import Factor
 from neural_sim.synthesis.scene import Draws, HardDraws
 
@@ -24,11 +25,10 @@ class Estimator(Protocol):
     """How psi's derivative is estimated from images.
 
     ``draws`` says how an iteration's images are drawn. ``probes_per_bin`` is the number of further images of every
-    stratum of every factor (0: none). ``through_images``: :meth:`accumulated` needs the derivatives by the training
-    images' inputs.
+    stratum of every factor (0: none). ``wanted`` is what :meth:`accumulated` reads of the sums over a training's steps.
     """
 
-    through_images: ClassVar[bool]
+    wanted: ClassVar[Wanted]
 
     @property
     def draws(self) -> Draws: ...
@@ -63,8 +63,8 @@ class StratifiedEstimator:
     (see :func:`gradient.mixed.scores`).
     """
 
-    through_images: ClassVar[bool] = False
-    probes_per_bin: int = 16
+    wanted: ClassVar[Wanted] = "probes"
+    probes_per_bin: int = 24
     chunk_size: int = 64
     theta_mode: ThetaMode = "central_difference"
 
@@ -134,7 +134,7 @@ class StratifiedEstimator:
 class ReinforceEstimator:
     """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
 
-    through_images: ClassVar[bool] = False
+    wanted: ClassVar[Wanted] = "weights"
     chunk_size: int = 64
 
     @property

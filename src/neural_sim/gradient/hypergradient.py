@@ -19,7 +19,7 @@ from neural_sim.detector.losses import proximal_loss
 from neural_sim.detector.trajectory import Trajectory
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
-from neural_sim.gradient.unrolled import Examples
+from neural_sim.gradient.unrolled import Examples, Wanted
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.flatten import unflatten
@@ -83,7 +83,8 @@ class InnerProblem:
 class Hypergradient:
     """``dL_val/dpsi`` per object with everything needed to judge it.
 
-    ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
+    ``stationarity`` is ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes; nan where
+    training was unrolled, which assumes none.
     ``sensitivity`` is ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, nan
     unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
     ``p_values`` by object and factor, see :class:`MixedDerivative`. ``seconds`` by phase: validation, solve (or
@@ -162,22 +163,21 @@ def unrolled_hypergradient(
     unrolled: Unrolled,
     generator: torch.Generator,
     probes: ProbeGroups | None = None,
-    with_inputs: bool = False,
+    wanted: Wanted = "weights",
 ) -> Hypergradient:
     """The derivative of the training that was run, for every object.
 
     ``trajectory`` is that training, of ``examples``, which ended at ``inner.params``. ``estimates`` maps an object's
-    name to its estimator as a function of the sums over the steps. ``probes`` and ``with_inputs`` say what is summed.
+    name to its estimator as a function of the sums over the steps. ``probes`` and ``wanted`` say what is summed.
     """
     began = time.perf_counter()
     slope = gradient(validation, inner.params)
-    stationarity = norm(gradient(inner.terms(), inner.params))
     validated = time.perf_counter()
-    sums = unrolled.accumulate(trajectory, examples, inner.params, slope, generator, probes, with_inputs)
+    sums = unrolled.accumulate(trajectory, examples, inner.params, slope, generator, probes, wanted)
     walked = time.perf_counter()
     parts = {name: estimate(sums) for name, estimate in estimates.items()}
     steps = len(trajectory) - trajectory.first
-    finite = bool(sums.images.isfinite().all())
+    finite = bool(sums.images.isfinite().all() and sums.probes.isfinite().all())
     solution = Solution(
         slope, Status.UNROLLED if finite else Status.NON_FINITE, steps, 0.0, (0.0, 0.0), steps, False
     )
@@ -188,7 +188,7 @@ def unrolled_hypergradient(
         solution=solution,
         damping=Damped(0.0, None),
         sensitivity=math.nan,
-        stationarity=stationarity,
+        stationarity=math.nan,
         validation_norm=norm(slope),
         seconds={
             "validation": validated - began,

@@ -33,6 +33,7 @@ from neural_sim.gradient.base import (
 )
 from neural_sim.gradient.mixed import ThetaMode, input_cotangents
 from neural_sim.gradient.significance import zero_mean
+from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import COORDINATES, Relaxation
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.synthesis.scene import RelaxedDraws
@@ -62,7 +63,7 @@ class PathwiseEstimator:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    through_images: ClassVar[bool] = True
+    wanted: ClassVar[Wanted] = "inputs"
     mode: Mode = "forward"
     relaxation: Relaxation = "gumbel_softmax"
     conditional_draws: int = 8

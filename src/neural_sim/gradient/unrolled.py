@@ -27,7 +27,10 @@ from neural_sim.gradient.base import Params
 from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.operator import plain_norm
 
-Product = Literal["central_difference", "reverse_over_reverse"]
+Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
+Wanted = Literal["probes", "weights", "inputs"]
+"""What an estimator reads: scores of probes alone, the derivatives by the training images' weights too, or these and
+those by the images' inputs."""
 InputsOf = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, ...]]
 
 
@@ -87,7 +90,7 @@ class ReversedStep:
     """One reversed step.
 
     ``params`` is theta before it, ``along`` a_t. ``rows`` are its batch's, ``scores`` those images' <dl/dtheta, a_t>,
-    and ``inputs`` the derivative of the mean score by those rows of the inputs, empty unless asked for.
+    and ``inputs`` the derivative of the mean score by those rows of the inputs; both are empty unless wanted.
     """
 
     step: int
@@ -113,13 +116,15 @@ def reversed_steps(
     like: Params,
     slope: Float[Tensor, "n"],
     product: Product = "central_difference",
-    with_inputs: bool = False,
+    wanted: Wanted = "weights",
 ) -> Iterator[ReversedStep]:
     """The steps of a training from the last to the first recorded one.
 
     ``like`` gives the parameters' names and shapes, ``slope`` is ``dL_val/dtheta`` after the last step. Products with a
-    batch's Hessian: ``central_difference``, two gradients at ``theta +- h a``, an error of relative order eps^(2/3);
-    ``reverse_over_reverse``, exact, about three and a half gradients and the memory of a second derivative.
+    batch's Hessian: ``forward_difference``, a gradient at ``theta + h a`` less the step's own, an error of relative
+    order eps^(1/2), where nothing but probes is wanted (else central ones); ``central_difference``, two gradients at
+    ``theta +- h a``, of order eps^(2/3); ``reverse_over_reverse``, exact, about three and a half gradients and the
+    memory of a second derivative.
 
     Raises:
         ValueError: for an unknown product, or a slope that is not as long as theta.
@@ -130,7 +135,8 @@ def reversed_steps(
         raise ValueError(
             f"unrolled: got a slope of shape {tuple(slope.shape)}, want {tuple(trajectory.end.shape)}"
         )
-    curved = _differenced if product == "central_difference" else _doubly_reversed
+    one_sided = product == "forward_difference" and wanted == "probes"
+    curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
     cotangents = list(trajectory.rule.begin(slope))  # the buffers after the last step move nothing
     for segment in trajectory.segments():
         replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
@@ -140,7 +146,11 @@ def reversed_steps(
                 trajectory.rule, state, gradient, trajectory.rates[step], step, cotangents
             )
             rows = trajectory.rows[step]
-            curvature = curved(examples, state[0], like, rows, along, with_inputs)
+            if one_sided:
+                own = gradient - examples.proximal_gradient(state[0], like)
+                curvature = _from_one_side(examples, state[0], like, rows, along, own)
+            else:
+                curvature = curved(examples, state[0], like, rows, along, wanted == "inputs")
             cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
             yield ReversedStep(
                 step,
@@ -171,10 +181,7 @@ def _differenced(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
 ) -> _Curved:
     """Central differences of losses and gradients, without waiting for a device."""
-    # As ``difference_length`` chooses it, kept on the device; for a zero vector all differences are zero.
-    size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
-    reach = torch.finfo(theta.dtype).eps ** (1 / 3) * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
-    unit = (along.double() / size).to(theta) * reach.to(theta)
+    unit, scale = _displacement(theta, along, torch.finfo(theta.dtype).eps ** (1 / 3))
     inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
     sides = []
     for point in (theta + unit, theta - unit):
@@ -184,6 +191,26 @@ def _differenced(
             loss = losses.mean()
         leaves = (leaf, *(inputs if with_inputs else ()))
         sides.append((losses.detach(), *torch.autograd.grad(loss, leaves, materialize_grads=True)))
-    scale = (0.5 * size / reach).to(theta)
-    scores, product, *moved = ((above - below) * scale for above, below in zip(*sides, strict=True))
+    scores, product, *moved = ((above - below) * (0.5 * scale) for above, below in zip(*sides, strict=True))
     return _Curved(product, scores, tuple(moved))
+
+
+def _from_one_side(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, own: Tensor
+) -> _Curved:
+    """The difference of a gradient beside theta and the one at theta, ``own``, which training has taken already."""
+    # Eight times the root of eps: rounding and third derivatives then add about alike.
+    unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
+    leaf = (theta + unit).detach().requires_grad_()
+    with torch.enable_grad():
+        loss = examples.losses(unflatten(leaf, like), examples.of(rows), rows).mean()
+    (beside,) = torch.autograd.grad(loss, leaf)
+    return _Curved((beside - own) * scale, theta.new_zeros(0), ())
+
+
+def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """A vector along a as long as ``reach`` times one plus theta's root mean square, and a's length by its. All stays
+    on the device; for a zero vector all differences are zero."""
+    size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
+    length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
+    return (along.double() / size).to(theta) * length.to(theta), (size / length).to(theta)

@@ -30,10 +30,10 @@ Actions = dict[str, dict[str, Action]]
 class Certificate:
     """What is known of one iteration's hypergradient.
 
-    ``stationarity`` is ``|dL_train/dtheta|`` and ``validation_norm`` ``|dL_val/dtheta|``. ``curvature_min`` and
-    ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` that of the damped one (nan
-    where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the hypergradient's
-    relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with what
+    ``stationarity`` is ``|dL_train/dtheta|`` (nan where none was assumed) and ``validation_norm`` ``|dL_val/dtheta|``.
+    ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` that of the
+    damped one (nan where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the
+    hypergradient's relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with what
     ``outer.certify`` measured, nan where it did not. ``doubts`` names what speaks against all steps. ``p_values``, by
     object and factor, are those of the null that a derivative is zero: this iteration's, or, where steps are checked,
     its average with those of earlier iterations, which steps follow. ``actions`` has the objects whose psi moves; a
@@ -158,9 +158,8 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
     done = Counter(action for held in c.actions.values() for action in held.values())
     parts = [
         f"psi {iteration}/{iterations} val {validation_loss:.4f}",
-        f"|dtrain| {c.stationarity:.2g} |dval| {c.validation_norm:.2g}",
-        f"{c.solver_status} {c.solver_steps} steps res {c.solver_residual:.1g}",
-        f"H [{c.curvature_min:.2g}, {c.curvature_max:.3g}] lambda {c.damping:.2g} cond {c.condition:.3g}",
+        f"|dval| {c.validation_norm:.2g}",
+        *_adjoint(c),
         *([] if math.isnan(c.sensitivity) else [f"2 lambda {c.sensitivity:.0%}"]),
         *(f"p {factor} {'/'.join(f'{p:.2g}' for p in found)}" for factor, found in tested.items()),
         *([] if math.isnan(c.cosine) else [f"cos {c.cosine:.2f}"]),
@@ -168,6 +167,18 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
         + (f" ({', '.join(c.doubts)})" if c.doubts else ""),
     ]
     return "; ".join(parts)
+
+
+def _adjoint(c: Certificate) -> list[str]:
+    """How the derivative was taken, for the log: a solve has a residual and a spectrum, other ways have none."""
+    taken = f"{c.solver_status} {c.solver_steps} steps"
+    if math.isnan(c.stationarity):
+        return [taken]
+    return [
+        f"|dtrain| {c.stationarity:.2g}",
+        f"{taken} res {c.solver_residual:.1g}",
+        f"H [{c.curvature_min:.2g}, {c.curvature_max:.3g}] lambda {c.damping:.2g} cond {c.condition:.3g}",
+    ]
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

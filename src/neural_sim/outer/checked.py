@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neural_sim.gradient.hypergradient import Hypergradient
@@ -99,7 +99,7 @@ class CheckedSteps:
         self._averages = {name: Average.zeros(part) for name, part in parts.items()}
         self._joined = self._averages
         self._promised = torch.zeros_like(psi[:, 0])
-        self._moved = torch.zeros(len(psi), dtype=torch.bool)
+        self._moved = {name: torch.zeros(len(psi), dtype=torch.bool) for name in parts}
         self._just_accepted = torch.zeros(len(psi), dtype=torch.bool)
         self._reference: Tensor | None = None
 
@@ -110,7 +110,12 @@ class CheckedSteps:
     @property
     def moved(self) -> bool:
         """Whether an object has a step that is not judged yet."""
-        return bool(self._moved.any())
+        return bool(self._waiting.any())
+
+    @property
+    def _waiting(self) -> Bool[Tensor, "objects"]:
+        """Objects whose step is not judged yet, by whichever factor they moved."""
+        return torch.stack([*self._moved.values()]).any(0)
 
     def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
         """A step is undone where its object's own score did not rise by more than ``errors`` standard errors, of the
@@ -123,16 +128,16 @@ class CheckedSteps:
         came, images = change.sum(1), change.shape[1]
         own, mean = came[self.labels], came.nanmean()
         error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(own)
-        rose = own > self.settings.errors * error
-        if bool(self._moved.any()) and bool(rose[self._moved].all()) and mean < 0.0:
+        rose, waiting = own > self.settings.errors * error, self._waiting
+        if bool(waiting.any()) and bool(rose[waiting].all()) and mean < 0.0:
             rose = torch.zeros_like(rose)
-        accepted = self._moved & rose
+        accepted = waiting & rose
         self.accepted = torch.where(accepted[:, None], self.tried, self.accepted)
         for name, radius in self.radius.items():
             grown = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
-            self.radius[name] = torch.where(self._moved, grown.clamp_max(self.settings.largest), radius)
+            self.radius[name] = torch.where(self._moved[name], grown.clamp_max(self.settings.largest), radius)
         # An object whose step was undone is compared with its last training at the psi that it is back at.
-        undone = self._moved & ~accepted
+        undone = waiting & ~accepted
         reference = scores.clone()
         reference[self.labels] = torch.where(
             undone[:, None], self._reference[self.labels], scores[self.labels]
@@ -140,10 +145,11 @@ class CheckedSteps:
         verdicts = {
             name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]), float(error[i]))
             for i, name in enumerate(self.names)
-            if self._moved[i]
+            if waiting[i]
         }
         self._just_accepted = accepted
-        self._reference, self._moved = reference, torch.zeros_like(self._moved)
+        self._reference = reference
+        self._moved = {name: torch.zeros_like(waiting) for name in self._moved}
         return verdicts
 
     def observe(self, result: Hypergradient) -> PValues:
@@ -182,7 +188,7 @@ class CheckedSteps:
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
             self._promised = self._promised + (direction * change).sum(1)
         self.tried = self.distribution.join(moved)
-        self._moved = (self.tried != self.accepted).any(1)
+        self._moved = {name: (moved[name] != psi[name]).any(1) for name in moved}
         return self.tried
 
 

@@ -94,6 +94,15 @@ class GradientLoop(OuterLoop, ABC):
             self.inner.renew()  # the same training again would say nothing new
         self._go_to(psi)
 
+    def derivative(self) -> Hypergradient:
+        """The derivative at psi as an iteration takes it, through new images and a training on them; psi stays."""
+        self._prepare()
+        rendered = self.inner.draw(self.psi)
+        images = join(rendered)
+        cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+        self.inner.train(cached, self._recording)
+        return self._derivative(rendered, images, cached)
+
     def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
         self.psi.data[self._learned] = psi
         reported = self.psi.detach().clone()

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.detector.protocol import Detector, Outputs, Parameters
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
@@ -81,6 +81,7 @@ class InnerLoop:
         self.images = self.steps = self._numbers = 0
         self.common_numbers = False
         self.trajectory: Trajectory | None = None
+        self._judged: tuple[Parameters, Outputs] = ({}, (torch.empty(0), torch.empty(0)))
 
     @property
     def trainable(self) -> Parameters:
@@ -133,9 +134,17 @@ class InnerLoop:
 
     def validation_loss(self) -> float:
         """L_val at theta."""
-        with torch.no_grad():
-            return float(sum(term(self.trainable) for term in self.objective.terms()))
+        return float(self.objective.of_outputs(self._on_validation()))
 
     def scores(self) -> Float[Tensor, "classes images"]:
         """What each validation image adds to theta's score for each class, more is better."""
-        return self.objective.scores(self.trainable)
+        return self.objective.scores(self._on_validation())
+
+    @torch.no_grad()
+    def _on_validation(self) -> Outputs:
+        """theta's outputs on the validation images, computed once for each theta."""
+        theta, outputs = self._judged
+        if theta is not self.theta:
+            outputs = self.objective.outputs(self.trainable)
+            self._judged = (self.theta, outputs)
+        return outputs

@@ -33,12 +33,16 @@ class Objective:
 
     def terms(self) -> list[Term]:
         """L_val as a sum of terms; the smooth average precision, which ranks all images, is one."""
-        losses = self.cached.mean_terms()
         if self.kind == "loss":
-            return losses
-        weight = self.smooth.loss
-        weighed = [lambda params, term=term: weight * term(params) for term in losses] if weight else []
-        return [lambda params: 1.0 - self.smooth_ap(self.outputs(params)).sum(1).nanmean(), *weighed]
+            return self.cached.mean_terms()
+        return [lambda params: self.of_outputs(self.outputs(params))]
+
+    def of_outputs(self, outputs: Outputs) -> Float[Tensor, ""]:
+        """L_val of the detector's outputs on all images."""
+        loss = self.cached.detector.losses_of(outputs, self.cached.targets).mean()
+        if self.kind == "loss":
+            return loss
+        return 1.0 - self.smooth_ap(outputs).sum(1).nanmean() + self.smooth.loss * loss
 
     def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
         """What each image adds to the smooth average precision of every class; nan for a class without a box."""
@@ -54,11 +58,11 @@ class Objective:
         return torch.cat(logits), torch.cat(deltas)
 
     @torch.no_grad()
-    def scores(self, params: Parameters) -> Float[Tensor, "classes images"]:
+    def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
         """What each image adds to the score of every class, more is better. A class's score, the sum of its row, is
         L_val's part of it with the other sign, without the one; losses are the mean over images with a box of the
         class. nan for a class without one. On the CPU."""
-        outputs, labels = self.outputs(params), self.images.labels.cpu()
+        labels = self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()
         classes = torch.arange(outputs[0].shape[-1])
         own = (labels == classes[:, None, None]).any(-1).to(losses)

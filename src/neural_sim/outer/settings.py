@@ -25,11 +25,11 @@ class Trust:
     """What a psi step's hypergradient must meet to be trusted; None makes no demand.
 
     ``max_residual`` of the adjoint solve, relative; ``max_stationarity`` of ``|dL_train/dtheta|``; ``max_sensitivity``
-    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); ``min_cosine`` with the retrained
-    finite difference (wants ``outer.certify_every``). These speak of all objects. ``level`` speaks of each object and
-    factor of psi: the probability with which an iteration's derivative that is zero passes for one that is not (see
-    ``gradient.significance``). ``shrink`` is the part of an untrusted step that is taken where ``outer.on_untrusted``
-    says shrink.
+    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); these three are of the implicit
+    adjoint. ``min_cosine`` is with what ``outer.certify`` measures (wants ``outer.certify_every``). These speak of all
+    objects. ``level`` speaks of each object and factor of psi: the probability with which an iteration's derivative
+    that is zero passes for one that is not (see ``gradient.significance``). ``shrink`` is the part of an untrusted step
+    that is taken where ``outer.on_untrusted`` says shrink.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.

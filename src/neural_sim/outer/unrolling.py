@@ -57,7 +57,7 @@ def through_training(
         loop.settings.unrolled,
         loop.generator,
         groups,
-        estimator.through_images,
+        estimator.wanted,
     )
 
 
