@@ -146,7 +146,9 @@ class CheckedSteps:
         self.accepted = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
             scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
-            self.radius[name] = torch.where(self._moved[name], scaled.clamp_max(self.settings.largest), radius)
+            self.radius[name] = torch.where(
+                self._moved[name], scaled.clamp_max(self.settings.largest), radius
+            )
         # After a rejected step an object is compared with its last training at the accepted psi, to which it returns.
         rejected = pending & ~accepted
         reference = scores.clone()
