@@ -1,8 +1,8 @@
 """A smooth average precision, which the psi loop differentiates in the place of the validation loss.
 
 The detections are those of the forward pass, after non-maximum suppression. Their anchors are fixed; their scores and
-boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true positive, by its
-overlap, and whether it ranks below another one, by the difference of their logits (Brown et al. 2020, Smooth-AP, Eq. 6).
+boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true positive (of its
+overlap), and whether it ranks below another one (of the difference of logits; Brown et al. 2020, Smooth-AP, Eq. 6).
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class SmoothAP:
         return torch.zeros_like(detections.logits).index_add(0, candidates, added)
 
     def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
-        """The degree in [0, 1] to which each detection is a true positive, at each threshold: that of its overlap, times
+        """Degree in [0, 1] to which each detection is a true positive, at each threshold: that of its overlap, times
         that to which no better detection of the same box is one. The degrees of a box sum to at most 1."""
         levels = detections.overlaps.new_tensor(THRESHOLDS)
         matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)

@@ -149,7 +149,7 @@ class Recorder:
             )
 
     def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
-        """Record a step before it is taken. ``state`` and ``gradient`` return copies; they are called only if needed."""
+        """Record a step before it is taken. ``state`` and ``gradient`` return copies and are called only if needed."""
         number = len(self._rates)
         self._rates.append(rate)
         if number < self._first:

@@ -1,7 +1,7 @@
 """The derivative of the training that was run: reverse mode through its optimiser's steps.
 
-The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of L_val
-by the state before step t (theta and the optimiser's moments), each step back takes
+The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of
+L_val by the state before step t (theta and the optimiser's moments), each step back takes
 
     a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
     lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
