@@ -133,7 +133,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         + (" (one seed: over images alone)." if count == 1 else "."),
         *_on_other_devices(runs),
         "",
-        f"| method | AP | of the gap won back | {c.reference} ahead by | area ahead by "
+        f"| method | AP | of the gap closed | {c.reference} ahead by | area ahead by "
         f"| AP after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
