@@ -75,7 +75,7 @@ INTRODUCTION = """    python benchmarks/lights.py --seeds {seeds} --per-light {p
 `illumination_gap` at `scale=quick`: the biased objects' weights are interpolated between the initial lights (0) and
 the target's (1). Columns: validation loss of the detector trained there, mean of {seeds}; its slope along the whole
 segment, as predicted by the derivative by the blend of lights in every image (`gradient=pathwise`), and by the
-derivative by the proportions of images under each anchor light (`gradient=stratified`, {per_light} scenes under all six).
+derivative by the proportions of images under each light (`gradient=stratified`, {per_light} scenes under all six).
 
 | interpolation | validation loss | predicted by blends | by proportions |
 |---|---|---|---|
