@@ -163,16 +163,13 @@ def _carved(
         pixel, ahead = lens.project(local)
         scale = mask.shape[1] / lens.width
         nearest = float((-local[:, 2]).clamp_min(1e-6).median())
-        grown = _grown(mask, int(np.ceil(scale * max(lens.fx, lens.fy) * reach / nearest)) + 1)
+        by = int(np.ceil(scale * max(lens.fx, lens.fy) * reach / nearest)) + 1
+        grown = functional.max_pool2d(mask[None, None].float(), 2 * by + 1, 1, by)[0, 0] > 0.0
         inside, value = _at(grown, pixel, lens)
         visible = inside & ahead
         seen += visible
         missed += visible & ~value
     return (seen >= SEEN_BY * len(shown)) & (missed <= OUTSIDE * seen)
-
-
-def _grown(mask: Bool[Tensor, "h w"], by: int) -> Bool[Tensor, "h w"]:
-    return functional.max_pool2d(mask[None, None].float(), 2 * by + 1, 1, by)[0, 0] > 0.0
 
 
 def _at(mask: Tensor, pixel: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:

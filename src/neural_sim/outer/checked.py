@@ -18,7 +18,7 @@ from torch import Tensor
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.settings import Checks
-from neural_sim.outer.steps import FRACTIONS, PValues, Verdict, stacked
+from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
 
@@ -190,11 +190,10 @@ class CheckedSteps:
             return self.trial
         self._averages = self._joined
         psi, moved = self.distribution.split(self.accepted), {}
-        fractions = {**FRACTIONS, "shrunk": self.shrink}
         for factor in self.distribution.factors:
             name = factor.name
-            taken = [fractions[certificate.actions[object_name][name]] for object_name in self.names]
-            radius = self.radius[name] * psi[name].new_tensor(taken)
+            taken = psi[name].new_tensor(fractions(certificate, self.names, name, self.shrink))
+            radius = self.radius[name] * taken
             radius = torch.where(self.radius[name] < self.settings.smallest, 0.0, radius)
             direction = self._averages[name].value
             moved[name] = within(factor, psi[name], direction, radius, self.settings.max_step)

@@ -19,7 +19,7 @@ from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.response import agreement
-from neural_sim.outer.retrained import as_double, binned_problem, check
+from neural_sim.outer.retrained import as_double, binned_problem, retrained_cosine
 from neural_sim.outer.unrolling import through_training
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.scene import RenderedObject
@@ -149,4 +149,4 @@ class SimulatorModule(GradientLoop):
         validation = self.inner.objective.double().terms()
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
-        return check(problem, validation, psi, label, as_double(trainable), gradient).cosine
+        return retrained_cosine(problem, validation, psi, label, as_double(trainable), gradient)

@@ -84,14 +84,13 @@ class FiniteDifference:
     """Central differences of L_val at retrained parameters, in centred logits of one object.
 
     ``slope`` is the largest final gradient norm of the retrainings; ``converged`` says whether all of them reached the
-    tolerance. ``products`` counts Hessian products, ``trainings`` the retrainings.
+    tolerance. ``trainings`` counts the retrainings.
     """
 
     gradient: Float[Tensor, "k"]
     converged: bool
     slope: float
     trainings: int
-    products: int
 
 
 def finite_difference(
@@ -123,28 +122,19 @@ def finite_difference(
         all(run.converged for run in runs),
         max(run.slope for run in runs),
         len(runs),
-        sum(run.products for run in runs),
     )
 
 
-@dataclass(frozen=True)
-class Check:
-    """A step's gradient of one object against the finite difference; ``cosine`` is nan unless that one converged."""
-
-    cosine: float
-    label: int
-    difference: FiniteDifference
-
-
-def check(
+def retrained_cosine(
     problem: BinnedProblem,
     validation: Sequence[Term],
     psi: Float[Tensor, "objects k"],
     label: int,
     start: Params,
     gradient: Float[Tensor, "k"],
-) -> Check:
-    """The cosine of ``gradient``, however it was estimated, with the retrained finite difference of ``problem``.
+) -> float:
+    """Cosine of object ``label``'s ``gradient``, from any estimator, with the finite differences of ``problem``; nan
+    where a retraining does not converge.
 
     The problem is first trained from ``start`` to its minimum. So a low cosine has one of several causes: an inner
     problem far from its minimum in the loop, a solve ended early, or a noisy estimate.
@@ -152,16 +142,12 @@ def check(
     minimum = problem.retrain(psi, start, TOLERANCE)
     if not minimum.converged:
         logger.warning("certificate: retraining stopped at a gradient of %.2g; no cosine", minimum.slope)
-        return Check(
-            math.nan,
-            label,
-            FiniteDifference(torch.zeros_like(gradient), False, minimum.slope, 1, minimum.products),
-        )
+        return math.nan
     difference = finite_difference(problem, validation, psi, label, minimum.params)
     if not difference.converged:
         logger.warning("certificate: a retraining stopped at a gradient of %.2g; no cosine", difference.slope)
-        return Check(math.nan, label, difference)
-    return Check(centred_cosine(gradient, difference.gradient), label, difference)
+        return math.nan
+    return centred_cosine(gradient, difference.gradient)
 
 
 def binned_problem(

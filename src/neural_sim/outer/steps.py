@@ -19,8 +19,6 @@ from neural_sim.parameter.update import Update, UpdateState
 
 PValues = Mapping[str, Mapping[str, float]]
 """By object and factor."""
-FRACTIONS = {"kept": 1.0, "skipped": 0.0, "stopped": 0.0}
-"""Fraction of a step that is taken, by its certificate's action; of a shrunk one, ``outer.trust.shrink``."""
 
 
 @dataclass(frozen=True)
@@ -99,12 +97,12 @@ class FreeSteps:
         psi, slope, noise = (
             self.distribution.split(values) for values in (self.reported, self._gradient, self._error)
         )
-        moved, fractions = {}, {**FRACTIONS, "shrunk": self.settings.trust.shrink}
+        moved = {}
         for factor in self.distribution.factors:
             name = factor.name
             after = self._step(factor, psi[name], slope[name], noise[name])
-            taken = [fractions[certificate.actions[object_name][name]] for object_name in self.names]
-            moved[name] = psi[name] + after.new_tensor(taken)[:, None] * (after - psi[name])
+            taken = after.new_tensor(fractions(certificate, self.names, name, self.settings.trust.shrink))
+            moved[name] = psi[name] + taken[:, None] * (after - psi[name])
         self.reported = self.reported + length * (self.distribution.join(moved) - self.reported)
         return self.reported
 
@@ -115,6 +113,12 @@ class FreeSteps:
             psi, factor.log_probabilities(psi), slope, noise, self._states[factor.name]
         )
         return factor.project(moved)
+
+
+def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
+    """Fraction that is taken of each object's step by a factor; ``shrink`` is that of a shrunk step."""
+    taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0, "stopped": 0.0}
+    return [taken[certificate.actions[name][factor]] for name in names]
 
 
 def stacked(

@@ -96,7 +96,7 @@ def _slug(comparison: Comparison) -> str:
 
 
 def _sources(group: Group) -> dict[str, Any]:
-    """What a table was made from, for compare.json."""
+    """The data of a table, for compare.json."""
     rows = [{"method": r.method, "seed": r.seed, "run": r.name, "run_id": r.run_id} for r in group.runs]
     return {"heading": group.heading, "scoring": group.runs[0].results["scoring"], "runs": rows}
 
