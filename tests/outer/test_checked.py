@@ -134,7 +134,7 @@ def test_a_rise_within_the_error_of_its_images_is_not_believed():
         assert verdict.error == pytest.approx(error) and verdict.measured_gain == pytest.approx(rise)
 
 
-def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_undone():
+def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], steps.accepted)

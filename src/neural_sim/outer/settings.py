@@ -175,6 +175,7 @@ class Outer:
 
     def __post_init__(self) -> None:
         at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
+        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
         at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
         at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         at_least("outer", 0, certify_every=self.certify_every)
@@ -184,23 +185,14 @@ class Outer:
             )
         if not 0.0 < self.refresh <= 1.0:
             raise ValueError(f"outer.refresh must lie in (0, 1], got {self.refresh}")
-        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
-        if self.start not in get_args(Start):
-            raise ValueError(f"outer.start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
         if self.learned is not None and not self.learned:
             raise ValueError("outer.learned: want the names of objects, or null for all, got none")
         if not 0.0 < self.final_step <= 1.0:
             raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
-        if self.on_untrusted not in get_args(OnUntrusted):
-            raise ValueError(
-                f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
-            )
         for key, kinds in (
-            ("adjoint", AdjointKind),
-            ("objective", ObjectiveKind),
-            ("steps", StepKind),
-            ("certify", CertifyKind),
-        ):
+            ("start", Start), ("adjoint", AdjointKind), ("objective", ObjectiveKind), ("steps", StepKind),
+            ("certify", CertifyKind), ("on_untrusted", OnUntrusted),
+        ):  # fmt: skip
             if getattr(self, key) not in get_args(kinds):
                 raise ValueError(
                     f"outer.{key} must be one of {', '.join(get_args(kinds))}, got {getattr(self, key)!r}"
