@@ -32,11 +32,7 @@ class Print:
         self._draw.polygon([(x * width, (1.0 - y) * height) for x, y in points], fill=colour)
 
     def text_lines(
-        self,
-        area: tuple[float, float, float, float],
-        lines: int,
-        colour: Colour,
-        generator: torch.Generator,
+        self, area: tuple[float, float, float, float], lines: int, colour: Colour, generator: torch.Generator
     ) -> None:
         """Bars of random lengths in ``area`` (x0, y0, x1, y1), like lines of small print."""
         x0, y0, x1, y1 = area

@@ -30,11 +30,7 @@ class SimulatorModule(GradientLoop):
     """psi follows the hypergradient, with a certificate for every iteration."""
 
     def __init__(
-        self,
-        inner: InnerLoop,
-        psi: Float[Tensor, "objects K"],
-        estimator: Estimator,
-        solver: AdjointSolver,
+        self, inner: InnerLoop, psi: Float[Tensor, "objects K"], estimator: Estimator, solver: AdjointSolver
     ) -> None:
         super().__init__(inner, psi)
         self.estimator, self.solver = estimator, solver
@@ -74,12 +70,7 @@ class SimulatorModule(GradientLoop):
             for label, name in zip(self._learned, self._names, strict=True)
         }
         result = hypergradient(
-            inner,
-            self.inner.objective.terms(),
-            estimates,
-            self.solver,
-            self.inner.generator,
-            self._adjoint,
+            inner, self.inner.objective.terms(), estimates, self.solver, self.inner.generator, self._adjoint
         )
         self._adjoint = result.solution.value
         return self._with_fixed(result)

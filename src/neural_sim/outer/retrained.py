@@ -118,10 +118,7 @@ def finite_difference(
                 values.append(math.fsum(float(term(runs[-1].params)) for term in validation))
         total += (values[0] - values[1]) / (2.0 * step) * direction
     return FiniteDifference(
-        total,
-        all(run.converged for run in runs),
-        max(run.slope for run in runs),
-        len(runs),
+        total, all(run.converged for run in runs), max(run.slope for run in runs), len(runs)
     )
 
 

@@ -27,10 +27,7 @@ class Subject(Protocol):
     def radius(self) -> float | None: ...
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
         """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
 
@@ -53,10 +50,7 @@ class MeshSubject:
         return self.item.name
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
         return self.renderer.render(self.item.mesh, camera, camera_to_world, lighting)
 
@@ -71,10 +65,7 @@ class FieldSubject:
     renderer: NerfRenderer = dataclasses.field(default_factory=NerfRenderer)
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
         if self.field is None:
             raise ValueError(f"{self.name}: nothing to render, since this target asked for no field")
