@@ -77,16 +77,9 @@ class GradientLoop(OuterLoop, ABC):
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
+        products, by_class = _products(result), scores.sum(1)
         self.record(
-            self.psi,
-            images,
-            training_loss,
-            seconds,
-            certificate,
-            norms,
-            _products(result),
-            scores.sum(1),
-            verdicts,
+            self.psi, images, training_loss, seconds, certificate, norms, products, by_class, verdicts
         )
         self._stopped = certificate.stopped
         psi = self.steps.next(certificate)
