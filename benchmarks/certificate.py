@@ -211,19 +211,19 @@ def main() -> None:
 TEXT = """
     python benchmarks/certificate.py
 
-An object whose derivative is zero passes with the probability `outer.trust.level`, 0.05, or less often. How often noise
-passes, by the law of the scores and by how much more the widest bin scatters than the narrowest (standard deviations,
-rare bins widest): {objects} objects a number, each number known to {noise:.3f}, {draws} random changes a p-value. In
-brackets: Welch's analysis of variance of the same scores. The earlier rule compared the best component's ratio to its
-standard error against 1, for the best of all objects; {old:.3f} of such objects pass it by themselves (normal, 16
-images of each bin).
+An object whose derivative is zero should be called significant with probability `outer.trust.level`, 0.05, or less. The
+table has the rate of such false positives, by the distribution of the scores and by the ratio of the largest to the
+smallest standard deviation of bins (rare bins: largest): {objects} objects for each rate, of standard error
+{noise:.3f}, and {draws} permutations or sign changes for each p-value. In brackets: Welch's analysis of variance of the
+same scores. An earlier rule compared the best component's ratio to its standard error with 1, for the best of all
+objects; {old:.3f} of such objects pass it by themselves (normal, 16 images of each bin).
 
 {laws}
 
-Each p-value, but of relaxed draws, is the larger of two. One is exact where scores do not depend on what was drawn,
-the other where they scatter symmetrically. Skewed scores pass too often where bins scatter differently too. No test of
-means holds its level for every law of the scores (Bahadur and Savage 1956), so the detector's own were asked: {images}
-of every bin at the warm start of `pose_gap`, their bins' means taken out, drawn from again.
+Each p-value, except of relaxed draws, is the larger of two. One is exact where scores do not depend on the bin, the
+other where they are symmetric about its mean. The rate is too high for skewed scores with unequal standard deviations.
+No test of means holds its level for every distribution (Bahadur and Savage 1956). So the next table resamples the
+detector's scores: {images} of every bin at the warm start of `pose_gap`, minus their bins' means.
 
 {own}
 """

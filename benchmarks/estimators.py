@@ -159,23 +159,23 @@ def compare_modes(world: FrozenLoop, size: int = 96, count: int = 8) -> list[dic
 
 DEFINITIONS = """\
 Each estimator gives d/dpsi <dL_train/dtheta, v> of one object's psi from N images, at the disjoint start of
-`pose_gap` (0.86 on a bin that the target has 0.02 of), for v solved at a warm-started detector. Compared are
-centred logits with two truths.
+`pose_gap` (0.86 on a bin that has 0.02 in the target), for v solved at a warm-started detector. Derivatives by
+centred logits are compared with two references, called truths.
 
 - *Hard*: the derivative over hard bins, g_i = p_i (s_i - sum_j p_j s_j) up to the floor's factor, s_b the mean score
-  <dl/dtheta, v> of {per_bin} images of bin b. This is the derivative of the distribution that images are really drawn
-  from in the end.
+  <dl/dtheta, v> of {per_bin} images of bin b. This is the derivative of the distribution that training images are
+  drawn from.
 - *Relaxed*: the mean over {truth_images} relaxed draws of the pathwise derivative, circular bin mean, boxes moving with
-  the object. This is the derivative of what the relaxed draws' training loss would be, at tau = {temperature}.
+  the object. This is the derivative of the training loss of relaxed draws, at tau = {temperature}.
 
-Both are estimates; *ceiling* is the cosine that the exact vector itself would be expected to have with each. Cosine is
+Both are estimates; *ceiling* is the expected cosine of the exact vector with each of them. *Cosine* is
 the mean over repeats and the two objects, with the standard deviation over repeats (pooled over objects; {repeats}
 repeats at N = 128, twice as many at each half; one of the paper's row, whose numbers are those of the linear row).
 *In p* is the cosine with the hard truth of derivatives by p, which mirror descent follows. Error is
 |g - hard| / |hard|. Seconds are one object's, of CPU time: drawing, rendering and the estimate ({threads} thread of
 {cores} cores, load {load:.1f}). Seconds to 0.7: at the smallest N of the table whose mean cosine with the hard truth
-reaches that. Below *circular, boxes* each pathwise row changes one thing of it. *Shrunk* is stratified with each
-component times max(0, 1 - noise / square), as the psi update does it."""
+reaches that. Below *circular, boxes* each pathwise row changes one setting of it. *Shrunk* is stratified with each
+component times max(0, 1 - noise / square), as in the psi update."""
 
 
 def markdown(worlds: list[dict[str, Any]], modes: list[dict[str, Any]], settings: dict[str, Any]) -> str:
@@ -191,7 +191,7 @@ def markdown(worlds: list[dict[str, Any]], modes: list[dict[str, Any]], settings
         for row in modes
     ]
     parts.append(
-        "Forward against reverse mode, one number of V, 96 px, float32: milliseconds (of CPU time) an image of "
+        "Forward against reverse mode, one number of V, 96 px, float32: milliseconds (CPU time) per image of "
         "rendering and of the derivative's contraction with a given cotangent, and the difference from forward mode "
         "(rounding; float64 is tested to 1e-8).\n\n| | ms | relative difference |\n|---|---|---|\n"
         + "\n".join(rows)
@@ -233,8 +233,8 @@ def _verdict(world: dict[str, Any], truth_images: int) -> str:
     weak = [which for which, ceilings in world["ceiling"].items() if min(ceilings) < 0.8]
     if weak:
         text += (
-            f". {truth_images} images do not settle the {' and the '.join(weak)} truth of every object (ceiling below "
-            "0.8): cosines with it say little"
+            f". {truth_images} images are too few for the {' and the '.join(weak)} truth of every object (ceiling "
+            "below 0.8), so cosines with it are uncertain"
         )
     return text + "."
 

@@ -71,12 +71,12 @@ def predicted(found: list[MixedDerivative], way: torch.Tensor) -> tuple[float, f
 
 INTRODUCTION = """    python benchmarks/lights.py --seeds {seeds} --per-light {per_light}
 
-`illumination_gap` at `scale=quick`: the biased objects' weights at a part of the way from the initial lights to the
-target's; validation loss of the detector trained there, mean of {seeds}; and the loss's slope along the whole way as it
-is predicted by the derivative by the blend of light in every image (`gradient=pathwise`), and by that by the
-proportions of images under each anchor (`gradient=stratified`, {per_light} scenes seen under all six).
+`illumination_gap` at `scale=quick`: the biased objects' weights are interpolated between the initial lights (0) and
+the target's (1). Columns: validation loss of the detector trained there, mean of {seeds}; its slope along the whole
+segment, as predicted by the derivative by the blend of lights in every image (`gradient=pathwise`), and by the
+derivative by the proportions of images under each light (`gradient=stratified`, {per_light} scenes under all six).
 
-| part of the way | validation loss | predicted by blends | by proportions |
+| interpolation | validation loss | predicted by blends | by proportions |
 |---|---|---|---|
 """
 

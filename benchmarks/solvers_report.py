@@ -10,24 +10,23 @@ SHORT = {
     "NEGATIVE_CURVATURE": "negative", "SINGULAR": "singular", "LEAST_SQUARES": "least sq.", "NON_FINITE": "not finite",
 }  # fmt: skip
 
-ORACLE = """`detector=micro` (2 classes, 32 px), warm from its usual training, then trained to the end of the proximal
-problem L_train + lambda/2 |theta - theta_0|^2 on one image of every bin (4) and object (2), where psi
+ORACLE = """`detector=micro` (2 classes, 32 px), after its usual training, then trained to the minimum of the proximal
+problem L_train + lambda/2 |theta - theta_0|^2 on one image of every bin (4) and object (2); psi
 enters by the bins' weights. The lambda of factor 1 is the one that `solver/damping=lanczos` chooses in 12 products
-at the warm start; the others show what hangs on it. *Retrained*: central differences of the same problem
-trained again to a gradient below 1e-10; *cosine* with those of 0.04 logits in centred logits, the smaller
-of the two objects'. *Exact*: relative error of the dense solve against retraining (0.04 and 0.02 logits
-extrapolated, so that the differences' own error is of fourth order), and against conjugate gradients run to
+at the warm start; the others show its effect. *Retrained*: central differences of the same problem,
+retrained to a gradient below 1e-10; *cosine*: with those of 0.04 logits, in centred logits, the smaller
+of the two objects'. *Exact*: relative error of the dense solve against retraining (differences of 0.04 and 0.02
+logits extrapolated, so that their error is of fourth order), and against conjugate gradients run to
 1e-12 on forward-over-reverse products."""
-BUDGET = """Relative error of the hypergradient by conjugate gradients, over the Hessian products spent (the last one
-checks the residual), and where a solve to rtol {rtol:g} stops, of at most {max_steps} products:"""
+BUDGET = """Relative error of the hypergradient by conjugate gradients after so many Hessian products (the last one
+checks the residual), and after a solve to rtol {rtol:g} of at most {max_steps} products:"""
 SYSTEMS = """200 unknowns, float64, eigenvalues spread evenly in log from 1 to 1 / condition number; rtol 1e-10, at most
-2000 steps. Relative error of the solution, how the solve ended, milliseconds. The residual asked for allows
-an error of 1e-10 times the condition number. `steps`: budget spent; `negative`: not positive definite,
-named; `approx`: never iterated to a tolerance. `nystrom`: rank 40, half of the smallest eigenvalue as its
-shift."""
+2000 steps. Relative error of the solution, status, milliseconds. This rtol allows an error of 1e-10 times the
+condition number. `steps`: no steps left; `negative`: reported as not positive definite; `approx`: not iterated to a
+tolerance. `nystrom`: rank 40, with half of the smallest eigenvalue as its shift."""
 COSTS = """`detector=tiny`, 64 images of 96 px, cached features, float32: medians of 7, in gradients of the same
-images, each timed beside its gradient. The default keeps the graph (`solver.retain_graph`), which costs one
-gradient with its graph once a step, and the memory of all curvature images."""
+images, timed alternately. The default keeps the graph (`solver.retain_graph`), at the cost of one gradient
+with its graph per outer step, and of the memory of all curvature images."""
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -40,8 +39,8 @@ def report(found: Mapping[str, Any]) -> str:
     machine, rows = found["machine"], found["hypergradients"]
     parts = [
         "    python benchmarks/solvers.py",
-        f"One thread, {machine['processor']}, torch {machine['torch']}; timings are the process's own.",
-        "### The hypergradient against the oracle and against retraining",
+        f"One thread, {machine['processor']}, torch {machine['torch']}; times are processor times.",
+        "### The hypergradient against a dense solve and against retraining",
         ORACLE,
         _oracle_table(rows),
         BUDGET.format(**found["default"]),
@@ -95,8 +94,8 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> str:
         if row["default_error"] < 1e-2
     ]
     missed = [f"{row['lambda']:.3g} ({row['condition']:.3g})" for row in rows if row["default_error"] >= 1e-2]
-    text = f"That solve is below 1e-2 within its products at lambda {', '.join(reached) or '(none)'}"
-    return text + (f", and not at {', '.join(missed)}, where its status says so." if missed else ".")
+    text = f"That solve has an error below 1e-2 at lambda {', '.join(reached) or '(none)'}"
+    return text + (f", but not at {', '.join(missed)}, which its status reports." if missed else ".")
 
 
 def _system_table(rows: Sequence[Mapping[str, Any]], indefinite: bool) -> str:

@@ -25,16 +25,16 @@ products and every one of {per_bin} probes a bin scored in every step (few probe
 |---|---|
 {errors}
 
-The response: the same training again, {part:.0%} of an object's images drawn from one bin instead, all other random
-numbers the same. Correlation over the bins of the change in validation loss with what each derivative foretells, means
-over {seeds} seeds (in brackets: seed by seed); then the response for one foretold, 1 where its size is right:
+The response: the training repeated with {part:.0%} of an object's images drawn from one bin instead, under the same
+random numbers. Correlation over the bins of the change in validation loss with its prediction by each derivative, means
+over {seeds} seeds (in brackets: seed by seed); then the slope of the response by its prediction, 1 for the right size:
 
 {responses}
 """
 
 
 def centred(values: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
-    """What all bins share moves nothing."""
+    """Values minus their mean: an offset common to all bins has no effect."""
     return values - values.mean()
 
 
@@ -43,10 +43,10 @@ def correlation(one: Tensor, other: Tensor) -> float:
     return float(one @ other / (one.norm() * other.norm()))
 
 
-def slope_of(response: Tensor, foretold: Tensor) -> float:
-    """The response for one foretold, by least squares."""
-    told = centred(foretold)
-    return float(centred(response) @ told / told.square().sum())
+def slope_of(response: Tensor, predicted: Tensor) -> float:
+    """Least-squares slope of the response by its prediction."""
+    x = centred(predicted)
+    return float(centred(response) @ x / x.square().sum())
 
 
 def table(found: dict[str, dict[str, Any]]) -> str:

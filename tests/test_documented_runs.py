@@ -98,7 +98,7 @@ def _run_what_is_compared(runs, experiments):
 
 
 def _run(folder, config):
-    """README, What a run leaves."""
+    """README.md, Use: the files of a run."""
     results = json.loads((folder / "results.json").read_text())
     assert set(results["ap"]) == {"ns", "learned", "matched"}
     assert (results["experiment"], results["seed"]) == (config["name"], config["seed"])
@@ -131,7 +131,7 @@ def _comparison(folder, config):
         assert held["methods"][0] == config["compare"]["reference"] and len(held["methods"]) > 1
         assert (folder / "figures" / f"{setting.replace(', ', '_')}.png").stat().st_size > 5000
         assert all(f"\n| {method} |" in text for method in held["methods"])
-    assert "of the gap won back" in text
+    assert "of the gap closed" in text
 
 
 def _interpolation(folder, config):

@@ -105,4 +105,4 @@ def test_the_comparison_reads_the_sweep_back(folder):
     assert comparison["methods"][0] == "neural_sim" and {"lts", "auto_sim"} <= set(comparison["methods"])
     assert {run["run"].split()[0] for run in document["left_out"]} == {"ns", "oracle"}
     assert (folder / "compare" / "figures" / "pose.png").stat().st_size > 5000
-    assert "of the gap won back" in (folder / "compare" / "compare.md").read_text()
+    assert "of the gap closed" in (folder / "compare" / "compare.md").read_text()

@@ -1,4 +1,4 @@
-"""Cameras on the object's orbit, and the rays of their pixels. OpenGL axes: x right, y up, view along -z."""
+"""Pinhole cameras, poses on an orbit about the object, and pixel rays. OpenGL axes: x right, y up, view along -z."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def orbit(
 
     The object stands upright along world +z. ``phi`` goes once round the great circle through the poles: 0 above,
     pi/2 beside (world +x), pi below, 3 pi/2 on the other side (world -x). ``rho`` turns that circle about the
-    vertical axis. Angles in radians; positions are in object radii, distance in the unit of ``radius``, the object's
-    (its own radius by default). The up vector is carried along the circle (it is
-    the derivative of position by -phi), so nothing is singular at the poles, where a world-up ``look_at`` is.
+    vertical axis. Angles are in radians, positions in object radii; ``distance`` has the unit of ``radius``, the
+    object's radius (by default, object radii). The up vector is the derivative of the position by -phi, so nothing is
+    singular at the poles, where a ``look_at`` with world up is.
     """
     sin_phi, cos_phi, sin_rho, cos_rho = phi.sin(), phi.cos(), rho.sin(), rho.cos()
     backward = torch.stack([sin_phi * cos_rho, sin_phi * sin_rho, cos_phi], -1)
@@ -54,8 +54,10 @@ def opencv_camera(
 ) -> PinholeCamera:
     """The camera of an OpenCV camera matrix, in pixels.
 
-    OpenCV's origin is the centre of the upper left pixel, so that ``cx`` of a centred camera is (width - 1) / 2, which
-    None stands for. Raises ``ValueError`` for sizes or focal lengths that are not positive and finite.
+    OpenCV's origin is the centre of the upper left pixel: ``cx`` of a centred camera is (width - 1) / 2, the default.
+
+    Raises:
+        ValueError: sizes or focal lengths that are not positive and finite.
     """
     if not (0.0 < fx < math.inf and 0.0 < fy < math.inf):
         raise ValueError(f"camera: fx and fy must be positive and finite, got {fx} and {fy}")
@@ -66,7 +68,7 @@ def opencv_camera(
 
 
 def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    """The camera whose images are this one's, stretched to another size."""
+    """The camera of this one's images resized to another width and height."""
     x, y = principal_point(camera)
     (fx, fy), across, down = focal_lengths(camera), width / camera.width, height / camera.height
     centre = None if camera.centre is None else (across * x, down * y)
@@ -84,8 +86,8 @@ def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
 def cameras_of(
     camera: PinholeCamera, magnification: Float[Tensor, "n"] | None
 ) -> list[tuple[PinholeCamera, slice]]:
-    """Cameras and the images each takes: one takes all, but every focal length (in units of the camera's own) is a
-    camera of its own."""
+    """Cameras and the images of each: one camera for all images, or one for each focal length (``magnification``, in
+    units of the camera's)."""
     if magnification is None:
         return [(camera, slice(None))]
     return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(magnification.tolist())]
@@ -99,9 +101,9 @@ def pixel_rays(
 ) -> Rays:
     """Rays (*m, rays, 3) through the centres of the pixels with the given flat indices into [views, height, width].
 
-    Row 0 is the top of the image. Linear in the poses, and differentiable in the views' focal lengths in units of the
-    camera's own. Values and derivatives are of one arithmetic: a sample that lands in another cell has another
-    derivative.
+    Row 0 is the top of the image. Rays are linear in the poses and differentiable by ``magnification``, the views'
+    focal lengths in units of the camera's. All callers share this arithmetic: a rounding error that moves a sample to
+    another cell changes its derivative.
     """
     per_view, (fx, fy), (cx, cy) = (
         camera.height * camera.width,
@@ -132,10 +134,10 @@ def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Ray
 def ray_rates(
     camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
 ) -> Rays:
-    """Rates (*m, rays, 3) of these pixels' rays where the camera-to-world matrices move at ``rates``.
+    """Derivatives (*m, rays, 3) of these pixels' rays for derivatives ``rates`` of the camera-to-world matrices.
 
-    Directions stay of unit length: what a rate has along them is taken out (rounding for a camera that turns; for one
-    whose focal length changes it is the derivative of the normalisation).
+    Directions stay of unit length: the component along them is removed (for a rotating camera it is rounding error, for
+    a changing focal length the derivative of the normalisation).
     """
     moved = pixel_rays(camera, rates, pixel)
     along = (moved.directions * rays.directions).sum(-1, keepdim=True)
@@ -145,9 +147,9 @@ def ray_rates(
 def unit_sphere_span(
     bundle: Rays, radius: float = 1.0
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
-    """Entry and exit distances of the sphere about the origin; entry >= exit where a ray misses it.
+    """Distances along unit-length rays at which they enter and leave the sphere about the origin.
 
-    A camera inside the sphere enters at distance 0.
+    Entry >= exit where a ray misses it; entry is 0 for an origin inside.
     """
     along = -(bundle.origins * bundle.directions).sum(-1)
     closest = bundle.origins + along[..., None] * bundle.directions

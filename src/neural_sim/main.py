@@ -139,16 +139,16 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     from neural_sim.parameter.product import SceneDistribution
 
     try:
-        made = SceneDistribution.of(parameters.values(), parts["unlearned"])
+        distribution = SceneDistribution.of(parameters.values(), parts["unlearned"])
     except ValueError as error:
         raise UserError(_first_line(error)) from error
     rig = parts["views"].rig
-    if made.lights and (rig is None or rig.anchors != made.lights):
+    if distribution.lights and (rig is None or rig.anchors != distribution.lights):
         lights = "one fixed light" if rig is None else f"{rig.anchors} anchor lights"
         raise UserError(
-            f"parameter.illumination: want renderer=nerf_w with {made.lights} anchors, got {lights}"
+            f"parameter.illumination: want renderer=nerf_w with {distribution.lights} anchors, got {lights}"
         )
-    return made
+    return distribution
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:

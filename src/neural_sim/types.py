@@ -157,6 +157,6 @@ class SceneDraw:
         return self.phi.shape[0]
 
     def select(self, index: Tensor | slice) -> SceneDraw:
-        held = {f.name: getattr(self, f.name) for f in fields(SceneDraw) if f.name != "radius"}
-        chosen = {name: value[index] for name, value in held.items() if value is not None}
+        values = {f.name: getattr(self, f.name) for f in fields(SceneDraw) if f.name != "radius"}
+        chosen = {name: value[index] for name, value in values.items() if value is not None}
         return SceneDraw(**chosen, radius=self.radius)

@@ -203,7 +203,7 @@ def test_steps_that_were_not_trusted_are_counted():
     assert untrusted(records) == {
         "steps": 8, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
         "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1},
-        "judged": 0, "undone": 0, "cosines": [0.9, 0.1],
+        "judged": 0, "rejected": 0, "cosines": [0.9, 0.1],
     }  # fmt: skip
     assert untrusted([])["untrusted"] == 0
 

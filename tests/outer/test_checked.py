@@ -87,7 +87,7 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
     verdicts = steps.judge(scored(0.1, 0.1))
     # The score is linear in p: the promise is its change, exactly but for the floor under p.
     for i, name in enumerate(NAMES):
-        assert verdicts[name].promised == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
+        assert verdicts[name].expected_gain == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
 
 
 def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():
@@ -98,13 +98,13 @@ def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorte
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     verdicts = steps.judge(scored(0.6, 0.45, 0.5))
     assert verdicts["a"].accepted and not verdicts["b"].accepted
-    assert verdicts["b"].came == pytest.approx(-0.05)
+    assert verdicts["b"].measured_gain == pytest.approx(-0.05)
     assert torch.equal(steps.reported, torch.stack([tried[0], psi[1]]))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
     # The next step of b sets out from where it was, and is judged against its score there.
     again, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert float(variation(POSE, again, psi)[1]) == pytest.approx(0.2, abs=1e-6)
-    assert steps.judge(scored(0.7, 0.52, 0.5))["b"].came == pytest.approx(0.02)
+    assert steps.judge(scored(0.7, 0.52, 0.5))["b"].measured_gain == pytest.approx(0.02)
 
 
 def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
@@ -131,10 +131,10 @@ def test_a_rise_within_the_error_of_its_images_is_not_believed():
         proposed(steps, gradient, torch.full_like(gradient, 1e-4))
         verdict = steps.judge(noise + rise / 50)["a"]
         assert verdict.accepted == kept
-        assert verdict.error == pytest.approx(error) and verdict.came == pytest.approx(rise)
+        assert verdict.error == pytest.approx(error) and verdict.measured_gain == pytest.approx(rise)
 
 
-def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_undone():
+def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], steps.accepted)

@@ -91,7 +91,7 @@ def test_its_loop_climbs_to_the_best_bins(scene):
     p = scene.distribution.probabilities(learned.last)["pose"]
     assert p.argmax(1).tolist() == [2, 1] and float(p.amax(1).min()) > 0.9
     assert all(
-        v.accepted for record in learned.records for v in record.verdicts.values() if v.promised > 1e-3
+        v.accepted for record in learned.records for v in record.verdicts.values() if v.expected_gain > 1e-3
     )
     assert learned.records[0].certificate.solver_status == "MEASURED"
 

@@ -21,7 +21,8 @@ def results():
     record = {
         "probabilities": {"pose": uniform.tolist()}, "entropies": {"pose": [1.0, 1.0]}, "gradient_norms": [0.1, 0.2],
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
-        "scores": [0.4, 0.2], "verdicts": {"a": {"accepted": False, "promised": 0.1, "came": -0.01, "error": 0.02}},
+        "scores": [0.4, 0.2],
+        "verdicts": {"a": {"accepted": False, "expected_gain": 0.1, "measured_gain": -0.01, "error": 0.02}},
         "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9, "cpu_seconds": 0.4,
         "certificate": {
             "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
@@ -67,7 +68,9 @@ def test_bins_that_look_the_same_are_drawn_as_one():
 
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
-    trust = "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; undone by the next training 2 of 2; "
+    trust = (
+        "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected by the next training 2 of 2; "
+    )
     trust += "cosine with what outer.certify measured 0.90, 0.90"
     images = ("validation images, learned: 25.0", "without a box: 6")
     for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", *images, trust):

@@ -111,11 +111,7 @@ class BayesOpt:
 
 class _Bayes(Incumbent):
     def __init__(
-        self,
-        reach: float,
-        study: Any,
-        psi: Float[Tensor, "objects K"],
-        distribution: SceneDistribution,
+        self, reach: float, study: Any, psi: Float[Tensor, "objects K"], distribution: SceneDistribution
     ) -> None:
         super().__init__(psi)
         self._study, self._distribution = study, distribution

@@ -1,9 +1,8 @@
-"""A smooth average precision: what the psi loop differentiates in the place of the validation loss.
+"""A smooth average precision, which the psi loop differentiates in the place of the validation loss.
 
-The detections are those of the forward pass, after non-maximum suppression; which anchors they come from is fixed,
-their scores and boxes are differentiated. Two steps of COCO's definition are made smooth. A detection is a true
-positive by a sigmoid of its overlap, not by a threshold. And it ranks below another by a sigmoid of the difference of
-their logits (Brown et al. 2020, Smooth-AP, Eq. 6), not by which is larger.
+The detections are those of the forward pass, after non-maximum suppression. Their anchors are fixed; their scores and
+boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true positive (of its
+overlap), and whether it ranks below another one (of the difference of logits; Brown et al. 2020, Smooth-AP, Eq. 6).
 """
 
 from __future__ import annotations
@@ -18,15 +17,16 @@ from neural_sim.detector.protocol import Detector, Outputs
 from neural_sim.types import LabelledImages
 
 THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
-"""COCO's overlaps, over which AP is averaged."""
+"""COCO's thresholds of intersection over union, over which AP is averaged."""
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """One class's detections in all images and the boxes nearest to them, image by image, the best of an image first.
+    """One class's detections in all images, and the nearest box of each; image by image, in order of falling score.
 
-    ``overlaps`` are with the nearest box of the class in the image, 0 where there is none. ``image`` numbers the image
-    of each, ``box`` its nearest box among all of the class, -1 for none. ``boxes`` is how many boxes the class has.
+    ``overlaps`` (intersection over union) are with the nearest box of the class in the image, 0 without one. ``image``
+    is each detection's image, ``box`` the number of that box among all, -1 for none. ``boxes`` counts the class's
+    boxes.
     """
 
     logits: Float[Tensor, "m"]
@@ -41,11 +41,11 @@ class SmoothAP:
     """Settings of the smooth AP.
 
     Args:
-        temperature: width of the sigmoid of a rank, in logits; the AP itself is the limit at 0.
-        width: width of the sigmoid of a true positive, in overlap; the AP itself is the limit at 0.
-        per_class: the best detections of an image that count for each class.
-        loss: weight of the training loss beside the AP. The AP of a class without true positives is zero for any
-            small change of psi; only its loss has a gradient.
+        temperature: width of the ranks' sigmoid, in logits; AP is the limit at 0.
+        width: width of the true positives' sigmoid, in intersection over union; AP is the limit at 0.
+        per_class: number of an image's best detections that count for each class.
+        loss: weight of the training loss that is added. The AP of a class without true positives has no gradient; its
+            loss has.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -68,7 +68,7 @@ class SmoothAP:
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
     ) -> Float[Tensor, "classes images"]:
-        """What each image adds to every class's AP, which is the sum of a row; nan for a class without boxes."""
+        """Each image's contribution to every class's AP, the sum of a row; nan for a class without boxes."""
         rows = []
         for detections in ranked(detector, outputs, images, self.per_class):
             row = detections.logits.new_zeros(len(images))
@@ -80,31 +80,31 @@ class SmoothAP:
         return torch.stack(rows)
 
     def of_class(self, detections: Ranked) -> Float[Tensor, "m"]:
-        """What each detection adds to one class's AP, the mean over :data:`THRESHOLDS`.
+        """Each detection's contribution to one class's AP, the mean over :data:`THRESHOLDS`.
 
         Raises:
-            ValueError: for a class without boxes, whose AP does not exist.
+            ValueError: a class without boxes, whose AP is not defined.
         """
         if detections.boxes == 0:
             raise ValueError("smooth_ap: want at least one box of the class")
         true = self.true_positives(detections)
-        candidates = (detections.box >= 0).nonzero().flatten()  # only they can be true
+        candidates = (detections.box >= 0).nonzero().flatten()  # only these can be true positives
         above = torch.sigmoid((detections.logits - detections.logits[candidates, None]) / self.temperature)
-        # A detection ranks above itself by a half; in full it is 1.
+        # The sigmoid counts half of a detection in its own rank; it counts as 1.
         above = above + 0.5 * (candidates[:, None] == torch.arange(len(detections.box), device=above.device))
         precision = (above @ true) / above.sum(1, keepdim=True)
         added = (true[candidates] * precision).mean(1) / detections.boxes
         return torch.zeros_like(detections.logits).index_add(0, candidates, added)
 
     def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
-        """How far each detection is a true positive, at each overlap: as far as it overlaps its box, and as far as no
-        better detection of the same box is one. Those of a box sum to at most 1."""
+        """Degree in [0, 1] to which each detection is a true positive, at each threshold: that of its overlap, times
+        that to which no better detection of the same box is one. The degrees of a box sum to at most 1."""
         levels = detections.overlaps.new_tensor(THRESHOLDS)
         matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)
         matched = torch.where((detections.box >= 0)[:, None], matched, 0.0)
         unclaimed = torch.ones_like(matched)
         for back in range(1, self.per_class):
-            # The detection ``back`` places before, if it is in the same image and at the same box.
+            # The detection ``back`` places before, if it has the same box (of the same image).
             before, box = matched.roll(back, 0), detections.box
             same = (box == box.roll(back)) & (box >= 0)
             same = same & (torch.arange(len(same), device=same.device) >= back)
@@ -118,18 +118,18 @@ def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_cla
     labels, boxes = images.labels.to(best.image.device), images.boxes.to(best.boxes)
     classes = []
     for number in range(outputs[0].shape[-1]):
-        own, present = best.label == number, labels == number
-        image = best.image[own]
-        overlaps, which = nearest_box(best.boxes[own], boxes[image], present[image])
+        of_class, present = best.label == number, labels == number
+        image = best.image[of_class]
+        overlaps, which = nearest_box(best.boxes[of_class], boxes[image], present[image])
         box = torch.where(which >= 0, image * labels.shape[1] + which, -1)
-        classes.append(Ranked(best.logits[own], overlaps, image, box, int(present.sum())))
+        classes.append(Ranked(best.logits[of_class], overlaps, image, box, int(present.sum())))
     return classes
 
 
 def nearest_box(
     boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
 ) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """The largest overlap of each detection with a box of its image, and which box; 0 and -1 where there is none."""
+    """Each detection's largest intersection over union with a box of its image, and that box; 0 and -1 without one."""
     if truth.shape[1] == 0:
         return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
     overlaps = torch.where(present, overlap(boxes[:, None], truth), 0.0)

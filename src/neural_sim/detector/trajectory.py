@@ -23,8 +23,9 @@ class Recording:
 
     Args:
         part: fraction of the steps, the last ones, that can be reversed.
-        max_memory_mb: limit of the record. It has the states of every sqrt(steps)-th step and all gradients; states in
-            between are recomputed elementwise. Gradients that do not fit are recomputed, which costs one more training.
+        max_memory_mb: limit in MB. The record has the states of every sqrt(steps)-th step and all gradients; the states
+            in between are recomputed elementwise. If the gradients do not fit, they are recomputed, at the cost of one
+            more training.
 
     Raises:
         ValueError: either of these out of its range.
@@ -47,7 +48,7 @@ class Recording:
         """Whether the gradients of all recorded steps fit beside the states.
 
         Raises:
-            ValueError: where not even the states fit, with what they take.
+            ValueError: not even the states fit.
         """
         count = steps - self.first(steps)
         length = segment_length(count)
@@ -63,11 +64,11 @@ class Recording:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A training that was run. Vectors are flat, in the order of the learned parameters.
+    """A recorded training. Vectors are flat, in the order of the learned parameters.
 
-    ``rows`` are those of each step's batch in the training set, whose mean loss (and proximal term) the step's gradient
-    was of; ``rates`` the learning rates. ``checkpoints`` are the states before some steps, ``gradients`` those of
-    all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
+    ``rows`` are each step's batch, as rows of the training set; the step's gradient is that of the batch's mean loss
+    (and proximal term). ``rates`` are the learning rates. ``checkpoints`` are the states before some steps,
+    ``gradients`` those of all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
     """
 
     rule: Rule
@@ -116,7 +117,7 @@ class Trajectory:
 
 
 def segment_length(steps: int) -> int:
-    """Steps between recorded states that minimise the number of recorded states plus those of one segment."""
+    """Steps between checkpoints for which the checkpoints and one segment's states take the least memory together."""
     return max(1, math.isqrt(max(0, steps - 1)) + 1)
 
 
@@ -130,7 +131,7 @@ class Recorder:
         theta: the parameters, for their size and type.
 
     Raises:
-        ValueError: where the states do not fit ``recording.max_memory_mb``.
+        ValueError: the states do not fit ``recording.max_memory_mb``.
     """
 
     def __init__(self, recording: Recording, rule: Rule, steps: int, theta: Float[Tensor, "n"]) -> None:
@@ -148,7 +149,7 @@ class Recorder:
             )
 
     def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
-        """Record a step before it is taken. ``state`` and ``gradient`` return copies, and are called if needed."""
+        """Record a step before it is taken. ``state`` and ``gradient`` return copies and are called only if needed."""
         number = len(self._rates)
         self._rates.append(rate)
         if number < self._first:
@@ -159,7 +160,7 @@ class Recorder:
             self._gradients[number] = gradient()
 
     def trajectory(self, rows: tuple[Int[Tensor, "batch"], ...], end: Float[Tensor, "n"]) -> Trajectory:
-        """What was recorded, of batches with these rows; ``end`` is theta after the last step."""
+        """The recorded training, of these batches; ``end`` is theta after the last step."""
         return Trajectory(self.rule, rows, tuple(self._rates), self._checkpoints, self._gradients, end)
 
 
@@ -171,7 +172,7 @@ def train(
     gradient_at: GradientAt,
     recording: Recording = Recording(),
 ) -> Trajectory:
-    """The training of these batches and learning rates from ``theta``, recorded, without a Trainer."""
+    """Train from ``theta`` on these batches with these learning rates, without a Trainer, and record it."""
     recorder = Recorder(recording, rule, len(rows), theta)
     state = rule.begin(theta)
     for done, (batch, rate) in enumerate(zip(rows, rates, strict=True)):

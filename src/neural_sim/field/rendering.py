@@ -39,11 +39,7 @@ def render_packed(
 
 @torch.no_grad()
 def render_with_tangents(
-    field: RadianceField,
-    rays: Rays,
-    rates: Rays,
-    termination: float,
-    samples_at_once: int = SAMPLES_AT_ONCE,
+    field: RadianceField, rays: Rays, rates: Rays, termination: float, samples_at_once: int = SAMPLES_AT_ONCE
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
     """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
 

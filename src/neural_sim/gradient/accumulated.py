@@ -20,10 +20,9 @@ from neural_sim.gradient.unrolled import Examples, InputsOf, Product, ReversedSt
 class Accumulated:
     """Sums over the reversed steps; a_t is that of :mod:`gradient.unrolled`.
 
-    ``images`` [N]: the derivative of L_val by each training image's weight, 1 in the means of its batches.
-    ``inputs``: the derivative by the training images' inputs, which ``inputs_of`` computes. Both are empty unless
-    wanted.
-    ``probes`` [m]: every probe's score, estimated from the steps that scored it; the mean over the probes of a bin is
+    ``images`` [N]: derivatives of L_val by the training images' weights (1 in the means of its batches).
+    ``inputs``: derivatives by the training images' inputs, which ``inputs_of`` computes. Both are empty unless wanted.
+    ``probes`` [m]: every probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
     unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group.
     ``scored`` counts the scored pairs of a probe and a step.
     """
@@ -37,25 +36,25 @@ class Accumulated:
     def cotangents(
         self, leaves: tuple[Tensor, ...], index: Int[Tensor, "n"], chunk_size: int = 16
     ) -> tuple[Tensor, ...]:
-        """The derivative of L_val by images, and by boxes where they move, pulled back from that by the inputs.
+        """Derivatives of L_val by images, and by boxes where they move: the vector-Jacobian product of ``inputs_of``.
 
-        ``leaves`` are those of the rows ``index``, at most ``chunk_size`` of them in memory at a time.
+        ``leaves`` are these images and boxes, of the rows ``index``; ``chunk_size`` rows are differentiated at a time.
 
         Raises:
-            ValueError: where no derivative by the inputs was accumulated.
+            ValueError: no derivatives by the inputs were accumulated.
         """
         if not self.inputs or self.inputs_of is None:
             raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
         parts = []
         chunks = zip(index.split(chunk_size), *(leaf.split(chunk_size) for leaf in leaves), strict=True)
         for rows, *chunk in chunks:
-            there = rows.to(self.inputs[0].device)
+            rows = rows.to(self.inputs[0].device)
             chunk_leaves = tuple(part.detach().requires_grad_() for part in chunk)
             with torch.enable_grad():
-                inputs = self.inputs_of(chunk_leaves, there)
-            # The input of a frozen label depends on no image.
+                inputs = self.inputs_of(chunk_leaves, rows)
+            # Targets of fixed boxes depend on no image.
             moved = [
-                (x, pulled[there]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
+                (x, pulled[rows]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
             ]
             values, pulled = zip(*moved, strict=True)
             parts.append(torch.autograd.grad(values, chunk_leaves, pulled, materialize_grads=True))
@@ -67,7 +66,7 @@ class ProbeGroups:
     """The probes, of which each step scores a sample.
 
     Each group is a table [strata, per_bin] of rows of ``losses``: one object's images of one factor's bins, or of the
-    same scenes (columns) under its lights. All groups have the same number of columns.
+    same scenes (columns) under each light. All groups have the same number of columns.
     """
 
     losses: IndexedLoss
@@ -91,14 +90,15 @@ class ProbeGroups:
 
 @dataclass(frozen=True)
 class Unrolled:
-    """How the training's derivative is taken.
+    """Settings of the derivative through a training.
 
     Args:
-        product: of a batch's Hessian with a vector, see :func:`gradient.unrolled.reversed_steps`.
+        product: how a batch's Hessian is multiplied, see :func:`gradient.unrolled.reversed_steps`.
         part: fraction of the steps, the last ones, that are reversed; 1 is exact.
-        max_memory_mb: limit for the recorded training, see :class:`detector.trajectory.Recording`.
+        max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
         probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them.
-        score_every: length of the blocks of steps of which one, drawn at random, scores probes for all.
+        score_every: length of a block of steps; one step of each block, drawn at random, scores probes with the block's
+            weight.
         chunk_size: probes whose losses are computed at a time.
 
     Raises:
@@ -118,11 +118,11 @@ class Unrolled:
         for key, least in (("probes_per_step", 0), ("score_every", 1), ("chunk_size", 1)):
             if getattr(self, key) < least:
                 raise ValueError(f"unrolled.{key} must be at least {least}, got {getattr(self, key)}")
-        _ = self.recording  # refuses what is out of its own range
+        _ = self.recording  # raises for part and max_memory_mb
 
     @property
     def recording(self) -> Recording:
-        """What a training must record."""
+        """What a training must record for it."""
         return Recording(self.part, self.max_memory_mb)
 
     def accumulate(
@@ -167,7 +167,7 @@ class _Scoring:
         self._levels: list[Tensor] = []
 
     def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: int) -> None:
-        """Add one step's scores of the probes in some columns, scaled up to all columns and ``weight`` steps."""
+        """Add one step's scores of the probes in some columns, scaled to all columns and ``weight`` steps."""
         columns = chosen.to(self.total.device)
         rows = [table[:, columns].reshape(-1) for table in self.tables]
         along = scores(
@@ -176,8 +176,8 @@ class _Scoring:
         parts = along.split([part.numel() for part in rows])
         means = [part.mean() for part in parts]
         scale = weight * self.per_bin / len(columns)
-        # A common offset moves nothing, but is noise where probes are scored unequally often. It is estimated from the
-        # step before: the mean of these same scores would correlate with their noise.
+        # An offset common to a group has no effect, but adds noise where probes are scored unequally often. It is
+        # subtracted as estimated at the step before: the mean of these same scores would correlate with their noise.
         for into, part, level in zip(rows, parts, self._levels or means, strict=True):
             self.total.index_add_(0, into, scale * (part - level))
         self._levels, self.scored = means, self.scored + len(along)
@@ -187,12 +187,12 @@ def probe_columns(
     columns: int, per_step: int, generator: torch.Generator
 ) -> Iterator[Int[Tensor, "per_step"]]:
     """``per_step`` columns at a time from shuffled passes over all: each is equally likely in every batch."""
-    left = torch.zeros(0, dtype=torch.long)
+    remaining = torch.zeros(0, dtype=torch.long)
     while True:
-        while len(left) < per_step:
-            left = torch.cat([left, torch.randperm(columns, generator=generator)])
-        yield left[:per_step]
-        left = left[per_step:]
+        while len(remaining) < per_step:
+            remaining = torch.cat([remaining, torch.randperm(columns, generator=generator)])
+        yield remaining[:per_step]
+        remaining = remaining[per_step:]
 
 
 def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""The estimators as configured: which images each draws, and how it estimates the derivative from them."""
+"""Estimators of the derivative by psi: the images that each draws, and its estimate from them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from neural_sim.synthesis.draws import Draws, HardDraws
 
 
 class Estimator(Protocol):
-    """How psi's derivative is estimated from images.
+    """An estimator of the derivative by psi from images.
 
-    ``draws`` says how an iteration's images are drawn. ``probes_per_bin`` is the number of further images of every
-    stratum of every factor (0: none). ``wanted`` is what :meth:`accumulated` reads of the sums over a training's steps.
+    ``draws`` is how an iteration's images are drawn, ``probes_per_bin`` the number of further images of every stratum
+    of every factor (0: none), ``wanted`` what :meth:`accumulated` reads of the sums over a training's steps.
     """
 
     wanted: ClassVar[Wanted]
@@ -44,7 +44,11 @@ class Estimator(Protocol):
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign; ``probes`` by factor."""
+        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign of Eq. 2.
+
+        ``losses`` are those of ``images`` and ``probes``, as functions of ``params``; ``vector`` is v; ``probes`` are
+        by factor.
+        """
         ...
 
     def accumulated(
@@ -89,11 +93,8 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
-
-        The null of its significance is that a factor's bins, or lights, have the same mean score, for which the value
-        is zero.
-        """
+        """See :class:`Estimator`. Null hypothesis of its p-values: a factor's bins, or lights, have equal mean scores,
+        so that the derivative is zero."""
         scored = losses.probes
         if scored is None:
             raise ValueError("stratified: wants losses of probes, got none")
@@ -106,7 +107,6 @@ class StratifiedEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
         return self._over_strata(lambda index: sums.probes[index.to(sums.probes.device)], images, probes)
 
     def _over_strata(
@@ -119,10 +119,10 @@ class StratifiedEstimator:
             )
         weight, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
         for factor in distribution.factors:
-            own = probes[factor.name]
-            along = scored(own.index).to(images.psi)
-            parts[factor.name] = by_strata(along, own.bins, factor, psi[factor.name], weight)
-            p_values[factor.name] = _equal_means(along, own.bins, factor)
+            strata = probes[factor.name]
+            along = scored(strata.index).to(images.psi)
+            parts[factor.name] = by_strata(along, strata.bins, factor, psi[factor.name], weight)
+            p_values[factor.name] = _equal_means(along, strata.bins, factor)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
@@ -155,10 +155,8 @@ class ReinforceEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
-
-        The null of its significance is that scores do not depend on the bins, or lights, that a factor drew.
-        """
+        """See :class:`Estimator`. Null hypothesis of its p-values: scores do not depend on the bins, or lights, that a
+        factor drew."""
         return self._by_score_function(
             scores(losses.cached, params, vector, images.index, self.chunk_size), images
         )
@@ -166,7 +164,6 @@ class ReinforceEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
         by_weight = sums.images[images.index.to(sums.images.device)]
         return self._by_score_function(by_weight / images.weights.to(by_weight), images)
 

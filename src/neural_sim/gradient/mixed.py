@@ -107,11 +107,7 @@ def _differenced_scores(losses, params: Params, vector: Params) -> Float[Tensor,
     return (losses(above) - losses(below)) * (0.5 / length)
 
 
-_ALONG = {
-    "forward": _forward_scores,
-    "reverse": _reverse_scores,
-    "central_difference": _differenced_scores,
-}
+_ALONG = {"forward": _forward_scores, "reverse": _reverse_scores, "central_difference": _differenced_scores}
 
 
 def _device(params: Params) -> torch.device:

@@ -107,10 +107,11 @@ class PathwiseEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
+        """See :class:`~neural_sim.gradient.estimators.Estimator`. Tangents of the first render are used in either mode;
+        p-values are those of :func:`significance.zero_mean` for the groups' contributions.
 
-        Tangents that came with the images are used whatever the mode. The significance is that of
-        :func:`significance.zero_mean` for the groups' contributions. Raises ``ValueError`` for images without a path.
+        Raises:
+            ValueError: images without a path.
         """
         path = _path(images)
         cotangents = input_cotangents(
@@ -122,10 +123,6 @@ class PathwiseEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """``dL_val/dpsi`` of one object through the training that was run, sign included.
-
-        Raises ``ValueError`` for images without a path.
-        """
         path = _path(images)
         cotangents = sums.cotangents(_inputs(images, path), images.index, self.chunk_size)
         return self._through_images(path, cotangents, images)
@@ -138,7 +135,7 @@ class PathwiseEstimator:
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
             # The first render computes derivatives by lights in any mode, those by the camera in forward mode only.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
-        # From here on a few numbers an image, on the CPU as psi and the draws are.
+        # From here on a few numbers per image, on the CPU like psi and the draws.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
         sums = group_sums(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
         # An offset common to a factor's components changes neither its distribution nor its weights of lights.
@@ -183,8 +180,8 @@ def draw_cotangents(
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
     drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
-    there = moved([number.detach() for number in drawn.values()], rgb.device)
-    numbers = dict(zip(drawn, there, strict=True))
+    on_device = moved([number.detach() for number in drawn.values()], rgb.device)
+    numbers = dict(zip(drawn, on_device, strict=True))
     total = {name: torch.zeros_like(number) for name, number in numbers.items()}
     for pixels in live.split(patch_size) if len(live) else ():
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}

@@ -64,8 +64,8 @@ def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draw
         permuted = residuals[order]
         return _statistic(permuted @ drawn, permuted.square() @ squared)
 
-    own = _statistic(residuals @ drawn, residuals.square() @ squared)
-    return max(flipped, _p_value(own, changed, draws))
+    observed = _statistic(residuals @ drawn, residuals.square() @ squared)
+    return max(flipped, _p_value(observed, changed, draws))
 
 
 def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) -> float:
@@ -90,10 +90,10 @@ def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) ->
     return max(flipped, _p_value(_statistic(rows.sum(0), rows.square().sum(0)), changed, draws))
 
 
-def _p_value(own: Tensor, changed: Callable[[int, torch.Generator], Tensor], draws: int) -> float:
+def _p_value(observed: Tensor, changed: Callable[[int, torch.Generator], Tensor], draws: int) -> float:
     generator, beyond = torch.Generator().manual_seed(0), 1
     for first in range(0, draws, _BLOCK):
-        beyond += int((changed(min(_BLOCK, draws - first), generator) >= own * _TIE).sum())
+        beyond += int((changed(min(_BLOCK, draws - first), generator) >= observed * _TIE).sum())
     return beyond / (draws + 1)
 
 

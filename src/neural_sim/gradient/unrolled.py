@@ -1,14 +1,14 @@
 """The derivative of the training that was run: reverse mode through its optimiser's steps.
 
-The implicit adjoint assumes a stationary point; a dozen epochs do not reach one. With lambda_t the derivative of L_val
-by the state before step t (theta and the optimiser's moments), each step back takes
+The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of
+L_val by the state before step t (theta and the optimiser's moments), each step back takes
 
     a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
     lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
 
-H_t the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta, a_t>``:
-summed over the steps, this score replaces ``-<dl/dtheta, v>``; it already has the derivative's sign (Baydin and
-Pearlmutter 2014; Maclaurin et al. 2015, with states stored instead of recomputed backwards).
+where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta,
+a_t>``. Summed over the steps, this score replaces ``-<dl/dtheta, v>``, the minus sign included (Baydin and Pearlmutter
+2014; Maclaurin et al. 2015, with stored states instead of states recomputed backwards).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from neural_sim.solver.operator import plain_norm
 
 Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
 Wanted = Literal["probes", "weights", "inputs"]
-"""What an estimator reads: scores of probes alone, the derivatives by the training images' weights too, or these and
-those by the images' inputs."""
+"""Sums that an estimator reads: probes' scores only, also derivatives by the training images' weights, or also those by
+the images' inputs."""
 InputsOf = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, ...]]
 
 
@@ -46,9 +46,9 @@ class LossesFrom(Protocol):
 class Examples:
     """A training's examples and their losses.
 
-    ``inputs`` [N, ...] are the inputs that losses are differentiated by where images move. The steps minimised a
-    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images, and
-    from boxes where they move, and their rows.
+    ``inputs`` [N, ...] are those by which losses are differentiated where images move. Each step's objective was its
+    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images (and
+    from boxes where they move) and their rows.
     """
 
     inputs: tuple[Tensor, ...]
@@ -71,7 +71,7 @@ class Examples:
     def gradient(
         self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]
     ) -> Float[Tensor, "n"]:
-        """Gradient of the objective of one step."""
+        """Gradient of one step's objective."""
         point = theta.detach().requires_grad_()
         with torch.enable_grad():
             loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
@@ -89,8 +89,8 @@ class Examples:
 class ReversedStep:
     """One reversed step.
 
-    ``params`` is theta before it, ``along`` a_t. ``rows`` are its batch's, ``scores`` those images' <dl/dtheta, a_t>,
-    and ``inputs`` the derivative of the mean score by those rows of the inputs; both are empty unless wanted.
+    ``params`` is theta before it, ``along`` a_t. ``rows`` is its batch, ``scores`` these images' <dl/dtheta, a_t>, and
+    ``inputs`` the derivative of the mean score by these rows of the inputs; both are empty unless wanted.
     """
 
     step: int
@@ -118,16 +118,16 @@ def reversed_steps(
     product: Product = "central_difference",
     wanted: Wanted = "weights",
 ) -> Iterator[ReversedStep]:
-    """The steps of a training from the last to the first recorded one.
+    """The steps of a training in reverse, from the last to the first recorded one.
 
-    ``like`` gives the parameters' names and shapes, ``slope`` is ``dL_val/dtheta`` after the last step. Products with a
-    batch's Hessian: ``forward_difference``, a gradient at ``theta + h a`` less the step's own, an error of relative
-    order eps^(1/2), where nothing but probes is wanted (else central ones); ``central_difference``, two gradients at
-    ``theta +- h a``, of order eps^(2/3); ``reverse_over_reverse``, exact, about three and a half gradients and the
-    memory of a second derivative.
+    ``like`` gives the parameters' names and shapes, ``slope`` is ``dL_val/dtheta`` after the last step. ``product`` is
+    how a batch's Hessian is multiplied: ``forward_difference``, the gradient at ``theta + h a`` minus the step's
+    recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as ``central_difference``);
+    ``central_difference``, two gradients at ``theta +- h a``, of relative error eps^(2/3); ``reverse_over_reverse``,
+    exact, at the time of three and a half gradients and the memory of a second derivative.
 
     Raises:
-        ValueError: for an unknown product, or a slope that is not as long as theta.
+        ValueError: an unknown product, or a slope of another length than theta.
     """
     if product not in get_args(Product):
         raise ValueError(f"unrolled.product must be one of {get_args(Product)}, got {product!r}")
@@ -137,7 +137,9 @@ def reversed_steps(
         )
     one_sided = product == "forward_difference" and wanted == "probes"
     curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
-    cotangents = list(trajectory.rule.begin(slope))  # the buffers after the last step move nothing
+    cotangents = list(
+        trajectory.rule.begin(slope)
+    )  # L_val does not depend on the buffers after the last step
     for segment in trajectory.segments():
         replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
         for step in reversed(segment):
@@ -147,8 +149,8 @@ def reversed_steps(
             )
             rows = trajectory.rows[step]
             if one_sided:
-                own = gradient - examples.proximal_gradient(state[0], like)
-                curvature = _from_one_side(examples, state[0], like, rows, along, own)
+                of_batch = gradient - examples.proximal_gradient(state[0], like)
+                curvature = _from_one_side(examples, state[0], like, rows, along, of_batch)
             else:
                 curvature = curved(examples, state[0], like, rows, along, wanted == "inputs")
             cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
@@ -165,7 +167,7 @@ def reversed_steps(
 def _doubly_reversed(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
 ) -> _Curved:
-    """<gradient, a> differentiated once more: by theta, by the images' weights and by their inputs at once."""
+    """<gradient, a> differentiated once more, by theta, the images' weights and their inputs at once."""
     point = theta.detach().requires_grad_()
     weights = theta.new_full((len(rows),), 1.0 / len(rows)).requires_grad_()
     inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
@@ -196,21 +198,21 @@ def _differenced(
 
 
 def _from_one_side(
-    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, own: Tensor
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, at_theta: Tensor
 ) -> _Curved:
-    """The difference of a gradient beside theta and the one at theta, ``own``, which training has taken already."""
-    # Eight times the root of eps: rounding and third derivatives then add about alike.
+    """Forward difference of gradients; ``at_theta``, the one at theta, is the training's."""
+    # At eight times the root of eps, rounding and third derivatives contribute about equally.
     unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
     leaf = (theta + unit).detach().requires_grad_()
     with torch.enable_grad():
         loss = examples.losses(unflatten(leaf, like), examples.of(rows), rows).mean()
     (beside,) = torch.autograd.grad(loss, leaf)
-    return _Curved((beside - own) * scale, theta.new_zeros(0), ())
+    return _Curved((beside - at_theta) * scale, theta.new_zeros(0), ())
 
 
 def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """A vector along a as long as ``reach`` times one plus theta's root mean square, and a's length by its. All stays
-    on the device; for a zero vector all differences are zero."""
+    """A vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device. For a = 0 all
+    differences are zero."""
     size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
     length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
     return (along.double() / size).to(theta) * length.to(theta), (size / length).to(theta)

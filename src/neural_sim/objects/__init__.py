@@ -1,1 +1,1 @@
-"""Meshes: procedural, YCB layout, BOP models, any folder of meshes."""
+"""Objects: procedural meshes, YCB layout, BOP models, any folder of meshes, photographs with cameras."""

@@ -19,9 +19,14 @@ DIAMETER_TOLERANCE = 0.05
 
 
 class BOP(MeshFiles):
-    """Objects of a BOP models folder, all of them or those named: 'obj_000001', '000001', '1' or 1.
+    """Objects of a BOP models folder.
 
-    Raises ``ValueError`` where the folder holds no ``obj_*.ply`` or a name is unknown.
+    Args:
+        root: the folder.
+        names: objects as 'obj_000001', '000001', '1' or 1; None: all.
+
+    Raises:
+        ValueError: no ``obj_*.ply`` in the folder, or an unknown name.
     """
 
     def __init__(self, root: str | Path, names: list[str | int] | None = None) -> None:
@@ -43,7 +48,8 @@ class BOP(MeshFiles):
     def load(self) -> list[ObjectMesh]:
         """The objects, normalised, in the order of ``names``; transforms lead to metres.
 
-        Raises ``ValueError`` where a mesh's extent contradicts the diameter in models_info.json in any unit.
+        Raises:
+            ValueError: a mesh whose extent agrees with its diameter in models_info.json in no unit.
         """
         diameters, digests = self._diameters(), self.digests()
         items = []
@@ -54,7 +60,7 @@ class BOP(MeshFiles):
         return items
 
     def _diameters(self) -> dict[str, float]:
-        """Diameters in millimetres by object number; empty, with a warning, where the folder has no such file."""
+        """Diameters in millimetres by object number, from models_info.json; empty, with a warning, without the file."""
         if not self._info.is_file():
             log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
             return {}
@@ -65,7 +71,7 @@ class BOP(MeshFiles):
             raise ValueError(f"{self._info}: want {{number: {{'diameter': mm}}}}: {error}") from error
 
     def _checked(self, item: ObjectMesh, path: Path, diameter: float | None) -> ObjectMesh:
-        """The object with its unit settled: the file's unit is millimetres or, by its diameter, metres."""
+        """The object in metres: the file's unit is the millimetre or, if the diameter says so, the metre."""
         if diameter is None:
             return item
         measured = _diameter(item) / MILLIMETRE
@@ -83,7 +89,7 @@ class BOP(MeshFiles):
 
 
 def _diameter(item: ObjectMesh) -> float:
-    """Largest distance between two vertices, in metres; over the hull's vertices, where it is attained."""
+    """Largest distance between two vertices, in metres; the convex hull's vertices attain it."""
     try:
         points = np.asarray(item.mesh.convex_hull.vertices)
     except (ValueError, RuntimeError):  # flat meshes have no hull; scipy's QhullError is a RuntimeError

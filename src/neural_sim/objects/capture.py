@@ -1,4 +1,4 @@
-"""Photographs of one object with their cameras, as a capture's files say them."""
+"""Data of a capture: photographs of one object with their cameras."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 ROTATION_TOLERANCE = 1e-3
-"""How far R R^T may be from the identity: files round to six digits, and pose optimisers drift."""
+"""Largest deviation of R R^T from the identity: files round to six digits, and pose optimisers drift."""
 WIDEST = 3.0
-"""Tangent of the largest angle off the axis that a perspective lens is asked about."""
+"""Tangent of the largest angle off the axis at which a perspective lens's distortion is examined."""
 
 
 @dataclass(frozen=True)
 class Lens:
     """A camera with OpenCV's distortion.
 
-    All in pixels, the principal point from the image's upper left corner (the first pixel's centre is (0.5, 0.5), as
-    COLMAP and nerfstudio count). With x, y on the plane at distance 1 and r its radius, x is scaled by
-    (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then moved by the ``tangential`` p1 and p2.
-    ``fisheye``: r is first replaced by the angle off the axis, and there is nothing tangential.
+    Lengths are in pixels, the principal point from the image's upper left corner (the first pixel's centre is
+    (0.5, 0.5), as in COLMAP and nerfstudio). A point (x, y) of the plane at distance 1, of radius r, is scaled by
+    (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then shifted by the ``tangential`` p1 and
+    p2. ``fisheye``: r is the angle off the axis, and there is no tangential term.
 
     Raises:
         ValueError: a size or a focal length that is not positive, or a number that is not finite.
@@ -48,10 +48,10 @@ class Lens:
             raise ValueError(f"want positive focal lengths, got {self.fx} and {self.fy}")
 
     def project(self, local: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Pixels (x, y) of points in the camera's OpenGL frame, and which of them the lens can see.
+        """Pixels (x, y) of points in the camera's OpenGL frame, and which of them are visible.
 
-        A point behind the camera is not seen, nor one so far off the axis that the distortion's polynomial has turned
-        back on itself there.
+        Points behind the camera are not visible, nor points so far off the axis that the distortion's polynomial no
+        longer increases there.
         """
         depth = -local[..., 2]
         ahead = depth > 1e-9
@@ -78,7 +78,7 @@ class Lens:
         return _polynomial(self.radial, square) / _polynomial(self.divisor, square)
 
     def _reach(self) -> float:
-        """The radius (or angle) up to which the distortion only ever moves points outwards."""
+        """The radius (or angle) up to which the distorted radius increases."""
         if not (any(self.radial) or any(self.divisor)):
             return float("inf") if not self.fisheye else 0.5 * np.pi
         at = torch.linspace(0.0, 0.5 * np.pi if self.fisheye else WIDEST, 4001, dtype=torch.float64)
@@ -96,7 +96,7 @@ def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class Frame:
     """One photograph. ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and
-    unit. ``mask`` is an image of its own; ``test`` frames are kept from training by the capture itself."""
+    unit. ``mask`` is a separate image file; ``test`` frames are the capture's own test set."""
 
     image: Path
     camera_to_world: Float[np.ndarray, "4 4"]
@@ -107,8 +107,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Capture:
-    """The photographs of an object; ``source`` is the file or folder that says their cameras, ``files`` all that was
-    read for them. ``up`` is what the source says of the world's up, None if nothing."""
+    """The photographs of an object. ``source`` is the file or folder with their cameras, ``files`` are all files that
+    were read, ``up`` is the world's up direction in the capture's frame, None if the source does not give it."""
 
     name: str
     frames: tuple[Frame, ...]
@@ -121,7 +121,7 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
     """A camera-to-world matrix of 3 or 4 rows.
 
     Raises:
-        ValueError: another shape, numbers that are none or not finite, or a rotation that is none.
+        ValueError: another shape, entries that are no finite numbers, or a matrix that is no rotation.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)

@@ -12,7 +12,7 @@ from neural_sim.objects.transforms_json import image_size
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-# Which of a model's parameters are what: focal lengths and principal point, radial, tangential, divisor.
+# Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -27,7 +27,7 @@ PARAMETERS: dict[str, str] = {
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a capture's sparse model lies, None if nowhere."""
+    """Folder of a capture's sparse model, None without one."""
     for place in MODELS:
         if any((folder / place / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
             return folder / place
@@ -38,8 +38,8 @@ def read_colmap(folder: Path, name: str) -> Capture:
     """The capture of a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images``.
 
     Raises:
-        ValueError: a model that pycolmap cannot read (as one of another version), one without posed images, a camera
-            model that is not known, an image that is missing or of another size than its camera says.
+        ValueError: a model that pycolmap cannot read (such as one of another version) or without posed images, an
+            unknown camera model, an image that is missing or whose size is not its camera's.
     """
     model = model_folder(folder)
     if model is None:
@@ -86,16 +86,16 @@ def _lens(camera: Any, where: str) -> Lens:
     kind = camera.model_name
     if kind not in PARAMETERS:
         raise ValueError(f"{where}: camera model {kind}: want one of {', '.join(PARAMETERS)}")
-    held = dict(zip(PARAMETERS[kind].split(), (float(p) for p in camera.params), strict=True))
+    given = dict(zip(PARAMETERS[kind].split(), (float(p) for p in camera.params), strict=True))
     fisheye = kind.endswith("FISHEYE")
     radial = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3")
     divisor = () if fisheye else ("k4", "k5", "k6")
-    coefficients = [tuple(held.get(key, 0.0) for key in keys) for keys in (radial, divisor)]
+    coefficients = [tuple(given.get(key, 0.0) for key in keys) for keys in (radial, divisor)]
     try:
         return Lens(
-            camera.width, camera.height, held.get("fx", held.get("f", 0.0)), held.get("fy", held.get("f", 0.0)),
-            held["cx"], held["cy"], *(part if any(part) else () for part in coefficients),
-            tangential=(held.get("p1", 0.0), held.get("p2", 0.0)), fisheye=fisheye,
+            camera.width, camera.height, given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0)),
+            given["cx"], given["cy"], *(part if any(part) else () for part in coefficients),
+            tangential=(given.get("p1", 0.0), given.get("p2", 0.0)), fisheye=fisheye,
         )  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

@@ -1,4 +1,4 @@
-"""Reading one mesh file, and hashing files without parsing them; shared by the loaders."""
+"""Reading and hashing of mesh files, shared by the loaders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Y_UP_TO_Z_UP = np.array(
 
 
 def file_digest(*paths: Path) -> str:
-    """SHA-256 over the files' bytes, in the order given; files that do not exist are skipped."""
+    """SHA-256 of the files' bytes, in the order given; missing files are skipped."""
     state = hashlib.sha256()
     for path in paths:
         if path.is_file():
@@ -29,7 +29,7 @@ def file_digest(*paths: Path) -> str:
 
 
 def content_digest(files: Mapping[str, Path]) -> str:
-    """SHA-256 over names and contents, which a file's place does not change; a missing file counts as an empty one."""
+    """SHA-256 of names and contents, whatever the files' folders; a missing file counts as an empty one."""
     lines = (f"{name} {file_digest(path)}\n" for name, path in files.items())
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -37,9 +37,11 @@ def content_digest(files: Mapping[str, Path]) -> str:
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
     """Read, repair and normalise a mesh file; several parts in it are joined.
 
-    glTF files (.glb) have +y up by their standard and are turned to +z up; others are taken as they are.
-    ``transform`` leads back to the file's frame in metres. Raises ``ValueError`` with the file and the reason where
-    it cannot be read or holds nothing to draw.
+    glTF files (.glb) have +y up by their standard and are turned to +z up; others are not turned. The object's
+    ``transform`` leads back to the file's frame in metres.
+
+    Raises:
+        ValueError: a file that cannot be read or has no triangles, with the reason.
     """
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
@@ -68,7 +70,11 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
 def choose(
     available: dict[str, Path], names: list[str] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """The wanted names in the wanted order (all, sorted, for None), through aliases; ``ValueError`` for others."""
+    """The available names of ``names``, which may be aliases, in their order; for None all of them, sorted.
+
+    Raises:
+        ValueError: an unknown name, one object twice, or no name.
+    """
     if names is None:
         return sorted(available)
     chosen = []
@@ -87,10 +93,17 @@ def choose(
 
 
 class MeshFiles:
-    """Objects of a folder, a mesh file each; ``files`` of all that there are, of which ``names`` (None: all) are taken.
+    """Objects of a folder, one mesh file each.
 
-    Raises ``ValueError`` where there are none, which are ``wanted``, or for a name that there is not, through
-    ``aliases`` too.
+    Args:
+        root: the folder.
+        files: its mesh files by the objects' names.
+        names: objects to load; None: all.
+        aliases: other spellings of names.
+        wanted: what the folder should hold, for messages.
+
+    Raises:
+        ValueError: no files, or what :func:`choose` raises.
     """
 
     def __init__(
@@ -120,7 +133,7 @@ class MeshFiles:
 
 
 def folder_of(root: str | Path) -> Path:
-    """Raises ``ValueError`` where there is no such folder."""
+    """The folder; raises ``ValueError`` if it does not exist."""
     path = Path(root)
     if not path.is_dir():
         raise ValueError(f"objects.root: {path} is not a folder")
@@ -128,7 +141,7 @@ def folder_of(root: str | Path) -> Path:
 
 
 def _companions(path: Path) -> list[Path]:
-    """Files a mesh may refer to. In a folder of many meshes each depends on all of them: too much, never too little."""
+    """Files a mesh may refer to: all materials and images beside it, some of which may be other meshes'."""
     if path.suffix.lower() in (".glb", ".stl"):
         return []
     return sorted(other for other in path.parent.iterdir() if other.suffix.lower() in COMPANIONS)

@@ -1,4 +1,4 @@
-"""Any folder of meshes: files side by side, or one sub-folder an object."""
+"""Any folder of meshes: files side by side, or one sub-folder per object."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from neural_sim.objects.files import MeshFiles, folder_of
 
 log = logging.getLogger(__name__)
 
-# In order of preference where a sub-folder holds the same object in several formats.
+# In order of preference, for a sub-folder with one object in several formats.
 FORMATS = (".glb", ".obj", ".ply", ".stl")
 
 
 class MeshFolder(MeshFiles):
-    """Meshes of a folder (.glb, .obj, .ply, .stl), all of them or those named, +z up.
+    """Meshes of a folder (.glb, .obj, .ply, .stl), +z up, in metres (rendering does not depend on the unit).
 
-    A file's object is named by its stem. A sub-folder is one object of that name: its only mesh, or the one that
-    comes first in ``FORMATS``; nested folders are searched. Units are taken to be metres (rendering does not
-    depend on them). Raises ``ValueError`` for an empty folder, unknown names and two objects of one name.
+    A file's object has the name of its stem. A sub-folder is one object of that name: its only mesh, or the first by
+    ``FORMATS``; nested folders are searched.
+
+    Raises:
+        ValueError: an empty folder, an unknown name, or two objects of one name.
     """
 
     def __init__(self, root: str | Path, names: list[str] | None = None) -> None:

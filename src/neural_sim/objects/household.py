@@ -1,8 +1,8 @@
-"""The six procedural household objects: what they look like, and which of their sides look alike.
+"""The six procedural household objects: their looks, and which of their sides look alike.
 
-The pitcher's +x side is the can's label but for the place of its bar; its -x side has the handle and a print of
-its own. The drill's -x side is the tall box's front but for the colours of two marks; its +x side has grip and chuck,
-which lie within 45 degrees behind the housing and so never show from -x. Numbers are in units of the body's radius or
+The pitcher's +x side is the can's label except for the place of its bar; its -x side has the handle and another print.
+The drill's -x side is the tall box's front except for the colours of two marks; its +x side has grip and chuck, which
+lie within 45 degrees behind the housing and so are never visible from -x. Lengths are in units of the body's radius or
 half height; the loader normalises afterwards.
 """
 
@@ -27,8 +27,8 @@ YELLOW: Colour = (244, 200, 36)
 VIOLET: Colour = (60, 30, 110)
 AMBER: Colour = (242, 172, 36)
 
-# What tells the look-alike sides apart: the place of the label's bar, and the colours of the drill's marks. Chosen on
-# seeds 100 and 101 so that a handful of images is too few to learn it and some dozens are enough.
+# The look-alike sides differ by the place of the label's bar and by the colours of the drill's marks, chosen on seeds
+# 100 and 101 so that a few images are too few to learn the difference and some dozens are enough.
 CAN_EMBLEM = PITCHER_EMBLEM = RED
 CAN_BAND = PITCHER_BAND = WHITE
 BOX_EMBLEM, DRILL_EMBLEM = NAVY, VIOLET

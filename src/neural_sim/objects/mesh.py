@@ -1,4 +1,4 @@
-"""One object ready for rendering: normalised to the unit sphere, with the way back to its source."""
+"""A mesh normalised to the unit sphere, with the transform back to its source."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ DEGENERATE_EXTENT = 1e-9
 class ObjectMesh:
     """A mesh whose bounding box is centred on the origin and whose farthest vertex has norm 1; +z up.
 
-    ``transform`` maps normalised coordinates to the source's frame, in metres. ``digest`` is the SHA-256 of what
-    the object was made from and keys stored results.
+    ``transform`` maps normalised coordinates to the source's frame, in metres. ``digest`` is the SHA-256 of the
+    object's source, a part of the keys of stored results.
     """
 
     name: str
@@ -28,15 +28,17 @@ class ObjectMesh:
 
     @property
     def radius(self) -> float:
-        """Of the object's sphere, in metres."""
+        """Radius of the object's bounding sphere, in metres."""
         return float(abs(np.linalg.det(self.transform[:3, :3])) ** (1.0 / 3.0))
 
 
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
-    """Centre the bounding box and scale to the unit sphere. ``mesh`` in metres; it is copied, not changed.
+    """A copy of ``mesh`` (in metres) with its bounding box centred and scaled to the unit sphere.
 
-    ``source`` (a file or other origin) is for messages. Without ``digest`` the geometry's own bytes are hashed.
-    Raises ``ValueError`` where the extent is zero or not finite.
+    ``source`` (a file or another origin) is for messages. Without ``digest`` the mesh is hashed.
+
+    Raises:
+        ValueError: an extent that is zero or not finite.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(vertices) == 0 or not np.isfinite(vertices).all():
@@ -48,7 +50,7 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
     if radius < DEGENERATE_EXTENT:
         raise ValueError(f"{source}: want a mesh with extent, got one of radius {radius:g}")
     scaled = mesh.copy()
-    normals = np.array(mesh.vertex_normals)  # similarity keeps normals; trimesh would drop those a file gave
+    normals = np.array(mesh.vertex_normals)  # similarities keep normals; trimesh would drop those of the file
     scaled.vertices = (vertices - centre) / radius
     scaled.vertex_normals = normals
     transform = np.eye(4)
@@ -58,7 +60,7 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
 
 
 def content_digest(mesh: trimesh.Trimesh) -> str:
-    """SHA-256 of vertices, faces and colours or texture; equal for equal meshes on every machine."""
+    """SHA-256 of vertices, faces and colours or texture, equal on every machine."""
     state = hashlib.sha256()
     state.update(np.ascontiguousarray(np.round(mesh.vertices, 9), dtype="<f8").tobytes())
     state.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())

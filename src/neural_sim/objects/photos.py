@@ -1,4 +1,4 @@
-"""Photographs of objects: a folder an object, with ``transforms.json`` or a COLMAP sparse model."""
+"""Photographs of objects: one folder per object, with ``transforms.json`` or a COLMAP sparse model."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ Up = str | list[float] | None
 
 
 class Photos:
-    """Captures of a folder, all of them or those named; an object's name is its folder's.
+    """Captures of a folder; an object has the name of its folder.
 
     Args:
         root: the folder of the objects' folders.
-        names: which of them; null: all.
-        masks: where the objects' pixels are said, see :class:`Pictures`.
-        up: of the world in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by object's
-            name; null: what the capture's file says, else the mean of the cameras' own.
-        size: the diameter of the object's sphere in metres, or a mapping by object's name; null: unknown, so that
-            distances are in object radii.
+        names: objects to load; null: all.
+        masks: source of the objects' masks, see :class:`Pictures`.
+        up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by
+            object's name; null: that of the capture's file, else the mean of the cameras' up vectors.
+        size: the diameter of the object's bounding sphere in metres, or a mapping by object's name; null: unknown, so
+            that distances are in object radii.
 
     Raises:
-        ValueError: no such folder, one without captures, an unknown name, an up or a size that is none; from a capture
-            whatever its reader refuses.
+        ValueError: a missing folder, one without captures, an unknown name, a bad ``up`` or ``size``, or a capture that
+            its reader refuses.
     """
 
     def __init__(
@@ -48,25 +48,25 @@ class Photos:
         size: float | Mapping[str, float] | None = None,
     ) -> None:
         self.root = folder_of(root)
-        found = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
-        if not found:
+        captures = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
+        if not captures:
             raise ValueError(
                 f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
             )
-        self._folders = {name: found[name] for name in choose(found, names, {}, str(self.root))}
+        self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
         self.up, self.size = up, size
         for name in self._folders:
             self._up(name)
             self.radius(name)
-        _ = self.captures  # what is wrong in one is said before anything is made
+        _ = self.captures  # errors in a file are raised here, not in a later stage
 
     def names(self) -> list[str]:
         return list(self._folders)
 
     @cached_property
     def captures(self) -> dict[str, Capture]:
-        """What the files say, by object; photographs are not read."""
+        """Frames and cameras by object; photographs are not read."""
         return {
             name: (read_transforms if has_transforms(folder) else read_colmap)(folder, name)
             for name, folder in self._folders.items()
@@ -77,7 +77,7 @@ class Photos:
         return {name: self._digest(name) for name in self._folders}
 
     def radius(self, name: str) -> float | None:
-        """Of an object's sphere in metres, None where nobody said it."""
+        """Radius of an object's bounding sphere in metres, None if unknown."""
         size = self.size.get(name) if isinstance(self.size, Mapping) else self.size
         if size is None:
             return None
@@ -86,12 +86,12 @@ class Photos:
         return 0.5 * float(size)
 
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
-        """At most ``count`` frames to train on and ``held_out`` that score, evenly spread.
+        """At most ``count`` training frames and ``held_out`` test frames, evenly spread.
 
-        Those that score are the capture's own test frames where it has some, else an eighth of all at most.
+        Test frames are the capture's own if it has any, else at most an eighth of all frames.
 
         Raises:
-            ValueError: fewer than two frames to train on.
+            ValueError: fewer than two training frames.
         """
         frames = self.captures[name].frames
         test = [frame for frame in frames if frame.test]
@@ -106,11 +106,11 @@ class Photos:
         return _spread(train, count), _spread(test, held_out)
 
     def placement(self, name: str) -> Placement:
-        """Where an object stands in its capture's frame."""
+        """An object's pose and radius in its capture's frame."""
         return place(Pictures(self.captures[name], self.masks), self._up(name))
 
     def views(self, name: str, count: int, held_out: int, image_size: int) -> PosedViews:
-        """Views of an object, those held out last, see :meth:`split` and :func:`resampling.resample`."""
+        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`."""
         train, test = self.split(name, count, held_out)
         pictures = Pictures(self.captures[name], self.masks)
         views = resample(pictures, [*train, *test], self.placement(name), image_size)
@@ -147,12 +147,12 @@ class Photos:
 
 
 def is_capture(folder: Path) -> bool:
-    """Whether a folder holds photographs with their cameras."""
+    """Whether a folder has a capture's camera files."""
     return has_transforms(folder) or model_folder(folder) is not None
 
 
 def _spread(frames: list[Frame], count: int) -> list[Frame]:
-    """``count`` of the frames, evenly spread, or all of fewer."""
+    """At most ``count`` of the frames, evenly spread."""
     if count >= len(frames):
         return list(frames)
     return [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]

@@ -1,4 +1,4 @@
-"""The pixels of a capture's photographs: colour, and which of them show the object."""
+"""Pixels of a capture's photographs: colours and the object's mask."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FOLDER = "masks"
 class Pictures:
     """Reads the photographs of a capture.
 
-    ``masks``: where an object's pixels are said. ``files``: a frame's own ``mask_path``, or an image of its name in the
-    folder ``masks`` beside the images or beside the capture's file; ``alpha``: the images' alpha channel; ``auto``: the
+    ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image of its name in a
+    folder ``masks`` beside the images or beside the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
     first of these that a frame has.
 
     Raises:
-        ValueError: another choice; from :meth:`rgba`, a frame without a mask, a mask of another size.
+        ValueError: another source; from :meth:`rgba`, a frame without a mask, or a mask of another size.
     """
 
     capture: Capture
@@ -38,7 +38,7 @@ class Pictures:
             raise ValueError(f"objects.masks must be one of {get_args(Masks)}, got {self.masks!r}")
 
     def rgba(self, frame: Frame) -> Float[Tensor, "h w 4"]:
-        """Straight alpha, float32 in [0, 1]."""
+        """Colour and mask of a frame: straight alpha, float32 in [0, 1]."""
         picture = _open(frame.image)
         file = mask_of(frame, self.capture.source) if self.masks != "alpha" else None
         if file is not None:
@@ -62,16 +62,16 @@ class Pictures:
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
-    """The file of a frame's mask, None if there is none. COLMAP names it ``image.jpg.png``, others ``image.png``."""
+    """The file of a frame's mask, None without one. COLMAP calls it ``image.jpg.png``, others ``image.png``."""
     if frame.mask is not None:
         return frame.mask
     image = frame.image
     root = source if source.is_dir() else source.parent
-    homes = dict.fromkeys([image.parent / FOLDER, image.parent.parent / FOLDER, root / FOLDER])
-    for home in homes:
+    folders = dict.fromkeys([image.parent / FOLDER, image.parent.parent / FOLDER, root / FOLDER])
+    for folder in folders:
         for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
-            if (home / name).is_file():
-                return home / name
+            if (folder / name).is_file():
+                return folder / name
     return None
 
 

@@ -1,4 +1,4 @@
-"""Where an object stands in its capture's frame: which way is up, its centre, its radius."""
+"""An object's placement in its capture's frame: the up direction, and centre and radius from the visual hull."""
 
 from __future__ import annotations
 
@@ -23,18 +23,20 @@ AXES = {
     for sign, axis in itertools.product("+-", "xyz")
 }
 SMALL = 256
-"""Pixels along the longer side of the silhouettes that are carved with."""
+"""Pixels along the longer side of the silhouettes that carve the hull."""
 CELLS = 48
-DISSENT = 0.05
-"""Share of the views that may see no object at a cell that stays: poses and masks of photographs are not exact."""
+"""Cells along each side of the cube that is carved."""
+OUTSIDE = 0.05
+"""Largest fraction of the views of a cell of the hull in which it lies outside the silhouette: poses and masks of
+photographs are not exact."""
 SEEN_BY = 0.5
-"""Share of the views that must see a cell for it to stay: what few see lies at the edges of their photographs."""
+"""Smallest fraction of all views that see a cell of the hull: cells seen by few lie at the photographs' edges."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """``to_object`` takes points of the capture's frame to the object's: +z up, in the unit sphere round the origin.
-    ``radius`` is that sphere's in the capture's unit."""
+    """``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere about the origin.
+    ``radius`` is that sphere's radius in the capture's unit."""
 
     to_object: Float[np.ndarray, "4 4"]
     radius: float
@@ -47,23 +49,23 @@ class Placement:
 
 
 def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placement:
-    """``up`` in the capture's frame; None: what its file says, else the mean of the cameras' own, which the log says.
+    """The placement of an object. Centre and radius are those of the visual hull (Laurentini 1994) of its silhouettes.
 
-    Centre and radius are those of the space that the silhouettes of (nearly) all photographs share.
+    ``up`` is in the capture's frame; None: that of its file, else the mean of the cameras' up vectors, which is logged.
 
     Raises:
-        ValueError: no object in the masks, or silhouettes that share no space.
+        ValueError: masks without an object, or an empty visual hull.
     """
     capture = pictures.capture
-    said = up if up is not None else capture.up
-    if said is None:
+    chosen = up if up is not None else capture.up
+    if chosen is None:
         axes = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames])
-        said = tuple(axes.mean(0))
+        chosen = tuple(axes.mean(0))
         _log.info(
             "%s: up is taken to be (%.3f, %.3f, %.3f), the mean of the cameras' own; objects.up says another",
-            capture.name, *(np.array(said) / max(float(np.linalg.norm(said)), 1e-12)),
+            capture.name, *(np.array(chosen) / max(float(np.linalg.norm(chosen)), 1e-12)),
         )  # fmt: skip
-    turn = upright(np.array(said, dtype=np.float64), capture.name)
+    turn = upright(np.array(chosen, dtype=np.float64), capture.name)
     centre, radius = sphere_of(capture, [silhouette(pictures, frame) for frame in capture.frames])
     _log.info(
         "%s: centre (%.4g, %.4g, %.4g) and radius %.4g in the capture's unit, from %d silhouettes",
@@ -76,7 +78,7 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placemen
 
 
 def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes ``up`` to +z. Raises ``ValueError`` where up is no direction."""
+    """The smallest rotation from ``up`` to +z; raises ``ValueError`` for a vector without a direction."""
     length = float(np.linalg.norm(up))
     if not np.isfinite(length) or length < 1e-6:
         raise ValueError(f"{name}: up has no direction, got {up.tolist()}; set objects.up")
@@ -88,7 +90,7 @@ def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
 
 
 def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
-    """Which pixels of the photograph, made smaller, show some of the object."""
+    """The object's mask at reduced size; a pixel belongs to it if any of the photograph's pixels there does."""
     alpha = pictures.rgba(frame)[..., 3]
     step = max(1, max(alpha.shape) // SMALL)
     return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
@@ -97,7 +99,7 @@ def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
 def sphere_of(
     capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Centre and radius of the space that the silhouettes share, in the capture's frame."""
+    """Centre and radius of the silhouettes' visual hull, in the capture's frame."""
     empty = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if not mask.any()]
     if len(empty) == len(silhouettes):
         raise ValueError(
@@ -109,27 +111,28 @@ def sphere_of(
         )
     shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
     centre, half = _first_cube(shown)
-    # The second time in a cube that fits, by the cells' middles alone: the first must not miss a thin part.
+    # First by whole cells, in order not to miss a thin part; then in a cube that fits, by the cells' centres.
     for reach in (0.5 * np.sqrt(3.0), 0.0):
         cell = 2.0 * half / CELLS
         axis = torch.linspace(-half + 0.5 * cell, half - 0.5 * cell, CELLS, dtype=torch.float64)
         cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(
             -1, 3
         ) + torch.from_numpy(centre)
-        kept = cells[_shared(shown, cells, reach * cell)]
-        if not len(kept):
+        hull = cells[_carved(shown, cells, reach * cell)]
+        if not len(hull):
             raise ValueError(
                 f"{capture.source}: the silhouettes of {capture.name} share no space; check masks, poses and axes"
             )
-        low, high = kept.amin(0) - 0.5 * cell, kept.amax(0) + 0.5 * cell
+        low, high = hull.amin(0) - 0.5 * cell, hull.amax(0) + 0.5 * cell
         centre = (0.5 * (low + high)).numpy()
-        radius = float((kept - torch.from_numpy(centre)).norm(dim=-1).max()) + 0.5 * cell
+        radius = float((hull - torch.from_numpy(centre)).norm(dim=-1).max()) + 0.5 * cell
         half = 1.1 * radius
     return centre, radius
 
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
-    """The point nearest to the rays through the silhouettes' middles, and half the side of a cube round the object."""
+    """The point nearest to the rays through the silhouettes' centres (least squares), and half the side of a cube about
+    the object."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     spans = []
     for frame, mask in shown:
@@ -149,10 +152,10 @@ def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, floa
     return centre, 1.5 * max(depth * span for depth, span in zip(depths, spans, strict=True))
 
 
-def _shared(
+def _carved(
     shown: Sequence[tuple[Frame, Tensor]], cells: Float[Tensor, "n 3"], reach: float
 ) -> Bool[Tensor, "n"]:
-    """Cells at which nearly all photographs that see them show the object within ``reach``."""
+    """Cells of the visual hull: nearly all photographs that see a cell show the object within ``reach`` of it."""
     seen, missed = torch.zeros(len(cells)), torch.zeros(len(cells))
     for frame, mask in shown:
         lens, pose = frame.lens, torch.from_numpy(frame.camera_to_world)
@@ -160,20 +163,17 @@ def _shared(
         pixel, ahead = lens.project(local)
         scale = mask.shape[1] / lens.width
         nearest = float((-local[:, 2]).clamp_min(1e-6).median())
-        grown = _grown(mask, int(np.ceil(scale * max(lens.fx, lens.fy) * reach / nearest)) + 1)
+        by = int(np.ceil(scale * max(lens.fx, lens.fy) * reach / nearest)) + 1
+        grown = functional.max_pool2d(mask[None, None].float(), 2 * by + 1, 1, by)[0, 0] > 0.0
         inside, value = _at(grown, pixel, lens)
         visible = inside & ahead
         seen += visible
         missed += visible & ~value
-    return (seen >= SEEN_BY * len(shown)) & (missed <= DISSENT * seen)
-
-
-def _grown(mask: Bool[Tensor, "h w"], by: int) -> Bool[Tensor, "h w"]:
-    return functional.max_pool2d(mask[None, None].float(), 2 * by + 1, 1, by)[0, 0] > 0.0
+    return (seen >= SEEN_BY * len(shown)) & (missed <= OUTSIDE * seen)
 
 
 def _at(mask: Tensor, pixel: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
-    """Whether pixels lie in the image, and what the smaller mask says there."""
+    """Whether pixels lie in the image, and the reduced mask's values there."""
     size = pixel.new_tensor([lens.width, lens.height])
     inside = ((pixel >= 0.0) & (pixel < size)).all(-1)
     place = (pixel / size * pixel.new_tensor([mask.shape[1], mask.shape[0]])).nan_to_num(0.0).long()

@@ -1,4 +1,4 @@
-"""The embedded default objects, made at run time: no downloads, the same bytes for the same seed."""
+"""The embedded default objects, generated at run time: no downloads, the same bytes for the same seed."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ DESIGNS = {
 
 
 class Procedural:
-    """Six textured household objects, two blue and four red, or those named.
+    """Six textured household objects, two blue and four red, without a unit of length.
 
-    ``seed`` draws their small print only; shapes and marks are fixed. An object does not depend on which others
-    are made. Their size means nothing. Raises ``ValueError`` for unknown names.
+    Args:
+        names: which of them; None: all.
+        seed: of their small print. Shapes and marks are fixed; an object does not depend on which others are chosen.
+
+    Raises:
+        ValueError: unknown or repeated names, or a bad seed.
     """
 
     metric: ClassVar[bool] = False

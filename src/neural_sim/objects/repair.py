@@ -1,4 +1,4 @@
-"""Mending what meshes from elsewhere bring along, and refusing what cannot be mended."""
+"""Repair of meshes from files: degenerate faces, normals, colours."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ HUGE_FACES = 500_000
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    """A copy fit for rendering: finite normals, no degenerate faces, some colour. Every mend is a logged warning.
+    """A copy that can be rendered: finite normals, no degenerate faces, colours. Every repair is logged as a warning.
 
-    Normals that are not finite are recomputed from the faces; a mesh without colours, or whose texture is missing,
-    is painted in its material's colour or grey; one of more than ``HUGE_FACES`` faces is only warned about. Raises
-    ``ValueError`` naming ``source`` where no face or no finite vertex is left.
+    Normals that are not finite are recomputed from the faces. A mesh without colours, or without its texture, gets its
+    material's colour or grey. More than ``HUGE_FACES`` faces only give a warning.
+
+    Raises:
+        ValueError: no face of positive area with finite vertices, with ``source``.
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
@@ -36,7 +38,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 
 
 def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    mesh = mesh.copy(include_cache=True)  # the cache holds normals that a file gave
+    mesh = mesh.copy(include_cache=True)  # the cache has the file's normals
     vertices = np.asarray(mesh.vertices)
     good = np.isfinite(vertices[mesh.faces].sum(axis=(1, 2)))
     if good.any():
@@ -66,7 +68,7 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
         "%s: object %r: %d of %d normals were not of finite unit length, recomputed",
         source, name, int(bad.sum()), len(bad),
     )  # fmt: skip
-    # A mesh built anew has no normals from the file, so trimesh computes them from the faces.
+    # A new mesh has no normals of the file, so trimesh computes them from the faces.
     rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     rebuilt.visual = copy.deepcopy(mesh.visual)
     fresh = np.array(rebuilt.vertex_normals)
@@ -87,7 +89,7 @@ def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trime
         )
         if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
             return _with_finite_uv(mesh, visual, name, source)
-        if np.asarray(material.main_color)[:3].any():  # black is what files without any colour come out as
+        if np.asarray(material.main_color)[:3].any():  # files without any colour come out black
             paint = tuple(int(value) for value in np.asarray(material.main_color)[:4])
         log.warning("%s: object %r: no texture to draw (missing?), painted plain %s", source, name, paint[:3])
     elif isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):

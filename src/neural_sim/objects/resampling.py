@@ -1,8 +1,7 @@
-"""Photographs as posed views of one camera: distortion undone, each camera turned to the object's middle.
+"""Photographs resampled as views of one camera: undistorted, each camera rotated towards the object's centre.
 
-A camera may be turned about its own place, and its focal length and principal point changed, without anything that it
-sees changing but the pixels' places. So photographs of any size and lens become views of one square camera that shows
-the whole object.
+A rotation of a camera about its centre, and a change of its intrinsics, map pixels to pixels whatever the scene (a
+homography). So photographs of any size and lens become views of one square camera that shows the whole object.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from neural_sim.objects.placing import Placement
 from neural_sim.types import PinholeCamera, PosedViews
 
 MARGIN = 1.08
-"""How much wider than the object's sphere the views are."""
+"""Width of the views over that of the object's bounding sphere."""
 MOST_SAMPLES = 16
-"""Along each side of a pixel of the views, where a photograph has so many more."""
+"""Samples along each side of a pixel of the views, at most."""
 
 
 def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str) -> PinholeCamera:
-    """The square camera in which the unit sphere is whole from the nearest of these places (object radii).
+    """The square camera that shows the whole unit sphere from the nearest of these poses (object radii).
 
     Raises:
-        ValueError: a photograph from within the sphere.
+        ValueError: a camera inside the sphere.
     """
     nearest = float(np.linalg.norm(poses[:, :3, 3], axis=-1).min())
     if nearest <= 1.02:
@@ -45,7 +44,7 @@ def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str)
 
 
 def turned_to_origin(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The camera at the same place that looks at the origin, turned by the smallest rotation."""
+    """The pose turned by the smallest rotation that makes it look at the origin; its position does not change."""
     position = pose[:3, 3]
     backward, target = pose[:3, 2], position / np.linalg.norm(position)
     axis = np.cross(backward, target)
@@ -62,32 +61,31 @@ def resample(
 ) -> PosedViews:
     """Views of these frames in the object's frame, in their order.
 
-    A pixel is the mean of as many samples of the photograph as that has pixels there; it is ``known`` where all of them
-    lie in the photograph.
+    A pixel is the mean of samples at the photograph's resolution; it is ``known`` if all of them lie in the photograph.
     """
     poses = np.stack([placement.pose(frame.camera_to_world) for frame in frames])
     camera = shared_camera(poses, image_size, pictures.capture.name)
     turned = np.stack([turned_to_origin(pose) for pose in poses])
-    made = [
-        _view(pictures.rgba(frame), frame, torch.from_numpy(own), torch.from_numpy(new), camera)
-        for frame, own, new in zip(frames, poses, turned, strict=True)
+    views = [
+        _view(pictures.rgba(frame), frame, torch.from_numpy(pose), torch.from_numpy(new), camera)
+        for frame, pose, new in zip(frames, poses, turned, strict=True)
     ]
-    images, known = (torch.stack(part) for part in zip(*made, strict=True))
+    images, known = (torch.stack(part) for part in zip(*views, strict=True))
     return PosedViews(images, torch.from_numpy(turned).float(), camera, known=known)
 
 
 def pixels_per_pixel(frame: Frame, camera: PinholeCamera) -> float:
-    """How many pixels of the photograph one of the views' covers along a side."""
+    """Pixels of the photograph along a side of one pixel of the views."""
     return max(frame.lens.fx, frame.lens.fy) / focal_length(camera)
 
 
 def _view(
-    photo: Float[Tensor, "h w 4"], frame: Frame, own: Tensor, turned: Tensor, camera: PinholeCamera
+    photo: Float[Tensor, "h w 4"], frame: Frame, pose: Tensor, turned: Tensor, camera: PinholeCamera
 ) -> tuple[Float[Tensor, "s s 4"], Bool[Tensor, "s s"]]:
     side = min(MOST_SAMPLES, max(1, math.ceil(pixels_per_pixel(frame, camera))))
     fine = PinholeCamera(side * camera.width, side * camera.height, camera.field_of_view)
     pixel = torch.arange(fine.width * fine.height)
-    directions = pixel_rays(fine, turned[None], pixel).directions @ own[:3, :3]
+    directions = pixel_rays(fine, turned[None], pixel).directions @ pose[:3, :3]
     place, seen = frame.lens.project(directions)
     size = place.new_tensor([frame.lens.width, frame.lens.height])
     seen &= ((place >= 0.0) & (place <= size)).all(-1)

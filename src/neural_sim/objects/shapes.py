@@ -27,7 +27,7 @@ class Part:
 def revolve(
     profile: list[tuple[float, float]], side: Print, cap: Print, segments: int = 64, rows: int = 6
 ) -> list[Part]:
-    """Turn a profile of (radius, z) about the z axis, one part for each of its straight pieces.
+    """Solid of revolution of a profile of (radius, z) about the z axis, one part for each of its straight pieces.
 
     The profile runs anticlockwise seen with radius to the right and z up: from the bottom's centre outwards, up the
     side, back to the axis. Steep pieces take ``side`` (x: azimuth, 0.5 at world +x and growing towards +y; y:
@@ -125,7 +125,7 @@ def _grid_faces(rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
 
 
 def _part(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, panel: Print) -> Part:
-    """Drops the triangles that collapse where a grid meets an axis."""
+    """A part without the triangles that degenerate where a grid meets an axis."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     kept = faces[area > 1e-12]

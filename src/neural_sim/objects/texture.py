@@ -1,4 +1,4 @@
-"""Drawing the printed sides of procedural objects, and packing them into one texture."""
+"""Printed sides of procedural objects, and their texture atlas."""
 
 from __future__ import annotations
 
@@ -32,11 +32,7 @@ class Print:
         self._draw.polygon([(x * width, (1.0 - y) * height) for x, y in points], fill=colour)
 
     def text_lines(
-        self,
-        area: tuple[float, float, float, float],
-        lines: int,
-        colour: Colour,
-        generator: torch.Generator,
+        self, area: tuple[float, float, float, float], lines: int, colour: Colour, generator: torch.Generator
     ) -> None:
         """Bars of random lengths in ``area`` (x0, y0, x1, y1), like lines of small print."""
         x0, y0, x1, y1 = area
@@ -63,7 +59,7 @@ class Print:
 def atlas(
     panels: list[UInt8[np.ndarray, "_h _w 3"]],
 ) -> tuple[Image.Image, list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]]]:
-    """Stack panels into one image; for each the (scale, offset) that take its own uv in [0, 1] to the atlas' uv."""
+    """Stack panels into one image; the (scale, offset) that map each panel's uv in [0, 1] to the atlas's uv."""
     width = max(panel.shape[1] for panel in panels) + 2 * MARGIN
     height = sum(panel.shape[0] + 2 * MARGIN for panel in panels)
     image = np.zeros((height, width, 3), dtype=np.uint8)

@@ -18,19 +18,19 @@ PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
 def has_transforms(folder: Path) -> bool:
-    """Whether a folder holds such a capture."""
+    """Whether a folder has ``transforms.json`` or ``transforms_train.json``."""
     return any((folder / name).is_file() for name in NAMES[:2])
 
 
 def read_transforms(folder: Path, name: str) -> Capture:
     """The capture of a folder.
 
-    ``transforms.json`` alone, or ``transforms_train.json`` with ``_val`` and ``_test`` beside it, whose frames are kept
-    from training; the latter are Blender's, so that +z is up. Intrinsics of a frame come before the file's.
+    It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` beside it, whose
+    frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's.
 
     Raises:
-        ValueError: a file that is not readable or has no frames, a frame without a pose or with a rotation that is
-            none, an image that is missing or of another size than its intrinsics say, an unknown camera model.
+        ValueError: a file that is not readable or has no frames, a frame without a pose or with a matrix that is no
+            rotation, an image that is missing or whose size is not that of its intrinsics, an unknown camera model.
     """
     whole = (folder / NAMES[0]).is_file()
     sources = (
@@ -96,7 +96,7 @@ def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, t
 
 
 def _image(path: Path, where: str) -> Path:
-    """The image itself; NeRF-synthetic leaves its suffix out."""
+    """The image's file; NeRF-synthetic omits the suffix."""
     for candidate in (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES)):
         if candidate.is_file():
             return candidate
@@ -120,10 +120,10 @@ def _lens(values: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
         return float(value)
 
     width, height = size
-    said = round(number("w", width)), round(number("h", height))
-    if said != size:
+    stated = round(number("w", width)), round(number("h", height))
+    if stated != size:
         raise ValueError(
-            f"{where}: the image has {width} x {height} pixels, its intrinsics w and h say {said[0]} x {said[1]}"
+            f"{where}: the image has {width} x {height} pixels, its intrinsics w and h say {stated[0]} x {stated[1]}"
         )
     model = values.get("camera_model", "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye", False))

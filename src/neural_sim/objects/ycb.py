@@ -8,10 +8,14 @@ from neural_sim.objects.files import MeshFiles, folder_of
 
 
 class YCB(MeshFiles):
-    """Objects of a folder in the YCB layout, all of them or those named.
+    """Objects of a folder in the YCB layout, with the names of their folders.
 
-    An entry of ``names`` may be '019_pitcher_base', '019' or 'pitcher_base'; the objects' own names are the folders'.
-    Raises ``ValueError`` where the folder holds no such object or a name is unknown.
+    Args:
+        root: the folder.
+        names: objects as '019_pitcher_base', '019' or 'pitcher_base'; None: all.
+
+    Raises:
+        ValueError: a folder without such objects, or an unknown name.
     """
 
     def __init__(self, root: str | Path, names: list[str] | None = None) -> None:

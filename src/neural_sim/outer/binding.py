@@ -1,4 +1,4 @@
-"""Ties rendered images to what the estimators ask of them: losses by row, and the way back to psi."""
+"""The estimators' inputs from rendered images: losses by row, and the differentiable path from psi to an image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neural_sim.types import SceneDraw
 def image_losses(
     detector: Detector, backbone: Parameters, targets: Targets, labels: Int[Tensor, "images boxes"]
 ) -> ImageLoss:
-    """Losses of images, differentiable in their pixels, and in their boxes where those are given."""
+    """Losses of images, differentiable by pixels, and by boxes where those are given."""
 
     def losses(params: Parameters, chunk: Tensor, index: Tensor, boxes: Tensor | None = None) -> Tensor:
         wanted = targets.select(index)
@@ -40,9 +40,10 @@ def bound_losses(
 
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compose) -> RenderedPath:
-    """How one object's images came from psi by a relaxed draw; ``compose`` makes them of its maps.
+    """The path from psi to one object's images through a relaxed draw; ``compose`` makes them of its maps.
 
-    Raises ``ValueError`` for images that did not.
+    Raises:
+        ValueError: images of hard draws.
     """
     noise, relaxed = part.noise, part.relaxed
     if noise is None or relaxed is None:

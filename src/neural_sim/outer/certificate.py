@@ -1,7 +1,7 @@
-"""How far each psi step may be trusted: what its hypergradient was worth, what speaks against it, what was done.
+"""Quality of each iteration's hypergradient, the conditions that it fails, and what happens to the steps.
 
-An iteration makes one step for each object and each factor of psi. Doubts about the solve, or about the hypergradient
-as a whole, are about all of them; whether a derivative can be told from zero is asked of each.
+An iteration makes one step for each object and each factor of psi. The solve and the hypergradient as a whole concern
+all of them; whether a derivative differs significantly from zero is tested for each.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 
 
 Actions = dict[str, dict[str, Action]]
-"""What became of the steps, by object and factor."""
+"""What happens to the steps, by object and factor."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is known of one iteration's hypergradient.
+    """Quality of one iteration's hypergradient.
 
     ``stationarity`` is ``|dL_train/dtheta|`` (nan where none was assumed) and ``validation_norm`` ``|dL_val/dtheta|``.
-    ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` that of the
-    damped one (nan where no spectrum was estimated, inf where it is not positive definite). ``sensitivity`` is the
-    hypergradient's relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``). ``cosine`` is with what
-    ``outer.certify`` measured, nan where it did not. ``doubts`` names what speaks against all steps. ``p_values``, by
-    object and factor, are those of the null that a derivative is zero: this iteration's, or, where steps are checked,
-    its average with those of earlier iterations, which steps follow. ``actions`` has the objects whose psi moves; a
-    step without doubt and with a significant derivative is kept.
+    ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` the damped
+    operator's condition number (nan without an estimated spectrum, inf where it is not positive definite).
+    ``sensitivity`` is the hypergradient's relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``).
+    ``cosine`` is with the reference of ``outer.certify``, nan where that was not measured. ``doubts`` names the
+    conditions on the whole hypergradient that fail. ``p_values``, by object and factor, are those of the null that a
+    derivative is zero: this iteration's, or, for checked steps, of the average over iterations that steps follow.
+    ``actions`` has the learned objects; a step is kept if no condition fails and its derivative is significant.
     """
 
     stationarity: float
@@ -59,13 +59,16 @@ class Certificate:
     @property
     def stopped(self) -> bool:
         """Whether the loop ends here."""
-        return any(action == "stopped" for held in self.actions.values() for action in held.values())
+        return "stopped" in self._taken
 
     @property
     def void(self) -> bool:
-        """Whether nothing of this iteration is followed, not even later through the momentum."""
-        done = {action for held in self.actions.values() for action in held.values()}
-        return self.stopped or (bool(self.doubts) and not done & {"shrunk", "kept"})
+        """Whether this iteration's derivative is discarded, also from the momentum."""
+        return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
+
+    @property
+    def _taken(self) -> set[Action]:
+        return {action for by_factor in self.actions.values() for action in by_factor.values()}
 
 
 def certify(
@@ -77,15 +80,21 @@ def certify(
     trust: Trust,
     on_untrusted: OnUntrusted,
 ) -> Certificate:
-    """Judge an iteration's hypergradient; ``names`` are the objects whose psi moves, ``factors`` those of psi, and
-    ``p_values`` those of the derivatives that steps follow.
+    """The certificate of an iteration's hypergradient.
 
-    No step follows a gradient that is not finite. A step is without signal where its p-value is above ``trust.level``;
-    where nothing was tested, nothing speaks against it.
+    No step follows a gradient that is not finite. A derivative is insignificant where its p-value is above
+    ``trust.level``; one that was not tested counts as significant.
+
+    Args:
+        result: the hypergradient.
+        p_values: of the derivatives that steps follow, by object and factor.
+        names, factors: the learned objects and the factors of psi.
+        cosine: with the reference of ``outer.certify``, nan if not measured.
+        trust, on_untrusted: the conditions, and what happens where they fail.
     """
     finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())
-    found = _doubts(result, cosine, trust) + ([] if finite else ["not finite"])
-    if found:
+    doubts = _doubts(result, cosine, trust) + ([] if finite else ["not finite"])
+    if doubts:
         action = _ACTIONS[on_untrusted]
         if not finite and action in ("shrunk", "kept"):
             action = "skipped"
@@ -106,8 +115,8 @@ def certify(
         condition=result.damping.condition,
         sensitivity=result.sensitivity,
         cosine=cosine,
-        doubts=found,
-        p_values={name: dict(found) for name, found in p_values.items()},
+        doubts=doubts,
+        p_values={name: dict(by_factor) for name, by_factor in p_values.items()},
         actions=actions,
     )
 
@@ -119,23 +128,23 @@ def _by_signal(
     level: float | None,
     on_untrusted: OnUntrusted,
 ) -> Actions:
-    """Steps kept where there is signal. An object at its optimum has none, and is no reason to stop the others:
-    ``stop`` skips its step, and ends the loop where no step is left."""
+    """Keep the steps of significant derivatives. An object at its optimum has none, and is no reason to stop the
+    others: ``stop`` skips its step, and ends the loop where no step is left."""
     otherwise: Action = "skipped" if on_untrusted == "stop" else _ACTIONS[on_untrusted]
     limit = math.inf if level is None else level
     actions: Actions = {
         name: {f: "kept" if p_values.get(name, {}).get(f, 0.0) <= limit else otherwise for f in factors}
         for name in names
     }
-    if on_untrusted == "stop" and not any("kept" in held.values() for held in actions.values()):
+    if on_untrusted == "stop" and not any("kept" in by_factor.values() for by_factor in actions.values()):
         return {name: dict.fromkeys(factors, "stopped") for name in names}
     return actions
 
 
 def _doubts(result: Hypergradient, cosine: float, trust: Trust) -> list[str]:
-    """Names of the demands on all steps that the hypergradient fails; a number that does not exist fails none."""
+    """Names of the conditions that the whole hypergradient fails; nan fails none."""
     solution = result.solution
-    # An approximation that was never iterated (solver=identity) was asked for knowing its residual.
+    # solver=identity never iterates: whoever chooses it accepts its residual.
     residual = 0.0 if solution.status is Status.APPROXIMATE else solution.residual
     failed = {
         "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE, Status.DIVERGED),
@@ -155,51 +164,51 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
     """One line for the log, p-values by factor, object by object."""
     c = certificate
     tested = {factor: [p[factor] for p in c.p_values.values()] for p in c.p_values.values() for factor in p}
-    done = Counter(action for held in c.actions.values() for action in held.values())
+    actions = Counter(action for by_factor in c.actions.values() for action in by_factor.values())
     parts = [
         f"psi {iteration}/{iterations} val {validation_loss:.4f}",
         f"|dval| {c.validation_norm:.2g}",
         *_adjoint(c),
         *([] if math.isnan(c.sensitivity) else [f"2 lambda {c.sensitivity:.0%}"]),
-        *(f"p {factor} {'/'.join(f'{p:.2g}' for p in found)}" for factor, found in tested.items()),
+        *(f"p {factor} {'/'.join(f'{p:.2g}' for p in values)}" for factor, values in tested.items()),
         *([] if math.isnan(c.cosine) else [f"cos {c.cosine:.2f}"]),
-        ", ".join(f"{action} {count}" for action, count in done.items())
+        ", ".join(f"{action} {count}" for action, count in actions.items())
         + (f" ({', '.join(c.doubts)})" if c.doubts else ""),
     ]
     return "; ".join(parts)
 
 
 def _adjoint(c: Certificate) -> list[str]:
-    """How the derivative was taken, for the log: a solve has a residual and a spectrum, other ways have none."""
-    taken = f"{c.solver_status} {c.solver_steps} steps"
+    """The adjoint, for the log; only a solve has a residual and a spectrum."""
+    method = f"{c.solver_status} {c.solver_steps} steps"
     if math.isnan(c.stationarity):
-        return [taken]
+        return [method]
     return [
         f"|dtrain| {c.stationarity:.2g}",
-        f"{taken} res {c.solver_residual:.1g}",
+        f"{method} res {c.solver_residual:.1g}",
         f"H [{c.curvature_min:.2g}, {c.curvature_max:.3g}] lambda {c.damping:.2g} cond {c.condition:.3g}",
     ]
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How many of the recorded steps, one for each object and factor of an iteration, were not trusted, what was done,
-    and why: doubts about all, or no signal. How many steps the next training judged, and how many it undid. And every
-    cosine that was measured."""
-    held = [record["certificate"] for record in records if record["certificate"]]
+    """Counts over recorded iterations: steps (one for each object and factor), untrusted ones, what happened to these
+    and why (failed conditions, or ``signal``: no significance), objects' steps that the next training judged, and those
+    that it rejected; and every measured cosine."""
+    certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
         (action, certificate["doubts"] or ["signal"])
-        for certificate in held
+        for certificate in certificates
         for by_factor in certificate["actions"].values()
         for action in by_factor.values()
     ]
     doubted = [(action, doubts) for action, doubts in actions if action != "kept"]
-    verdicts = [verdict["accepted"] for record in records for verdict in record["verdicts"].values()]
+    accepted = [verdict["accepted"] for record in records for verdict in record["verdicts"].values()]
     return {
         "steps": len(actions),
         "untrusted": len(doubted),
         "actions": dict(Counter(action for action, _ in doubted)),
         "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),
-        "judged": len(verdicts),
-        "undone": verdicts.count(False),
-        "cosines": [c["cosine"] for c in held if not math.isnan(c["cosine"])],
+        "judged": len(accepted),
+        "rejected": accepted.count(False),
+        "cosines": [c["cosine"] for c in certificates if not math.isnan(c["cosine"])],
     }

@@ -1,9 +1,9 @@
-"""Steps that are checked: proposed in a trust region where there is evidence, judged by the next iteration's training.
+"""Trust-region steps of psi, accepted or rejected by the next iteration's training.
 
-Each iteration trains a detector anyway. Under the random numbers of the training before (the same start, batches,
-backgrounds and noise of the draws) the difference of the two is what the step did, with little noise. A step that did
-not help its own object is undone and its region shrinks, one that did grows it (Conn, Gould and Toint 2000, Chapter 6;
-here each object's reduction is measured).
+Each iteration trains a detector anyway. Under common random numbers (the same initial parameters, batches, backgrounds
+and noise of the draws) the difference of two consecutive trainings measures the effect of the step with little noise. A
+step that does not raise its object's score is rejected and its radius shrinks; an accepted one enlarges it (Conn, Gould
+and Toint 2000, Chapter 6, with the reduction measured object by object).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.settings import Checks
-from neural_sim.outer.steps import PARTS, PValues, Verdict, stacked
+from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
 
@@ -27,8 +27,11 @@ HALVINGS = 40
 
 @dataclass(frozen=True)
 class Average:
-    """A weighted mean of the iterations' directions, each weighted by one over its noise variance, and less from
-    iteration to iteration: one that is long because it is noisy, or because it was the first, does not rule."""
+    """Inverse-variance weighted mean of the iterations' directions, with weights that decay.
+
+    So neither a noisy direction, which is long, nor the first one dominates. ``total`` is the weighted sum, ``weight``
+    the sum of weights, ``noise`` the variance of ``total``.
+    """
 
     total: Float[Tensor, "objects k"]
     weight: Float[Tensor, "objects 1"]
@@ -44,11 +47,11 @@ class Average:
         variance: Float[Tensor, "objects k"],
         keep: Float[Tensor, "objects 1"] | float,
     ) -> Average:
-        """With one more direction; what was there counts ``keep`` times as much as before. Objects whose direction or
+        """The mean with one more direction; earlier weights are multiplied by ``keep``. Objects whose direction or
         variance is not finite stay as they are."""
         known = (direction.isfinite() & variance.isfinite()).all(1, keepdim=True)
         mean = variance.mean(1, keepdim=True)
-        # Without noise (an exact derivative) all iterations weigh alike.
+        # Without noise (an exact derivative) all iterations have the same weight.
         weight = torch.where(mean > 0.0, 1.0 / mean, 1.0)
         joined = (
             keep * self.total + weight * direction,
@@ -67,20 +70,28 @@ class Average:
 
     @property
     def p_values(self) -> Float[Tensor, "objects"]:
-        """Of the null that all components of the mean are equal, by a chi-square of size - 1 degrees of freedom: each
-        component over its own variance. 1 where nothing was seen, 0 without noise."""
+        """Of the null that all components of the mean are equal: a chi-square test with k - 1 degrees of freedom, each
+        component over its own variance. 1 without observations, 0 without noise."""
         variance = self.noise / self.weight.square().clamp_min(torch.finfo(self.total.dtype).tiny)
-        sharp = (variance == 0.0).all(1)
+        exact = (variance == 0.0).all(1)
         weights = 1.0 / torch.where(variance > 0.0, variance, 1.0)
         centre = (weights * self.value).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
         statistic = (weights * (self.value - centre).square()).sum(1)
         freedom = torch.full_like(statistic, 0.5 * (self.value.shape[1] - 1))
-        found = torch.special.gammaincc(freedom, 0.5 * statistic)
-        return torch.where(sharp, torch.where(self.value.abs().amax(1) > 0.0, 0.0, 1.0).to(found), found)
+        p_value = torch.special.gammaincc(freedom, 0.5 * statistic)
+        return torch.where(exact, torch.where(self.value.abs().amax(1) > 0.0, 0.0, 1.0).to(p_value), p_value)
 
 
 class CheckedSteps:
-    """See the module. ``labels`` are the classes of the objects ``names``, whose psi moves."""
+    """Trust-region steps, see the module.
+
+    Args:
+        settings: radii and acceptance.
+        shrink: fraction of an untrusted step that is taken.
+        distribution: p_psi.
+        names, labels: the learned objects and their classes.
+        psi: initial psi of these objects.
+    """
 
     def __init__(
         self,
@@ -93,12 +104,12 @@ class CheckedSteps:
     ) -> None:
         self.settings, self.shrink, self.distribution = settings, shrink, distribution
         self.names, self.labels = names, torch.tensor(labels)
-        self.accepted = self.tried = psi.detach().clone()
+        self.accepted = self.trial = psi.detach().clone()
         parts = distribution.split(psi)
         self.radius = {name: torch.full_like(part[:, 0], settings.radius) for name, part in parts.items()}
         self._averages = {name: Average.zeros(part) for name, part in parts.items()}
         self._joined = self._averages
-        self._promised = torch.zeros_like(psi[:, 0])
+        self._expected = torch.zeros_like(psi[:, 0])
         self._moved = {name: torch.zeros(len(psi), dtype=torch.bool) for name in parts}
         self._just_accepted = torch.zeros(len(psi), dtype=torch.bool)
         self._reference: Tensor | None = None
@@ -109,60 +120,62 @@ class CheckedSteps:
 
     @property
     def moved(self) -> bool:
-        """Whether an object has a step that is not judged yet."""
-        return bool(self._waiting.any())
+        """Whether an object's step is pending."""
+        return bool(self._pending.any())
 
     @property
-    def _waiting(self) -> Bool[Tensor, "objects"]:
-        """Objects whose step is not judged yet, by whichever factor they moved."""
+    def _pending(self) -> Bool[Tensor, "objects"]:
+        """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
         return torch.stack([*self._moved.values()]).any(0)
 
     def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
-        """A step is undone where its object's own score did not rise by more than ``errors`` standard errors, of the
-        paired differences of images. Where all own scores rose and yet the mean over all classes fell, steps harm each
-        other, and all of them are undone."""
+        """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
+        paired differences. Where all these scores rose and yet the mean over all classes fell, steps harm each other,
+        and all are rejected."""
         scores = scores.double()
         if self._reference is None:
             self._reference = scores
         change = scores - self._reference
-        came, images = change.sum(1), change.shape[1]
-        own, mean = came[self.labels], came.nanmean()
-        error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(own)
-        rose, waiting = own > self.settings.errors * error, self._waiting
-        if bool(waiting.any()) and bool(rose[waiting].all()) and mean < 0.0:
+        gains, images = change.sum(1), change.shape[1]
+        gain = gains[self.labels]
+        error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(gain)
+        rose, pending = gain > self.settings.errors * error, self._pending
+        if bool(pending.any()) and bool(rose[pending].all()) and gains.nanmean() < 0.0:
             rose = torch.zeros_like(rose)
-        accepted = waiting & rose
-        self.accepted = torch.where(accepted[:, None], self.tried, self.accepted)
+        accepted = pending & rose
+        self.accepted = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
-            grown = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
-            self.radius[name] = torch.where(self._moved[name], grown.clamp_max(self.settings.largest), radius)
-        # An object whose step was undone is compared with its last training at the psi that it is back at.
-        undone = waiting & ~accepted
+            scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
+            self.radius[name] = torch.where(
+                self._moved[name], scaled.clamp_max(self.settings.largest), radius
+            )
+        # After a rejected step an object is compared with its last training at the accepted psi, to which it returns.
+        rejected = pending & ~accepted
         reference = scores.clone()
         reference[self.labels] = torch.where(
-            undone[:, None], self._reference[self.labels], scores[self.labels]
+            rejected[:, None], self._reference[self.labels], scores[self.labels]
         )
         verdicts = {
-            name: Verdict(bool(accepted[i]), float(self._promised[i]), float(own[i]), float(error[i]))
+            name: Verdict(bool(accepted[i]), float(self._expected[i]), float(gain[i]), float(error[i]))
             for i, name in enumerate(self.names)
-            if waiting[i]
+            if pending[i]
         }
         self._just_accepted = accepted
         self._reference = reference
-        self._moved = {name: torch.zeros_like(waiting) for name in self._moved}
+        self._moved = {name: torch.zeros_like(pending) for name in self._moved}
         return verdicts
 
     def observe(self, result: Hypergradient) -> PValues:
         gradient, error = stacked(result, self.names, self.accepted)
-        psi, slope, noise = (self.distribution.split(values) for values in (self.tried, gradient, error))
+        psi, slope, noise = (self.distribution.split(values) for values in (self.trial, gradient, error))
         p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
-        # What was seen where an object still is stays as good as new.
+        # Derivatives at a psi that has not changed keep their full weight.
         keep = torch.where(self._just_accepted, self.settings.momentum, 1.0)[:, None].to(self.accepted)
         self._joined = {}
         for factor in self.distribution.factors:
             name = factor.name
             p = factor.log_probabilities(psi[name]).exp()
-            # By p: the slope in logits is p times it, and a bin that p has left gets as long a step as any.
+            # The derivative by p: that by logits is p times it, and would hardly move a bin of small p.
             direction = -slope[name] / p
             direction = direction - direction.mean(-1, keepdim=True)
             self._joined[name] = self._averages[name].joined(direction, (noise[name] / p).square(), keep)
@@ -171,25 +184,24 @@ class CheckedSteps:
         return p_values
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        self._promised = torch.zeros_like(self._promised)
+        self._expected = torch.zeros_like(self._expected)
         if certificate.void:
-            self.tried = self.accepted
-            return self.tried
+            self.trial = self.accepted
+            return self.trial
         self._averages = self._joined
         psi, moved = self.distribution.split(self.accepted), {}
-        parts = {**PARTS, "shrunk": self.shrink}
         for factor in self.distribution.factors:
             name = factor.name
-            left = [parts[certificate.actions[object_name][name]] for object_name in self.names]
-            radius = self.radius[name] * psi[name].new_tensor(left)
+            taken = psi[name].new_tensor(fractions(certificate, self.names, name, self.shrink))
+            radius = self.radius[name] * taken
             radius = torch.where(self.radius[name] < self.settings.smallest, 0.0, radius)
             direction = self._averages[name].value
             moved[name] = within(factor, psi[name], direction, radius, self.settings.max_step)
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
-            self._promised = self._promised + (direction * change).sum(1)
-        self.tried = self.distribution.join(moved)
+            self._expected = self._expected + (direction * change).sum(1)
+        self.trial = self.distribution.join(moved)
         self._moved = {name: (moved[name] != psi[name]).any(1) for name in moved}
-        return self.tried
+        return self.trial
 
 
 def within(
@@ -199,8 +211,8 @@ def within(
     radius: Float[Tensor, "objects"],
     max_step: float,
 ) -> Float[Tensor, "objects k"]:
-    """psi moved along ``direction`` until half the absolute change of p (of bins: the total variation) is ``radius``,
-    or the largest change of a number of psi ``max_step``; by bisection."""
+    """psi moved along ``direction`` until half the absolute change of p (for bins, the total variation) reaches
+    ``radius`` or the largest change of a component of psi reaches ``max_step``; by bisection."""
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
     longest = direction * (max_step / torch.where(size > 0.0, size, 1.0))

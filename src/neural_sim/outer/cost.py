@@ -1,4 +1,4 @@
-"""What a method or a training spends."""
+"""Cost of a method or a training."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cost:
-    """What was spent: labelled images made, optimiser steps of detectors, Hessian products, seconds on the wall clock
-    and seconds of all processor cores together."""
+    """Labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time and processor seconds
+    over all cores."""
 
     images: int = 0
     detector_steps: int = 0

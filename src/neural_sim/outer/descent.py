@@ -1,4 +1,4 @@
-"""The psi loop whose steps follow a derivative, wherever that comes from: draw, train, judge, derive, step."""
+"""The psi loop of methods with a derivative: draw, train, accept or reject the last step, differentiate, step."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from neural_sim.synthesis.assembly import RenderedImages
 
 
 class GradientLoop(OuterLoop, ABC):
-    """One training step is one outer iteration. A subclass says in :meth:`_derivative` where the derivative comes from.
+    """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
 
-    Where steps are checked, the last iteration trains only to judge the last step.
+    Where steps are checked, the last iteration only trains, to accept or reject the last step.
     """
 
     def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> None:
@@ -54,10 +54,10 @@ class GradientLoop(OuterLoop, ABC):
         with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
         with timed(seconds, "train", self.inner.device):
-            # The warm start has trained on this psi already, on more images and for longer than an iteration would.
+            # The warm start has trained at this psi, on more images and for more steps than an iteration.
             recording = None if last else self._recording
-            arrived = not self.records and not self.settings.train_first
-            training_loss = self.inner.loss(cached) if arrived else self.inner.train(cached, recording)
+            trained = not self.records and not self.settings.train_first
+            training_loss = self.inner.loss(cached) if trained else self.inner.train(cached, recording)
         with timed(seconds, "judge", self.inner.device):
             scores = self.inner.scores()
             verdicts = self.steps.judge(scores)
@@ -76,25 +76,18 @@ class GradientLoop(OuterLoop, ABC):
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
+        products, by_class = _products(result), scores.sum(1)
         self.record(
-            self.psi,
-            images,
-            training_loss,
-            seconds,
-            certificate,
-            norms,
-            _products(result),
-            scores.sum(1),
-            verdicts,
+            self.psi, images, training_loss, seconds, certificate, norms, products, by_class, verdicts
         )
         self._stopped = certificate.stopped
         psi = self.steps.next(certificate)
         if not self.steps.moved:
-            self.inner.renew()  # the same training again would say nothing new
+            self.inner.renew()  # the same training again would give the same derivative
         self._go_to(psi)
 
     def derivative(self) -> Hypergradient:
-        """The derivative at psi as an iteration takes it, through new images and a training on them; psi stays."""
+        """The derivative at psi as an iteration takes it, by new images and a training on them; psi does not move."""
         self._prepare()
         rendered = self.inner.draw(self.psi)
         cached = CachedSet.of(self.inner.detector, self.inner.backbone, rendered.images)
@@ -111,14 +104,14 @@ class GradientLoop(OuterLoop, ABC):
         return -1 if self._stopped else None
 
     def _prepare(self) -> None:
-        """Make what the derivative needs beside the iteration's training."""
+        """Draw what the derivative needs beside the training images."""
 
     @abstractmethod
     def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
-        """dL_val/dpsi of the objects that are learned, zeros for others."""
+        """dL_val/dpsi of the learned objects, zeros for the others."""
 
     def _cosine(self, result: Hypergradient) -> float:
-        """Of the derivative with an independent one; nan where there is none."""
+        """Cosine of the derivative with an independent reference; nan without one."""
         return math.nan
 
 

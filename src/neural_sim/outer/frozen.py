@@ -1,4 +1,4 @@
-"""The psi loop frozen at one psi, detector and v, to compare estimators with the truth."""
+"""One state of the psi loop (psi, detector and v), to compare estimators with a reference."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class FrozenLoop:
-    """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta, and
-    ``solve`` says how that ended."""
+    """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta,
+    ``solve`` describes that solve."""
 
     scene: Scene
     detector: Detector
@@ -55,16 +55,16 @@ class FrozenLoop:
         weights = torch.full((len(images),), 1.0 / len(images), device=cached.device)
         inner = InnerProblem(trainable, cached.losses, weights)
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
-        found = hypergradient(inner, terms, {}, solver, generator)
-        solution = found.solution
+        result = hypergradient(inner, terms, {}, solver, generator)
+        solution = result.solution
         solve = (
-            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {found.damping.value:.2g}"
+            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {result.damping.value:.2g}"
         )
         vector = unflatten(solution.value, trainable)
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
     def with_factor(self, factor: BinnedFactor) -> FrozenLoop:
-        """The same state with a distribution whose only factor is ``factor``, which has the same bins."""
+        """The same state with ``factor``, of the same bins, as the distribution's only one."""
         distribution = replace(self.scene.distribution, factors=(factor,))
         return replace(self, scene=replace(self.scene, distribution=distribution))
 
@@ -98,9 +98,9 @@ class FrozenLoop:
         return [self._stratified(probed, label) for label in range(len(probed.probes))]
 
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
-        held = probed.probes[label][self.factor.name]
-        along = scores(probed.cached.losses, self.trainable, self.vector, held.index).cpu()
-        return by_strata(along, held.bins, self.factor, self.psi[label].float())
+        probes = probed.probes[label][self.factor.name]
+        along = scores(probed.cached.losses, self.trainable, self.vector, probes.index).cpu()
+        return by_strata(along, probes.bins, self.factor, self.psi[label].float())
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
@@ -110,16 +110,15 @@ class FrozenLoop:
         images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
         losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets, images.labels))
-        weights = torch.full(
-            (len(images),), len(rendered.objects) / len(images)
-        )  # every object's own sum to 1
-        held = object_images(self.scene, rendered, self.psi, weights)
-        return [estimator.estimate(losses, self.trainable, self.vector, part, {}) for part in held.values()]
+        # The weights of an object's images sum to 1.
+        weights = torch.full((len(images),), len(rendered.objects) / len(images))
+        parts = object_images(self.scene, rendered, self.psi, weights).values()
+        return [estimator.estimate(losses, self.trainable, self.vector, part, {}) for part in parts]
 
 
-def centred(found: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
-    """Logits have a free constant: derivatives are compared without their mean."""
-    values = torch.stack([part.value for part in found])
+def centred(derivatives: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
+    """Derivatives by centred logits: a constant added to all logits does not change p."""
+    values = torch.stack([part.value for part in derivatives])
     return values - values.mean(-1, keepdim=True)
 
 

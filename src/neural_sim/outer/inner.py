@@ -1,4 +1,4 @@
-"""What all methods share: images drawn from p_psi, a detector trained on them, its loss on the target set."""
+"""The inner problem, common to all methods: images drawn from p_psi, and a detector trained on them."""
 
 from __future__ import annotations
 
@@ -37,21 +37,29 @@ def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterat
 
 
 def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
-    """Whether images come from a pool: where none is differentiated and the light does not move."""
+    """Whether images come from a pool: where images are not differentiated and the light is fixed."""
     return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
 class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
-    The detector has the backbone of ``params``, frozen; its pyramid and head train ``settings.epochs`` epochs each time
-    an iteration asks, on the device of ``params``, where the scene's fields are too. ``validation`` is the labelled
-    target set, anywhere; no step sees any other real image. ``draws`` says how the method wants images drawn. Relaxed
-    ones, and those under a light that moves, are always rendered anew, all others come from a pool of every bin.
-    The batch size and the decay of its steps are those of ``training``.
+    The backbone is that of ``params``, frozen. Pyramid and head are trained for ``settings.epochs`` epochs at a time on
+    the device of ``params``, where the scene's fields are too. Relaxed draws, and images under a light that moves, are
+    always rendered anew; all others come from a pool of poses of every bin.
+
+    Args:
+        scene: what images are drawn from.
+        detector, params: the detector and its warm start.
+        validation: the labelled target set, on any device; the loop sees no other images of the target.
+        settings: of the psi loop.
+        training: batch size and weight decay.
+        generator: of all draws.
+        draws: how the method draws images.
+
     With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
-    ``images`` and ``steps`` count labelled images made and optimiser steps; ``cpu_begun`` is the processor time at
-    which the pool was begun.
+    ``images`` and ``steps`` count labelled images and optimiser steps; ``cpu_begun`` is the processor time before the
+    pool was rendered.
     """
 
     def __init__(
@@ -71,11 +79,11 @@ class InnerLoop:
         self.validation = CachedSet.of(detector, self.backbone, validation)
         self.draws, self.device = draws, self.validation.device
         self.pool: ImagePool | None = None
-        begun, self.cpu_begun = time.perf_counter(), time.process_time()
+        began, self.cpu_begun = time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
             self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
         synchronise(self.device)
-        self.pool_seconds = time.perf_counter() - begun
+        self.pool_seconds = time.perf_counter() - began
         self._start = params
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
@@ -83,7 +91,7 @@ class InnerLoop:
         self.images = self.steps = self._numbers = 0
         self.common_numbers = False
         self.trajectory: Trajectory | None = None
-        self._judged: tuple[Parameters, Outputs] = ({}, (torch.empty(0), torch.empty(0)))
+        self._evaluated: tuple[Parameters, Outputs] = ({}, (torch.empty(0), torch.empty(0)))
 
     @property
     def trainable(self) -> Parameters:
@@ -99,25 +107,25 @@ class InnerLoop:
         return rendered
 
     def _common(self, purpose: int) -> torch.Generator:
-        """The same random numbers every time until :meth:`renew`, or new ones."""
+        """A generator of the same random numbers until :meth:`renew`, or of new ones without ``common_numbers``."""
         if not self.common_numbers:
             return self.generator
         seed = self.generator.initial_seed() + 2_000_003 * (1 + self._numbers) + purpose
         return torch.Generator().manual_seed(seed)
 
     def renew(self) -> None:
-        """Other random numbers from now on."""
+        """Change the common random numbers."""
         self._numbers += 1
 
     def train(self, images: CachedSet, recording: Recording | None = None) -> float:
-        """Train theta on the images; returns the last epoch's loss, nan where there are no epochs.
+        """Train theta on the images; returns the last epoch's loss, nan for no epochs.
 
-        What ``recording`` wants kept of the steps is in ``trajectory``.
+        With ``recording``, the steps are in ``trajectory``.
         """
         if self.settings.epochs == 0:
             return math.nan
         how = replace(self.training.of(self.settings.epochs), learning_rate=self.settings.learning_rate)
-        # The proximal term takes the decay's place: with both, its Hessian would not be the inner problem's.
+        # The proximal term replaces weight decay: with both, its Hessian would not be the inner problem's.
         if self.detector.proximal > 0.0:
             how = replace(how, weight_decay=0.0)
         start = self.theta if self.settings.start == "previous" else self._start
@@ -138,14 +146,14 @@ class InnerLoop:
         return float(self.objective.of_outputs(self._on_validation()))
 
     def scores(self) -> Float[Tensor, "classes images"]:
-        """What each validation image adds to theta's score for each class, more is better."""
+        """Each validation image's contribution to theta's score of each class, more is better."""
         return self.objective.scores(self._on_validation())
 
     @torch.no_grad()
     def _on_validation(self) -> Outputs:
-        """theta's outputs on the validation images, computed once for each theta."""
-        theta, outputs = self._judged
+        """theta's outputs on the validation images, cached until theta changes."""
+        theta, outputs = self._evaluated
         if theta is not self.theta:
             outputs = self.objective.outputs(self.trainable)
-            self._judged = (self.theta, outputs)
+            self._evaluated = (self.theta, outputs)
         return outputs

@@ -1,4 +1,4 @@
-"""The frame of every outer loop: psi, what is recorded of an iteration, and the Trainer that runs it."""
+"""Base of all outer loops: psi, an iteration's record, and the Trainer that runs the loop."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ logger = logging.getLogger(__name__)
 class OuterLoop(pl.LightningModule):
     """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
 
-    ``inner`` draws the images of an iteration and trains the detector on them. A subclass's ``training_step`` ends with
-    :meth:`record` and, after psi has moved, ``trajectory.append``: what the method would report if it ended there.
+    ``inner`` draws an iteration's images and trains the detector on them. A subclass's ``training_step`` ends with
+    :meth:`record` and, after the step of psi, appends to ``trajectory`` the method's result if it ended there.
     """
 
     def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], rounds: int) -> None:
@@ -47,7 +47,7 @@ class OuterLoop(pl.LightningModule):
         return range(self.rounds)
 
     def on_train_batch_end(self, *step: Any) -> None:
-        """Show an observer the iteration that has ended; its processor time is not the method's."""
+        """Call ``on_record``, whose processor time is not counted as the method's."""
         begun = time.process_time()
         self.on_record(self.records[-1])
         self._cpu += time.process_time() - begun
@@ -64,9 +64,9 @@ class OuterLoop(pl.LightningModule):
         scores: Tensor | None = None,
         verdicts: Mapping[str, Verdict] | None = None,
     ) -> IterationRecord:
-        """Keep what an iteration did with images drawn from ``psi``, before any step."""
+        """Record an iteration on ``images`` drawn from ``psi``, before the step."""
         p_by_factor = self.scene.distribution.probabilities(psi.detach())
-        done, cpu = (self.inner.images, self.inner.steps), time.process_time()
+        counted, cpu = (self.inner.images, self.inner.steps), time.process_time()
         if not self.records:
             seconds = {"pool": self.inner.pool_seconds, **seconds}
         self.records.append(
@@ -79,8 +79,8 @@ class OuterLoop(pl.LightningModule):
                 validation_loss=self.inner.validation_loss(),
                 training_loss=training_loss,
                 certificate=certificate,
-                images=done[0] - self._counted[0],
-                detector_steps=done[1] - self._counted[1],
+                images=counted[0] - self._counted[0],
+                detector_steps=counted[1] - self._counted[1],
                 products=products,
                 images_without_box=int((~images.present.any(-1)).sum()),
                 scores=[] if scores is None else scores.tolist(),
@@ -89,35 +89,33 @@ class OuterLoop(pl.LightningModule):
                 cpu_seconds=cpu - self._cpu,
             )
         )
-        self._counted, self._cpu = done, cpu
+        self._counted, self._cpu = counted, cpu
         number, last = len(self.records), self.records[-1]
         if certificate is None:
-            logger.info("round %d/%d val %.4f%s", number, self.rounds, last.validation_loss, _told(last))
+            logger.info("round %d/%d val %.4f%s", number, self.rounds, last.validation_loss, _outcomes(last))
         else:
-            logger.info(line(certificate, number, self.rounds, last.validation_loss) + _told(last))
+            logger.info(line(certificate, number, self.rounds, last.validation_loss) + _outcomes(last))
         return last
 
 
 def learn_psi(
     module: OuterLoop, progress: bool, on_record: Callable[[IterationRecord], object] | None = None
 ) -> LearnedPsi:
-    """Run the loop to its budget through a Lightning Trainer that writes nothing. ``on_record`` is called with each
-    iteration's record when it has ended."""
+    """Run the loop to its end by a Lightning Trainer that writes nothing. ``on_record`` is called with the record of
+    each iteration when it ends."""
     if on_record is not None:
         module.on_record = on_record
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
-        # psi and its account are a few numbers: they stay on the CPU wherever images and detector are.
+        # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
         trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records)
 
 
-def _told(record: IterationRecord) -> str:
-    """What became of the steps before, for the log."""
-    named = {True: "gained", False: "undone"}
-    parts = [
-        f"{named[accepted]} {', '.join(name for name, v in record.verdicts.items() if v.accepted == accepted)}"
-        for accepted in (True, False)
-        if any(v.accepted == accepted for v in record.verdicts.values())
-    ]
-    return "; " + "; ".join(parts) if parts else ""
+def _outcomes(record: IterationRecord) -> str:
+    """Accepted and rejected steps of objects, for the log."""
+    text = ""
+    for outcome, accepted in (("accepted", True), ("rejected", False)):
+        names = [name for name, verdict in record.verdicts.items() if verdict.accepted == accepted]
+        text += f"; {outcome} {', '.join(names)}" if names else ""
+    return text

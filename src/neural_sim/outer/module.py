@@ -1,4 +1,4 @@
-"""The psi loop of Eq. 1 as a LightningModule: render, train the detector, hypergradient, step psi; and again."""
+"""The psi loop of Eq. 1 as a LightningModule: render, train the detector, take the hypergradient, step psi."""
 
 from __future__ import annotations
 
@@ -19,27 +19,23 @@ from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.response import agreement
-from neural_sim.outer.retrained import as_double, binned_problem, check
+from neural_sim.outer.retrained import as_double, binned_problem, retrained_cosine
 from neural_sim.outer.unrolling import through_training
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.assembly import RenderedImages
 
 
 class SimulatorModule(GradientLoop):
-    """psi moved by the hypergradient, with a certificate for every step."""
+    """psi follows the hypergradient, with a certificate for every iteration."""
 
     def __init__(
-        self,
-        inner: InnerLoop,
-        psi: Float[Tensor, "objects K"],
-        estimator: Estimator,
-        solver: AdjointSolver,
+        self, inner: InnerLoop, psi: Float[Tensor, "objects K"], estimator: Estimator, solver: AdjointSolver
     ) -> None:
         super().__init__(inner, psi)
         self.estimator, self.solver = estimator, solver
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
-        # A generator of its own, so that being certified does not change a run.
+        # A generator of its own, so that certifying does not change a run.
         self._check_generator = torch.Generator().manual_seed(inner.generator.initial_seed() + 1)
         if self.settings.adjoint == "unrolled":
             self._recording = self.settings.unrolled.recording
@@ -59,25 +55,19 @@ class SimulatorModule(GradientLoop):
             subset=None if subset is None else subset.to(device),
         )  # fmt: skip
         probed = self._probes
-        held = object_images(self.scene, rendered, self.psi, weights)
+        by_object = object_images(self.scene, rendered, self.psi, weights)
+        learned = {name: by_object[name] for name in self._names}
         if self.settings.adjoint == "unrolled":
-            learned = {self.scene.names[label]: held[self.scene.names[label]] for label in self._learned}
             return self._with_fixed(
                 through_training(self.inner, inner, self.estimator, cached, labels, learned, probed)
             )
         losses = bound_losses(cached, self.inner.backbone, labels, probed.cached if probed else None)
         estimates = {
-            name: self._bind(losses, held[name], probed.probes[label] if probed else {})
-            for label, name in enumerate(self.scene.names)
-            if label in self._learned
+            name: self._bind(losses, learned[name], probed.probes[label] if probed else {})
+            for label, name in zip(self._learned, self._names, strict=True)
         }
         result = hypergradient(
-            inner,
-            self.inner.objective.terms(),
-            estimates,
-            self.solver,
-            self.inner.generator,
-            self._adjoint,
+            inner, self.inner.objective.terms(), estimates, self.solver, self.inner.generator, self._adjoint
         )
         self._adjoint = result.solution.value
         return self._with_fixed(result)
@@ -91,21 +81,21 @@ class SimulatorModule(GradientLoop):
             standard_errors={**zeros, **result.standard_errors},
         )
 
-    def _bind(self, losses: Losses, held: ObjectImages, probes: dict[str, Probes]) -> Callable:
+    def _bind(self, losses: Losses, images: ObjectImages, probes: dict[str, Probes]) -> Callable:
         trainable = self.inner.trainable
-        return lambda vector: self.estimator.estimate(losses, trainable, vector, held, probes)
+        return lambda vector: self.estimator.estimate(losses, trainable, vector, images, probes)
 
     def _prepare(self) -> None:
-        """New probes, or a part of them, so that what is peculiar to some does not push psi the same way for ever."""
-        every = self.estimator.probes_per_bin
-        if not every:
+        """Draw probes, or replace a fraction of them, so that the noise of a sample does not bias all iterations."""
+        per_bin = self.estimator.probes_per_bin
+        if not per_bin:
             return
         if self._probes is None:
-            self._probes = self._every_bin(every, self.inner.generator, self._learned)
+            self._probes = self._every_bin(per_bin, self.inner.generator, self._learned)
             return
-        part = max(1, round(self.settings.refresh * every))
-        fresh = self._every_bin(part, self.inner.generator, self._learned)
-        self._probes = fresh if part == every else self._probes.renewed(fresh, len(self.records))
+        new = max(1, round(self.settings.refresh * per_bin))
+        fresh = self._every_bin(new, self.inner.generator, self._learned)
+        self._probes = fresh if new == per_bin else self._probes.renewed(fresh, len(self.records))
 
     def _every_bin(self, per_bin: int, generator: torch.Generator, objects: Sequence[int]) -> ProbeSet:
         """``per_bin`` images of every bin of every factor of the objects, with their features."""
@@ -117,18 +107,18 @@ class SimulatorModule(GradientLoop):
         return probed
 
     def _cosine(self, result: Hypergradient) -> float:
-        """The mean over objects and factors of the cosine with the response of training itself; or, in turn, one
-        object's and factor's with a problem retrained to its end."""
+        """Cosine with the response of training, averaged over objects and factors; or, for one object and factor in
+        turn, with finite differences of the retrained problem."""
         if self.settings.certify == "response":
             return agreement(self.inner, self.psi, result, self._learned)
         return self._retrained(result) if self.scene.distribution.binned else math.nan
 
     def _retrained(self, result: Hypergradient) -> float:
-        """One object's gradient of one factor against finite differences of a retrained problem.
+        """Cosine of one object's derivative by one factor with finite differences of the retrained problem.
 
-        That problem is the one of this step's probes, with the proximal term whose exact derivative the step's solve
-        took: its damping, held at the parameters of this step, beside the detector's own. Estimators without probes
-        get images drawn for the purpose.
+        That problem has this step's probes, and beside the detector's proximal term the one whose exact derivative
+        this step's damped solve takes: its lambda, anchored at this step's parameters. For estimators without probes,
+        images are drawn.
         """
         every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
         done = len(self.records) + 1
@@ -147,4 +137,4 @@ class SimulatorModule(GradientLoop):
         validation = self.inner.objective.double().terms()
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
-        return check(problem, validation, psi, label, as_double(trainable), gradient).cosine
+        return retrained_cosine(problem, validation, psi, label, as_double(trainable), gradient)

@@ -1,4 +1,4 @@
-"""What psi lowers: a loss of the trained detector on the validation images, and its parts by class."""
+"""The outer objective L_val: a loss of the trained detector on the validation images, and its parts by class."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from neural_sim.types import LabelledImages
 class Objective:
     """L_val as a function of the parameters.
 
-    ``loss`` is the mean loss of the validation images ``cached``, as in the paper. ``average_precision`` is one minus
-    the mean over classes of the ``smooth`` average precision, plus ``smooth.loss`` times that loss; it needs the boxes
-    of ``images``, the same ones.
+    ``kind``: ``loss`` is the mean loss of the validation images (the paper's). ``average_precision`` is one minus the
+    mean over classes of the ``smooth`` average precision, plus ``smooth.loss`` times that loss. ``cached`` has the
+    validation images' features, ``images`` the same images' boxes.
     """
 
     cached: CachedSet
@@ -45,11 +45,11 @@ class Objective:
         return 1.0 - self.smooth_ap(outputs).sum(1).nanmean() + self.smooth.loss * loss
 
     def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """What each image adds to the smooth average precision of every class; nan for a class without a box."""
+        """Each image's contribution to the smooth average precision of every class; nan for a class without a box."""
         return self.smooth(self.cached.detector, outputs, self.images)
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
-        """The detector's outputs on all images. Only these stay in memory for a derivative, not what led to them."""
+        """The detector's outputs on all images. A derivative recomputes intermediate values chunk by chunk."""
         parts = [
             checkpoint(self.cached.outputs, params, rows, use_reentrant=False)
             for rows in torch.arange(len(self.cached), device=self.cached.device).split(chunk_size)
@@ -59,14 +59,16 @@ class Objective:
 
     @torch.no_grad()
     def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """What each image adds to the score of every class, more is better. A class's score, the sum of its row, is
-        L_val's part of it with the other sign, without the one; losses are the mean over images with a box of the
-        class. nan for a class without one. On the CPU."""
+        """Each image's contribution to the score of every class, more is better; on the CPU.
+
+        A class's score, the sum of its row, is minus its part of L_val (up to the constant one), with losses averaged
+        over the images with a box of the class; nan for a class without a box.
+        """
         labels = self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()
         classes = torch.arange(outputs[0].shape[-1])
-        own = (labels == classes[:, None, None]).any(-1).to(losses)
-        parts = -own * losses / own.sum(1, keepdim=True)
+        shown = (labels == classes[:, None, None]).any(-1).to(losses)
+        parts = -shown * losses / shown.sum(1, keepdim=True)
         if self.kind == "loss":
             return parts
         return self.smooth_ap(outputs).cpu() + self.smooth.loss * parts

@@ -1,4 +1,4 @@
-"""Probes: images of every bin drawn on purpose, and how a part of them is renewed from iteration to iteration."""
+"""Probes: a stratified sample of images, a fixed number of every bin, of which each iteration replaces a fraction."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ProbeSet:
-    """``per_bin`` images of every bin of every factor of every object, bin after bin, with their features; the anchor
-    lights are the bins of an illumination.
+    """``per_bin`` images of every bin of every factor of every object, bin after bin, with their features.
 
-    ``probes`` are an object's by the factor's name, none of objects that are left out.
+    The bins of an illumination are its anchor lights. ``probes``, by object and by the factor's name, are rows of
+    ``cached``; empty for objects that were left out.
     """
 
     probes: list[dict[str, Probes]]
@@ -39,7 +39,7 @@ class ProbeSet:
         objects: Sequence[int],
         source: Source | None = None,
     ) -> ProbeSet:
-        """Images of some ``objects``, rendered by ``source`` (None: the scene); what a factor's bin does not fix is
+        """Probes of some ``objects``, rendered by ``source`` (None: the scene); all factors but the stratified one are
         drawn from p_psi."""
         drawn: list[LabelledImages] = []
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
@@ -55,7 +55,8 @@ class ProbeSet:
         return ProbeSet(probes, cached, per_bin)
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """These probes with ``fresh`` ones, fewer in every bin, in the places whose turn it is; all places in turn.
+        """These probes with the next ``fresh.per_bin`` of every bin, cyclically by the iteration ``turn``, replaced by
+        ``fresh`` ones.
 
         Raises:
             ValueError: for more fresh probes a bin than there are places.
@@ -64,9 +65,9 @@ class ProbeSet:
             raise ValueError(f"probes: got {fresh.per_bin} fresh ones a bin for {self.per_bin} places")
         places = (turn * fresh.per_bin + torch.arange(fresh.per_bin)) % self.per_bin
         targets, sources, probes = [], [], []
-        for held, new in zip(self.probes, fresh.probes, strict=True):
+        for old, new in zip(self.probes, fresh.probes, strict=True):
             probes.append({})
-            for name, part in held.items():
+            for name, part in old.items():
                 rows = part.index.view(-1, self.per_bin)[:, places]
                 bins = part.bins.view(-1, self.per_bin).clone()
                 bins[:, places] = new[name].bins.view(-1, fresh.per_bin)

@@ -1,4 +1,4 @@
-"""What an outer loop leaves: one record an iteration, and the distributions it went through."""
+"""Results of an outer loop: one record an iteration, and the trajectory of psi."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from neural_sim.outer.steps import Verdict
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """What one outer iteration did; probabilities, by factor and object, are those the images were drawn from, before
-    the step.
+    """One outer iteration.
 
-    ``images`` are the labelled images made in it, probes included, ``detector_steps`` the optimiser steps and
-    ``products`` the Hessian products spent. ``seconds`` are by phase and by the clock on the wall, ``cpu_seconds``
-    those that all processor cores together worked, which other processes on the machine disturb less.
-    ``certificate`` is None for methods without a hypergradient, and where the last iteration took none. ``scores`` of
-    the classes are those of the loop's objective, more is better; ``verdicts`` are of the objects whose last step was
-    checked.
+    ``probabilities`` and ``entropies`` (nats), by factor and object, are of the distribution that the images were drawn
+    from, before the step. ``images`` counts labelled images, probes included, ``detector_steps`` optimiser steps and
+    ``products`` Hessian products. ``seconds`` are wall-clock times by phase, ``cpu_seconds`` the processor time over
+    all cores, which other processes on the machine disturb less. ``certificate`` is None for methods without a
+    hypergradient, and in an iteration that takes none. ``scores`` [classes] are those of the loop's objective, more is
+    better. ``verdicts`` are of the objects whose last step was accepted or rejected.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -44,14 +43,14 @@ class IterationRecord:
 
 
 def cost_of(record: IterationRecord) -> Cost:
-    """Of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``, which counts them already."""
+    """Cost of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``, which includes them."""
     phases = record.seconds.items()
     seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
     return Cost(record.images, record.detector_steps, record.products, seconds, record.cpu_seconds)
 
 
 def record_of(stored: Mapping[str, Any]) -> IterationRecord:
-    """A record from what ``dataclasses.asdict`` made of one."""
+    """The inverse of ``dataclasses.asdict`` for a record."""
     certificate = stored["certificate"]
     return IterationRecord(
         **{
@@ -64,21 +63,21 @@ def record_of(stored: Mapping[str, Any]) -> IterationRecord:
 
 @dataclass(frozen=True)
 class LearnedPsi:
-    """The loop's outcome. ``trajectory`` is what the method would report before the first iteration and after each; a
-    checked step is in it from the training on that accepted it. ``before`` is what was spent before the first: on the
-    warm start, whose backbone every loop has."""
+    """The loop's result. ``trajectory`` has the method's psi before the first iteration and after each, a checked step
+    once it is accepted. ``before`` is the cost before the first iteration: the warm start, whose backbone every loop
+    uses."""
 
     trajectory: Float[Tensor, "iterations+1 objects K"]
     records: list[IterationRecord]
     before: Cost = field(default_factory=Cost)
 
     def cost(self, iterations: int) -> Cost:
-        """What was spent up to the end of so many iterations; nothing before the first, whose psi is given."""
+        """Cost up to the end of so many iterations; zero for none, whose psi is given."""
         return sum(
             (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
         )
 
     @property
     def last(self) -> Float[Tensor, "objects K"]:
-        """What the method reports."""
+        """The method's result."""
         return self.trajectory[-1]

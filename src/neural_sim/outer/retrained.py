@@ -1,7 +1,7 @@
-"""The hypergradient by finite differences of a retrained inner problem: what the implicit one should agree with.
+"""The hypergradient by finite differences of a retrained inner problem: the reference of the implicit one.
 
-The problem is small enough to be trained to its end: images of every bin on purpose, which psi enters by the bins'
-weights alone, so that its minimiser moves smoothly with psi and every number is deterministic.
+The problem is small enough to be trained to a stationary point. It has a fixed sample of every bin, and psi enters by
+the bins' weights alone, so that its minimiser is a smooth and deterministic function of psi.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class BinnedProblem:
         return InnerProblem(params, self.losses, weights, self.chunk_size, self.proximal, anchor)
 
     def retrain(self, psi: Float[Tensor, "objects k"], start: Params, tolerance: float) -> Minimum:
-        """The minimiser reached from ``start``, its gradient's norm at most ``tolerance`` if it says converged."""
+        """The minimiser reached from ``start``, of a gradient norm of at most ``tolerance`` if it converged."""
         return minimise(self.at(psi, start).terms(), start, tolerance)
 
     def estimate(
         self, psi: Float[Tensor, "objects k"], label: int, params: Params
     ) -> Callable[[Params], MixedDerivative]:
-        """``v -> d/dpsi <dL_train/dtheta, v>`` of one object: exact, since nothing here is sampled."""
+        """``v -> d/dpsi <dL_train/dtheta, v>`` of one object; exact, without sampling."""
         part = self.probes[label]
 
         def exact(vector: Params) -> MixedDerivative:
@@ -83,15 +83,14 @@ class BinnedProblem:
 class FiniteDifference:
     """Central differences of L_val at retrained parameters, in centred logits of one object.
 
-    ``slope`` is the largest gradient norm that any retraining ended at; ``converged`` says whether all of them reached
-    the tolerance. ``products`` counts Hessian products, ``trainings`` the retrainings.
+    ``slope`` is the largest final gradient norm of the retrainings; ``converged`` says whether all of them reached the
+    tolerance. ``trainings`` counts the retrainings.
     """
 
     gradient: Float[Tensor, "k"]
     converged: bool
     slope: float
     trainings: int
-    products: int
 
 
 def finite_difference(
@@ -105,8 +104,8 @@ def finite_difference(
 ) -> FiniteDifference:
     """dL_val/dpsi of object ``label`` by k - 1 central differences of ``step`` logits, two retrainings each.
 
-    ``start`` is the minimiser at ``psi``, from which every retraining sets out. Its own error: ``step``^2 / 6 times a
-    third derivative, and ``|dL_val/dtheta| tolerance / (proximal step)`` from retraining no further than ``tolerance``.
+    Every retraining starts from ``start``, the minimiser at ``psi``. Error: ``step``^2 / 6 times a third derivative,
+    and ``|dL_val/dtheta| tolerance / (proximal step)`` from ending the retrainings at ``tolerance``.
     """
     total, runs = torch.zeros_like(psi[label]), []
     for direction in contrasts(psi.shape[-1]).to(psi):
@@ -119,49 +118,33 @@ def finite_difference(
                 values.append(math.fsum(float(term(runs[-1].params)) for term in validation))
         total += (values[0] - values[1]) / (2.0 * step) * direction
     return FiniteDifference(
-        total,
-        all(run.converged for run in runs),
-        max(run.slope for run in runs),
-        len(runs),
-        sum(run.products for run in runs),
+        total, all(run.converged for run in runs), max(run.slope for run in runs), len(runs)
     )
 
 
-@dataclass(frozen=True)
-class Check:
-    """A step's gradient of one object against the finite difference; ``cosine`` is nan unless that one converged."""
-
-    cosine: float
-    label: int
-    difference: FiniteDifference
-
-
-def check(
+def retrained_cosine(
     problem: BinnedProblem,
     validation: Sequence[Term],
     psi: Float[Tensor, "objects k"],
     label: int,
     start: Params,
     gradient: Float[Tensor, "k"],
-) -> Check:
-    """The cosine of ``gradient``, however it was estimated, with the retrained finite difference of ``problem``.
+) -> float:
+    """Cosine of object ``label``'s ``gradient``, from any estimator, with the finite differences of ``problem``; nan
+    where a retraining does not converge.
 
-    The problem is trained to its end from ``start`` first, so that a low cosine also tells of an inner problem that the
-    loop leaves far from its minimum, of a short solve and of a noisy estimate.
+    The problem is first trained from ``start`` to its minimum. So a low cosine has one of several causes: an inner
+    problem far from its minimum in the loop, a solve ended early, or a noisy estimate.
     """
     minimum = problem.retrain(psi, start, TOLERANCE)
     if not minimum.converged:
         logger.warning("certificate: retraining stopped at a gradient of %.2g; no cosine", minimum.slope)
-        return Check(
-            math.nan,
-            label,
-            FiniteDifference(torch.zeros_like(gradient), False, minimum.slope, 1, minimum.products),
-        )
-    found = finite_difference(problem, validation, psi, label, minimum.params)
-    if not found.converged:
-        logger.warning("certificate: a retraining stopped at a gradient of %.2g; no cosine", found.slope)
-        return Check(math.nan, label, found)
-    return Check(centred_cosine(gradient, found.gradient), label, found)
+        return math.nan
+    difference = finite_difference(problem, validation, psi, label, minimum.params)
+    if not difference.converged:
+        logger.warning("certificate: a retraining stopped at a gradient of %.2g; no cosine", difference.slope)
+        return math.nan
+    return centred_cosine(gradient, difference.gradient)
 
 
 def binned_problem(
@@ -179,9 +162,9 @@ def binned_problem(
     few = images.select(torch.cat([part.index for part in chosen])).double()
     sizes = [len(part.index) for part in chosen]
     rows = torch.arange(sum(sizes)).split(sizes)
-    held = [Probes(row, part.bins) for row, part in zip(rows, chosen, strict=True)]
+    renumbered = [Probes(row, part.bins) for row, part in zip(rows, chosen, strict=True)]
     weight, centre = merged_anchor([(weight, as_double(anchor)) for weight, anchor in pulls])
-    return BinnedProblem(few.losses, held, log_probabilities, weight, centre)
+    return BinnedProblem(few.losses, renumbered, log_probabilities, weight, centre)
 
 
 def as_double(params: Params) -> Params:
@@ -213,7 +196,8 @@ def contrasts(k: int) -> Float[Tensor, "k-1 k"]:
 
 
 def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
-    """Cosine of two gradients in centred logits, where softmax lives; nan where either vanishes."""
+    """Cosine of two gradients after subtracting their means (a constant added to logits does not change softmax); nan
+    where either vanishes."""
     left, right = (g.double() - g.double().mean() for g in (left, right))
     size = float(left.norm() * right.norm())
     return float(left @ right) / size if size > 0.0 else math.nan

@@ -22,14 +22,17 @@ OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
 @dataclass(frozen=True)
 class Trust:
-    """What a psi step's hypergradient must meet to be trusted; None makes no demand.
+    """Conditions under which a psi step's hypergradient is trusted; None: no condition.
 
-    ``max_residual`` of the adjoint solve, relative; ``max_stationarity`` of ``|dL_train/dtheta|``; ``max_sensitivity``
-    of the relative change from lambda to 2 lambda (wants ``solver.sensitivity``); these three are of the implicit
-    adjoint. ``min_cosine`` is with what ``outer.certify`` measures (wants ``outer.certify_every``). These speak of all
-    objects. ``level`` speaks of each object and factor of psi: the probability with which an iteration's derivative
-    that is zero passes for one that is not (see ``gradient.significance``). ``shrink`` is the part of an untrusted step
-    that is taken where ``outer.on_untrusted`` says shrink.
+    The first four are on the whole hypergradient, ``level`` is on each object's derivative by each factor.
+
+    Args:
+        max_residual: relative residual of the adjoint solve (implicit adjoint).
+        max_stationarity: ``|dL_train/dtheta|`` (implicit adjoint).
+        max_sensitivity: relative change from lambda to 2 lambda (implicit adjoint; wants ``solver.sensitivity``).
+        min_cosine: cosine with the reference of ``outer.certify`` (wants ``outer.certify_every``).
+        level: significance level of the test that a derivative is zero (see ``gradient.significance``).
+        shrink: fraction of an untrusted step that is taken under ``outer.on_untrusted=shrink``.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -60,16 +63,16 @@ class Trust:
 
 @dataclass(frozen=True)
 class Checks:
-    """Steps that the next iteration's training accepts or undoes.
+    """Trust-region steps, which the next iteration's training accepts or rejects.
 
     Args:
-        radius: of each object's first step by a factor, in total variation (of lights: half the absolute change of the
-            weights).
-        largest, smallest: radii; under ``smallest`` an object rests.
-        errors: standard errors by which an object's own score must rise for its step to be kept.
-        grow, shrink: what an accepted and an undone step multiply the radius by.
-        momentum: what an iteration's derivative counts in the next one's average, before noise is weighed.
-        max_step: the most by which a step changes a logit (or a weight).
+        radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
+            the weights).
+        largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
+        errors: standard errors by which an object's score must rise for its step to be accepted.
+        grow, shrink: factors of the radius after an accepted and a rejected step.
+        momentum: weight of an iteration's derivative in the next one's average, before noise is weighed.
+        max_step: largest change of a logit (or a weight) in one step.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -101,33 +104,47 @@ class Checks:
 
 @dataclass(frozen=True)
 class Outer:
-    """The psi loop: how often, on how many images, how long the detector trains in between, and how psi steps.
+    """Settings of the psi loop.
 
-    Each iteration's training starts from the pyramid and head of the iteration before (``previous``, the paper), of the
-    warm start (``warm``) or from new ones, always the same (``fresh``). A detector that goes on remembers bins that psi
-    has left, and its loss does not miss them; one that starts anew shows what the distribution itself teaches. The
-    first iteration's hypergradient is taken at the warm start as it is, unless ``train_first``.
-    psi's steps shorten linearly over the iterations to ``final_step`` of their length (Robbins and Monro 1951);
-    ``update`` steps logits of bins, ``light_update`` weights of lights.
-    ``curvature_images`` of an iteration's training images make the Hessian products (0: all of them). ``pool_per_bin``
-    poses of every bin are rendered once and composed afresh (0: every image is rendered anew); the pathwise
-    estimator, which replays exact draws, always renders. ``refresh`` is the part of the probes that an iteration draws
-    anew; the others keep their images, and what other factors of p_psi gave them. ``quality`` is that of the loop's
-    renders (None: the renderer's own); the scored detectors always train on the renderer's. ``learned`` names the
-    objects whose psi moves (None: all); for the others no probe is drawn and no second derivative taken.
-    ``objective`` is L_val: one minus the smooth average precision of the validation images (``smooth_ap`` says how
-    smooth), or their ``loss``, as in the paper.
-    ``steps`` are ``checked`` as ``checks`` says: every iteration trains under the same random numbers, and the last one
-    trains only to judge the last step; or ``free``, by ``update``.
-    ``adjoint`` says what the hypergradient is of: a stationary point, by the solver (``implicit``, the paper's Eq. 2),
-    or the training that was run (``unrolled``, as ``unrolled`` says), which every iteration must then have: it wants
-    ``train_first`` and epochs, and no retrained finite differences, which are of a stationary point.
-    ``on_untrusted`` is what happens to a step that fails ``trust``: the step of one factor of one object where its
-    derivative is not significant, of all where the doubt is about all. ``keep`` takes it whole, as the paper does;
-    ``stop`` skips the former, and ends the loop at the latter or where no object is left. Every ``certify_every`` steps
-    (0: never) the hypergradient is compared: with the ``response`` of training itself at this psi, a training for each
-    bin (:mod:`outer.response`), or with finite differences of a problem ``retrained`` to stationarity on
-    ``certify_per_bin`` images of every bin, one object in turn, 2 k - 1 such trainings.
+    Args:
+        update: the optimiser of free steps, for logits of bins.
+        iterations: outer iterations.
+        images_per_object: training images of each object in an iteration.
+        epochs, learning_rate: of an iteration's training.
+        start: initial pyramid and head of that training: those of the iteration before (``previous``, the paper's), of
+            the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that goes on remembers
+            bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
+        train_first: train before the first hypergradient; otherwise that is taken at the warm start.
+        adjoint: the hypergradient of a stationary point, by the solver (``implicit``, the paper's Eq. 2), or of the
+            training that was run (``unrolled``). The latter wants ``train_first``, epochs and no ``certify=retrained``.
+        unrolled: settings of the unrolled adjoint.
+        objective: L_val: one minus the smooth average precision of the validation images, or their ``loss`` (the
+            paper's).
+        smooth_ap: settings of that smooth average precision.
+        steps: ``checked``: in a trust region. Consecutive trainings use the same random numbers, and the last iteration
+            only trains, to accept or reject the last step. ``free``: by ``update``.
+        checks: settings of checked steps.
+        final_step: free steps shorten linearly over the iterations to this fraction (Robbins and Monro 1951).
+        curvature_images: training images of the Hessian products; 0: all.
+        pool_per_bin: poses of every bin that are rendered once and then composited onto new backgrounds; 0: every image
+            is rendered anew, as it always is for the pathwise estimator, which replays exact draws.
+        refresh: fraction of the probes that an iteration replaces. The others keep their images, with the values that
+            the other factors of p_psi had when they were drawn.
+        quality: of the loop's renders; None: the renderer's own, which the scored detectors always train on.
+        trust: conditions on the hypergradient.
+        on_untrusted: what happens to steps that fail ``trust``: those of one factor of one object where its derivative
+            is not significant, all of them where the whole hypergradient fails. ``keep`` takes them whole, as the paper
+            does; ``stop`` skips the former, and ends the loop at the latter or where no step is left.
+        learned: names of the objects whose psi moves; None: all. The others get no probes and no second derivatives.
+        light_update: the optimiser of free steps, for weights of lights.
+        certify: reference of the hypergradient: the ``response`` of training at this psi, one training for each bin
+            (:mod:`outer.response`), or finite differences of a problem ``retrained`` to stationarity, for one object
+            in turn, 2 k - 1 trainings.
+        certify_every: iterations from one comparison to the next; 0: never.
+        certify_per_bin: images of every bin in the retrained problem.
+
+    Raises:
+        ValueError: any of these out of its range, or a combination that cannot be, with the keys and the values.
     """
 
     update: Update
@@ -158,6 +175,7 @@ class Outer:
 
     def __post_init__(self) -> None:
         at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
+        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
         at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
         at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         at_least("outer", 0, certify_every=self.certify_every)
@@ -167,23 +185,14 @@ class Outer:
             )
         if not 0.0 < self.refresh <= 1.0:
             raise ValueError(f"outer.refresh must lie in (0, 1], got {self.refresh}")
-        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
-        if self.start not in get_args(Start):
-            raise ValueError(f"outer.start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
         if self.learned is not None and not self.learned:
             raise ValueError("outer.learned: want the names of objects, or null for all, got none")
         if not 0.0 < self.final_step <= 1.0:
             raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
-        if self.on_untrusted not in get_args(OnUntrusted):
-            raise ValueError(
-                f"outer.on_untrusted must be one of {', '.join(get_args(OnUntrusted))}, got {self.on_untrusted!r}"
-            )
         for key, kinds in (
-            ("adjoint", AdjointKind),
-            ("objective", ObjectiveKind),
-            ("steps", StepKind),
-            ("certify", CertifyKind),
-        ):
+            ("start", Start), ("adjoint", AdjointKind), ("objective", ObjectiveKind), ("steps", StepKind),
+            ("certify", CertifyKind), ("on_untrusted", OnUntrusted),
+        ):  # fmt: skip
             if getattr(self, key) not in get_args(kinds):
                 raise ValueError(
                     f"outer.{key} must be one of {', '.join(get_args(kinds))}, got {getattr(self, key)!r}"

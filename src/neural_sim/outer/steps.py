@@ -1,4 +1,4 @@
-"""What an iteration's hypergradient does to psi: steps taken as they come. Checked ones: :mod:`outer.checked`."""
+"""Steps of psi: what every kind has, and free steps. Trust-region steps: :mod:`outer.checked`."""
 
 from __future__ import annotations
 
@@ -19,39 +19,36 @@ from neural_sim.parameter.update import Update, UpdateState
 
 PValues = Mapping[str, Mapping[str, float]]
 """By object and factor."""
-PARTS = {"kept": 1.0, "skipped": 0.0, "stopped": 0.0}
-"""What is left of a step by what its certificate did; of one that is shrunk, ``outer.trust.shrink``."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of an object's step, seen from the next iteration's training.
+    """Whether an object's step was accepted, by the next iteration's training; a rejected one is taken back.
 
-    ``promised`` is the fall of L_val that the hypergradient foretold to first order, ``came`` the rise of the object's
-    own score, ``error`` the standard error of that rise by validation image. A step that was not ``accepted`` was
-    undone.
+    ``expected_gain`` is the fall of L_val that the hypergradient predicts to first order, ``measured_gain`` the rise of
+    the object's score, ``error`` the standard error of that rise over validation images.
     """
 
     accepted: bool
-    promised: float
-    came: float
+    expected_gain: float
+    measured_gain: float
     error: float
 
 
 class Steps(Protocol):
-    """Moves psi [objects, K] of the objects that are learned."""
+    """Moves psi [objects, K] of the learned objects."""
 
     def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
-        """What the training on the last step's psi says of it. ``scores`` are what each validation image adds to the
-        score of each class, more is better."""
+        """Accept or reject the last step by the training on its psi. ``scores`` are each validation image's
+        contributions to the score of each class, more is better."""
         ...
 
     def observe(self, result: Hypergradient) -> PValues:
-        """Take in an iteration's derivative; p-values of the null that the derivative which steps follow is zero."""
+        """Add an iteration's derivative; p-values of the null that the derivative which steps follow is zero."""
         ...
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """psi that the next iteration trains on."""
+        """psi of the next iteration's training."""
         ...
 
     @property
@@ -61,12 +58,12 @@ class Steps(Protocol):
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        """psi that the loop reports if it ends now."""
+        """psi of the loop's result if it ends now."""
         ...
 
 
 class FreeSteps:
-    """``outer.update`` and ``outer.light_update``, step by step, with nothing undone.
+    """Steps of ``outer.update`` and ``outer.light_update``, none of which is rejected.
 
     Steps shorten linearly over ``outer.iterations`` to ``outer.final_step`` of their length.
     """
@@ -82,7 +79,7 @@ class FreeSteps:
         self.reported = psi.detach().clone()
         self._states = {name: UpdateState.zeros(part) for name, part in distribution.split(psi).items()}
         self._gradient = self._error = torch.zeros_like(psi)
-        self._done, self.moved = 0, True
+        self._steps, self.moved = 0, True
 
     def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
         return {}
@@ -92,26 +89,25 @@ class FreeSteps:
         return result.p_values
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """A derivative without signal joins the momentum nevertheless: the average of several may tell what each does
-        not."""
-        part = 1.0 + self._done / max(1, self.settings.iterations - 1) * (self.settings.final_step - 1.0)
-        self._done += 1
+        """An insignificant derivative enters the momentum nevertheless: the average of several may be significant."""
+        length = 1.0 + self._steps / max(1, self.settings.iterations - 1) * (self.settings.final_step - 1.0)
+        self._steps += 1
         if certificate.void:
             return self.reported
         psi, slope, noise = (
             self.distribution.split(values) for values in (self.reported, self._gradient, self._error)
         )
-        moved, parts = {}, {**PARTS, "shrunk": self.settings.trust.shrink}
+        moved = {}
         for factor in self.distribution.factors:
             name = factor.name
             after = self._step(factor, psi[name], slope[name], noise[name])
-            left = [parts[certificate.actions[object_name][name]] for object_name in self.names]
-            moved[name] = psi[name] + after.new_tensor(left)[:, None] * (after - psi[name])
-        self.reported = self.reported + part * (self.distribution.join(moved) - self.reported)
+            taken = after.new_tensor(fractions(certificate, self.names, name, self.settings.trust.shrink))
+            moved[name] = psi[name] + taken[:, None] * (after - psi[name])
+        self.reported = self.reported + length * (self.distribution.join(moved) - self.reported)
         return self.reported
 
     def _step(self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor) -> Tensor:
-        """One factor's step: in logits of bins, or in weights of lights, which stay on their constraint."""
+        """One factor's step in logits of bins, or in weights of lights, which are projected on their constraint."""
         update: Update = getattr(self.settings, factor.update)
         moved, self._states[factor.name] = update.step(
             psi, factor.log_probabilities(psi), slope, noise, self._states[factor.name]
@@ -119,10 +115,16 @@ class FreeSteps:
         return factor.project(moved)
 
 
+def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
+    """Fraction that is taken of each object's step by a factor; ``shrink`` is that of a shrunk step."""
+    taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0, "stopped": 0.0}
+    return [taken[certificate.actions[name][factor]] for name in names]
+
+
 def stacked(
     result: Hypergradient, names: Sequence[str], like: Tensor
 ) -> tuple[Float[Tensor, "objects K"], Float[Tensor, "objects K"]]:
     """The named objects' derivatives and their standard errors."""
-    found = (result.psi_gradients, result.standard_errors)
-    gradient, error = (torch.stack([values[name] for name in names]).to(like) for values in found)
+    both = (result.psi_gradients, result.standard_errors)
+    gradient, error = (torch.stack([values[name] for name in names]).to(like) for values in both)
     return gradient, error

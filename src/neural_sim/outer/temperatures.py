@@ -1,4 +1,4 @@
-"""What the temperature of the Gumbel-softmax does to the draws, and to the pathwise derivative's bias and variance."""
+"""The Gumbel-softmax temperature's effect on draws, and on the pathwise derivative's bias and variance."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from neural_sim.parameter.factor import BinnedFactor, BinNoise
 class AtTemperature:
     """One object at one tau, all from the same noise.
 
-    ``frequencies`` is the part of the relaxed draws that lies in each bin. ``bias`` is |mean estimate - truth| of
-    centred logits, the noise of both taken off (0 where it explains all), ``bias_error`` its standard error; ``spread``
-    is the root of the variance, summed over components, of an estimate from ``images`` images; ``cosine`` is the mean
-    estimate's with the truth.
+    ``frequencies`` are the fractions of the relaxed draws in each bin. ``bias`` is |mean estimate - truth| in centred
+    logits, after subtracting the variance of both (0 where that is larger), ``bias_error`` its standard error.
+    ``spread`` is the square root of the variance, summed over components, of an estimate from ``images`` images.
+    ``cosine`` is that of the mean estimate with the truth.
     """
 
     object: str
@@ -37,8 +37,11 @@ class AtTemperature:
 
 @dataclass(frozen=True)
 class Truth:
-    """One object's derivative over hard bins: its length, its noise, and the spread that the stratified estimator has
-    with as many images as a row of :class:`AtTemperature`. ``probabilities`` are p, what draws should follow."""
+    """One object's derivative over hard bins.
+
+    ``length`` is its norm, ``noise`` its standard error, ``spread`` the stratified estimator's with as many images as a
+    row of :class:`AtTemperature`. ``probabilities`` are p, the expected frequencies of draws.
+    """
 
     object: str
     length: float
@@ -96,7 +99,7 @@ class Temperatures:
         for value in self.values:
             moved = loop.with_factor(replace(loop.bins, temperature=value))
             generator = torch.Generator().manual_seed(seed + 1)  # the same noise at every temperature
-            found = torch.stack(
+            estimates = torch.stack(
                 [centred(moved.pathwise(estimator, images, generator)) for _ in range(self.rounds)]
             )
             for label, name in enumerate(names):
@@ -106,7 +109,7 @@ class Temperatures:
                         name,
                         value,
                         frequencies,
-                        *against(found[:, label], truth[label], errors[label]),
+                        *against(estimates[:, label], truth[label], errors[label]),
                         images,
                     )
                 )
@@ -121,7 +124,7 @@ def against(
     off = mean - truth
     noise = variance / len(estimates) + truth_errors.square()
     bias = math.sqrt(max(0.0, float(off.square().sum() - noise.sum())))
-    # |off| moves with the noise along off; where there is no bias, with all of it.
+    # |off| varies with the noise along off; without a bias, with all of it.
     along = float((off.square() * noise).sum().sqrt() / off.norm().clamp_min(1e-30))
     error = along if bias > 0.0 else float(noise.sum().sqrt())
     cosine = float(mean @ truth / (mean.norm() * truth.norm()).clamp_min(1e-30))
@@ -129,7 +132,7 @@ def against(
 
 
 def bin_frequencies(factor: BinnedFactor, psi: Float[Tensor, "k"], draws: int, seed: int) -> list[float]:
-    """Part of the relaxed draws that lies in each bin, where the uniform offset within the bin is left out."""
+    """Fractions of the relaxed draws in each bin, each draw at its bins' middles (without the offset within a bin)."""
     generator = torch.Generator().manual_seed(seed)
     noise = BinNoise(gumbel((draws, factor.bins), generator, torch.float64))
     middle = torch.full((draws,), 0.5, dtype=torch.float64)

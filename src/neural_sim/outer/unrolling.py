@@ -1,8 +1,9 @@
-"""The psi loop's own way to the derivative of its training: what was recorded, and what is summed over its steps."""
+"""The derivative of the psi loop's last training, from its recorded steps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 from jaxtyping import Int
 from torch import Tensor
@@ -26,12 +27,18 @@ def through_training(
     images: Mapping[str, ObjectImages],
     probed: ProbeSet | None,
 ) -> Hypergradient:
-    """The derivative of the loop's last training, on ``cached`` images with boxes of these ``labels``.
+    """The derivative of L_val through the loop's last training.
 
-    ``images`` are those of every object that is learned, ``probed`` the probes of all objects.
+    Args:
+        loop: with the recorded training.
+        problem: its objective.
+        estimator: of the derivative by psi.
+        cached, labels: its training images and the labels of their boxes.
+        images: those of each learned object.
+        probed: the probes of all objects.
 
     Raises:
-        ValueError: where that training was not recorded.
+        ValueError: that training was not recorded.
     """
     if loop.trajectory is None:
         raise ValueError("unrolled: the last training was not recorded; want train(images, recording)")
@@ -42,18 +49,18 @@ def through_training(
     groups = None
     if probed is not None:
         probes = {name: probed.probes[loop.scene.names.index(name)] for name in images}
-        tables = [part.index.view(-1, probed.per_bin) for held in probes.values() for part in held.values()]
+        tables = [part.index.view(-1, probed.per_bin) for parts in probes.values() for part in parts.values()]
         groups = ProbeGroups(probed.cached.losses, tables)
 
-    def estimate(name: str, found: Accumulated) -> MixedDerivative:
-        return estimator.accumulated(found, images[name], probes[name])
+    def estimate(name: str, sums: Accumulated) -> MixedDerivative:
+        return estimator.accumulated(sums, images[name], probes[name])
 
     return unrolled_hypergradient(
         problem,
         loop.trajectory,
         examples,
         loop.objective.terms(),
-        {name: lambda found, name=name: estimate(name, found) for name in images},
+        {name: partial(estimate, name) for name in images},
         loop.settings.unrolled,
         loop.generator,
         groups,
@@ -62,9 +69,9 @@ def through_training(
 
 
 def inputs_of(loop: InnerLoop, cached: CachedSet, labels: Int[Tensor, "images boxes"]) -> InputsOf:
-    """A cached set's inputs made again of images, and of their boxes where those are given too."""
+    """The function that computes a cached set's inputs from images, and from their boxes where those are given too."""
 
-    def made(leaves: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
+    def inputs(leaves: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
         pixels, *boxes = leaves
         features = loop.detector.features(loop.backbone, pixels)
         targets = cached.targets.select(rows)
@@ -72,4 +79,4 @@ def inputs_of(loop: InnerLoop, cached: CachedSet, labels: Int[Tensor, "images bo
             targets = loop.detector.assign(boxes[0], labels[rows, : boxes[0].shape[1]])
         return (*features, targets.deltas)
 
-    return made
+    return inputs

@@ -13,12 +13,7 @@ from neural_sim.cameras import pixel_rays, ray_rates
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
-from neural_sim.field.rendering import (
-    SAMPLES_AT_ONCE,
-    render_packed,
-    render_views,
-    render_with_tangents,
-)
+from neural_sim.field.rendering import SAMPLES_AT_ONCE, render_packed, render_views, render_with_tangents
 from neural_sim.types import Maps, PinholeCamera, Rays
 
 Quality = Literal["draft", "normal", "final"]

@@ -1,4 +1,4 @@
-"""An object as target sets and symmetry see it: a name, a size, and images of it, whether of a mesh or of a field."""
+"""An object of which target sets and symmetry render images, by its mesh or by its field."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neural_sim.types import PinholeCamera
 
 
 class Subject(Protocol):
-    """``radius`` is that of the object's sphere in metres, None where nobody knows it."""
+    """An object; ``radius`` is that of its bounding sphere in metres, None if unknown."""
 
     @property
     def name(self) -> str: ...
@@ -27,21 +27,19 @@ class Subject(Protocol):
     def radius(self) -> float | None: ...
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
         """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
 
-        Raises ``ValueError`` for a light that this object cannot be seen under.
+        Raises:
+            ValueError: an object that cannot be rendered, or not under this lighting.
         """
         ...
 
 
 @dataclass(frozen=True)
 class MeshSubject:
-    """A mesh, under the renderer's own light or any other."""
+    """A mesh, under the renderer's default light or any other."""
 
     item: ObjectMesh
     renderer: MeshRenderer
@@ -52,50 +50,28 @@ class MeshSubject:
         return self.item.name
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
         return self.renderer.render(self.item.mesh, camera, camera_to_world, lighting)
 
 
 @dataclass(frozen=True)
-class Unseen:
-    """An object by its name, for targets that render none."""
-
-    name: str
-    radius: float | None = None
-
-    def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
-    ) -> Float[Tensor, "n h w 4"]:
-        raise ValueError(f"{self.name}: there is nothing to render here, its field is not asked for")
-
-
-@dataclass(frozen=True)
 class FieldSubject:
-    """A field of an object that there is no mesh of, under the light that its views saw."""
+    """A field, under the light of its views; ``field`` is None for targets that render no object."""
 
     name: str
-    field: RadianceField
+    field: RadianceField | None = None
     radius: float | None = None
     renderer: NerfRenderer = dataclasses.field(default_factory=NerfRenderer)
 
     def render(
-        self,
-        camera: PinholeCamera,
-        camera_to_world: Float[Tensor, "n 4 4"],
-        lighting: Lighting | None = None,
+        self, camera: PinholeCamera, camera_to_world: Float[Tensor, "n 4 4"], lighting: Lighting | None = None
     ) -> Float[Tensor, "n h w 4"]:
+        if self.field is None:
+            raise ValueError(f"{self.name}: nothing to render, since this target asked for no field")
         if lighting is not None:
-            raise ValueError(
-                f"{self.name}: a field of photographs is seen under their light alone, not another"
-            )
-        own = next(self.field.parameters())
-        rgb, opacity = self.renderer.render(self.field, camera, camera_to_world.to(own))
+            raise ValueError(f"{self.name}: a field of photographs can be rendered under their light alone")
+        like = next(self.field.parameters())
+        rgb, opacity = self.renderer.render(self.field, camera, camera_to_world.to(like))
         colour = torch.where(opacity[..., None] > 0.0, rgb / opacity[..., None].clamp_min(1e-6), 0.0)
         return torch.cat([colour.clamp(0.0, 1.0), opacity[..., None].clamp(0.0, 1.0)], -1).float().cpu()

@@ -96,7 +96,7 @@ def _slug(comparison: Comparison) -> str:
 
 
 def _sources(group: Group) -> dict[str, Any]:
-    """What a table was made from, for compare.json."""
+    """The data of a table, for compare.json."""
     rows = [{"method": r.method, "seed": r.seed, "run": r.name, "run_id": r.run_id} for r in group.runs]
     return {"heading": group.heading, "scoring": group.runs[0].results["scoring"], "runs": rows}
 
@@ -133,7 +133,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         + (" (one seed: over images alone)." if count == 1 else "."),
         *_on_other_devices(runs),
         "",
-        f"| method | AP | of the gap won back | {c.reference} ahead by | area ahead by "
+        f"| method | AP | of the gap closed | {c.reference} ahead by | area ahead by "
         f"| AP after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
         "|---|---|---|---|---|---|---|---|---|",
     ]

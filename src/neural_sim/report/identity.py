@@ -23,10 +23,7 @@ SHOWN = 3
 
 
 def identity(
-    config: Mapping[str, Any],
-    files: Mapping[str, Any],
-    code: Mapping[str, str],
-    test: LabelledImages,
+    config: Mapping[str, Any], files: Mapping[str, Any], code: Mapping[str, str], test: LabelledImages
 ) -> dict[str, Any]:
     """What results.json carries for a comparison.
 

@@ -55,7 +55,7 @@ def table(rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> str:
     """Markdown: everything relative to the length of the truth."""
     lines = [
         f"Estimates of d/dpsi <dL_train/dtheta, v> from {rows[0].images} images, in lengths of the derivative over "
-        "hard bins.",
+        "hard bins."
     ]
     for truth in truths:
         lines += [

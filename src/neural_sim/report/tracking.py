@@ -244,7 +244,7 @@ def connect(uri: str) -> Any:
 
 
 def _experiment_id(client: Any, uri: str, name: str) -> str:
-    """The experiment, made where there is none, with the tag of model training unless it has one of its kind."""
+    """The experiment, created if it does not exist, with the tag of model training unless it has another kind's."""
     from mlflow.exceptions import MlflowException
 
     experiment = client.get_experiment_by_name(name)

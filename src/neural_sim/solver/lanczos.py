@@ -10,15 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.base import Search
-from neural_sim.solver.operator import (
-    Matvec,
-    NonFiniteProduct,
-    Watched,
-    in_range,
-    norm,
-    numbers,
-    plain_norm,
-)
+from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, in_range, norm, numbers, plain_norm
 
 
 @dataclass(frozen=True)

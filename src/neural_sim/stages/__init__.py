@@ -1,1 +1,1 @@
-"""The stages of a run: one file each, which says what it needs, the key of its result, how it is made and stored."""
+"""The stages of a run: one file each, with its inputs, the key of its result, and how that is computed and stored."""

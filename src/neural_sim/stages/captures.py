@@ -1,4 +1,4 @@
-"""The objects of a run as photographs: their views, and their fields in the place of meshes."""
+"""The objects of a run as photographs: their views, and fields in the place of meshes."""
 
 from __future__ import annotations
 
@@ -10,42 +10,33 @@ from neural_sim.field.base import RadianceField
 from neural_sim.objects.photos import Photos
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.renderer.subject import FieldSubject, Subject, Unseen
+from neural_sim.renderer.subject import FieldSubject
+from neural_sim.stages.meshes import Objects
 from neural_sim.stages.views import ViewsStage
 from neural_sim.types import PosedViews
 
 
 @dataclass(frozen=True)
-class Captures:
-    """The objects of ``source`` by name; see :class:`~neural_sim.stages.meshes.Meshes`."""
+class Captures(Objects):
+    """Objects of photographs."""
 
     source: Photos
 
     @cached_property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.source.names())
-
-    @cached_property
-    def digests(self) -> dict[str, str]:
-        return self.source.digests()
-
-    @cached_property
     def radii(self) -> dict[str, float | None]:
-        """Of the objects, in metres, where somebody said their size."""
+        """``objects.size``, halved."""
         return {name: self.source.radius(name) for name in self.names}
 
-    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
-        """An object as target sets see it: its field, or its name alone for targets that render nothing."""
-        if field is None:
-            return Unseen(name, self.radii[name])
+    def subject(self, name: str, field: RadianceField | None = None) -> FieldSubject:
+        """The object by its field; without one, for targets that render no object, it cannot be rendered."""
         renderer = NerfWRenderer() if isinstance(field, AppearanceField) else NerfRenderer()
         return FieldSubject(name, field, self.radii[name], renderer)
 
 
 @dataclass(frozen=True)
 class PhotoViewsStage(ViewsStage):
-    """Photographs of one object, ``content`` the digest of their files, as views of one camera. Of ``settings`` the
-    counts and the image size apply."""
+    """Photographs of one object as views of one camera. ``content`` is the digest of their files; of ``settings`` only
+    the counts and the image size apply."""
 
     @property
     def held_out(self) -> int:
@@ -58,5 +49,5 @@ class PhotoViewsStage(ViewsStage):
         return self.objects.source
 
     def make(self, results: object) -> PosedViews:
-        wanted = self.settings
-        return self._source.views(self.object, wanted.count, wanted.held_out, wanted.image_size)
+        counts = self.settings
+        return self._source.views(self.object, counts.count, counts.held_out, counts.image_size)

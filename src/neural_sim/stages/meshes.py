@@ -1,7 +1,8 @@
-"""The objects of a run as meshes, loaded when a stage first draws one, and what draws them."""
+"""The objects of a run, and their kind that has meshes: loaded when a stage first renders one."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, Protocol
@@ -13,37 +14,27 @@ from neural_sim.renderer.subject import MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
 
 
-class ObjectSource(Protocol):
-    """Where objects come from, such as a folder of meshes."""
+class Source(Protocol):
+    """A source of objects, such as a folder."""
 
     def names(self) -> list[str]: ...
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each object's geometry and texture, by name."""
+        """SHA-256 of each object's content, by name."""
         ...
+
+
+class ObjectSource(Source, Protocol):
+    """A source of meshes."""
 
     def load(self) -> list[ObjectMesh]: ...
 
 
-class Objects(Protocol):
-    """The objects of a run by name, of meshes or of photographs. ``radii`` are in metres, None where unknown."""
-
-    @cached_property
-    def names(self) -> tuple[str, ...]: ...
-    @cached_property
-    def digests(self) -> dict[str, str]: ...
-    @cached_property
-    def radii(self) -> dict[str, float | None]: ...
-    def subject(self, name: str, field: RadianceField | None = None) -> Subject: ...
-
-
 @dataclass(frozen=True)
-class Meshes:
-    """The objects of ``source`` by name, and a mesh renderer."""
+class Objects(ABC):
+    """The objects of a run by name, of meshes or of photographs. ``radii`` are in metres, None if unknown."""
 
-    source: ObjectSource
-    backend: Literal["auto", "pyrender", "raycast"] = "auto"
-    supersample: int = 2
+    source: Source
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -54,17 +45,34 @@ class Meshes:
         return self.source.digests()
 
     @cached_property
+    @abstractmethod
+    def radii(self) -> dict[str, float | None]: ...
+
+    @abstractmethod
+    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
+        """The object as target sets render it; ``field`` is its radiance field where there is one."""
+
+
+@dataclass(frozen=True)
+class Meshes(Objects):
+    """Objects of meshes, and their renderer."""
+
+    source: ObjectSource
+    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    supersample: int = 2
+
+    @cached_property
     def items(self) -> dict[str, ObjectMesh]:
         return {item.name: item for item in self.source.load()}
 
     @cached_property
     def radii(self) -> dict[str, float | None]:
-        """Of the objects, in metres; None of objects whose source knows no unit (``metric`` is False)."""
-        known = getattr(self.source, "metric", True)
-        return {name: item.radius if known else None for name, item in self.items.items()}
+        """None for all objects of a source without a unit (its ``metric`` is False)."""
+        metric = getattr(self.source, "metric", True)
+        return {name: item.radius if metric else None for name, item in self.items.items()}
 
-    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
-        """An object as target sets see it: its mesh, whatever its field."""
+    def subject(self, name: str, field: RadianceField | None = None) -> MeshSubject:
+        """The object by its mesh, with or without a field."""
         return MeshSubject(self.items[name], self.renderer, self.radii[name])
 
     @cached_property

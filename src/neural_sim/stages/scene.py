@@ -39,5 +39,6 @@ class SceneStage(Stage[Scene]):
 
     def make(self, results: Results) -> Scene:
         fields = tuple(results(stage).field for stage in self.fields)
-        made = self.renderer, self.camera, self.synthesizer, self.distribution
-        return Scene(self.names, fields, *made, radii=self.radii)
+        return Scene(
+            self.names, fields, self.renderer, self.camera, self.synthesizer, self.distribution, radii=self.radii
+        )  # fmt: skip

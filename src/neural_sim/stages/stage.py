@@ -31,7 +31,7 @@ class Stage(ABC, Generic[T]):
     """
 
     name: str
-    """What ``stages=[...]`` must list for a result that the store lacks to be made."""
+    """The stage that ``stages=[...]`` must list in order to compute a result that is not stored."""
     kind: str
     """The folder of the store."""
     keep: ClassVar[bool] = True
@@ -94,7 +94,7 @@ class Results:
 
     Args:
         store: where results are kept.
-        asked: names of the stages that may be made; results of others must be in the store.
+        asked: names of the stages that may be computed; results of others must be in the store.
         reused: called with every result that the store had.
     """
 

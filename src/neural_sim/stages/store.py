@@ -44,7 +44,7 @@ class Store:
         """The result ``key``, from the store or from ``make``.
 
         ``make`` returns tensors, numbers, strings and lists and dicts of these: all that is read back is read
-        with ``weights_only``, so that a shared store cannot run code. An unreadable entry is made again, with
+        with ``weights_only``, so that a shared store cannot run code. An unreadable entry is computed again, with
         a warning.
         """
         path = self.root / kind / f"{key}.pt"

@@ -51,8 +51,8 @@ class TargetSetsStage(Stage[TargetSets]):
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}
         objects = {name: self.objects.subject(name, fields.get(name)) for name in self.objects.names}
-        drawn = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
-        return TargetSets(**self.target.sets(objects, *drawn))
+        how = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
+        return TargetSets(**self.target.sets(objects, *how))
 
     def pack(self, value: TargetSets) -> dict[str, dict[str, Tensor]]:
         return {part.name: _packed(getattr(value, part.name)) for part in fields(TargetSets)}
@@ -62,8 +62,8 @@ class TargetSetsStage(Stage[TargetSets]):
 
 
 def _packed(images: LabelledImages) -> dict[str, Tensor]:
-    held = {field.name: getattr(images, field.name).cpu() for field in fields(LabelledImages)}
-    return held | {"images": to_bytes(images.images)}
+    tensors = {field.name: getattr(images, field.name).cpu() for field in fields(LabelledImages)}
+    return tensors | {"images": to_bytes(images.images)}
 
 
 def _unpacked(stored: Mapping[str, Tensor]) -> LabelledImages:
