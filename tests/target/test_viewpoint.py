@@ -102,8 +102,12 @@ def test_a_viewpoint_rebuilds_its_camera_whatever_the_pose():
 def test_a_camera_above_and_one_beside_by_hand():
     """An object 2 m ahead. Seen from above: its +z points to the camera. Upright, its +x to the camera: phi is 90
     degrees."""
-    above = torch.tensor([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
-    beside = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
+    above = torch.tensor(
+        [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 2.0], [0.0, 0.0, 0.0, 1.0]]
+    )
+    beside = torch.tensor(
+        [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     seen = viewpoint_of(torch.stack([above, beside]))
     torch.testing.assert_close(seen.phi, torch.tensor([0.0, 0.5 * math.pi], dtype=torch.float64))
     assert seen.distance.tolist() == [2.0, 2.0]

@@ -1,4 +1,4 @@
-"""From which side a camera sees an object: the inverse of the project's orbit, and the bins of p_psi that it falls in."""
+"""From which side a camera sees an object: the inverse of the project's orbit, and the bin of p_psi it falls in."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Viewpoint:
     """Cameras as :func:`neural_sim.cameras.orbit` places them, float64.
 
     ``phi`` and ``rho`` are its angles in radians, ``distance`` is that from the object's centre, in the unit of the
-    poses. ``roll`` in [-pi, pi] turns the orbit's camera about its own backward axis, anticlockwise as seen from behind:
+    poses. ``roll`` in [-pi, pi] turns the orbit's camera about its own backward axis, anticlockwise seen from behind:
     camera_to_world = orbit(phi, rho, distance) Rz(roll), for a camera that looks straight at the object's centre.
     """
 
@@ -41,9 +41,9 @@ def viewpoint_of(
 ) -> Viewpoint:
     """The orbit's camera that sees an object from the side from which a real camera sees it.
 
-    An orbit's camera looks straight at the object, a real one rarely does. Its direction from the object is kept, and it
-    is turned to face the object by the smallest rotation that does; what is left over is the roll. Where the
-    object lies in the image has no part in the angles.
+    An orbit's camera looks straight at the object, a real one rarely does. Its direction from the object is kept, and
+    it is turned to face the object by the smallest rotation that does; what is left over is the roll. Where the object
+    lies in the image has no part in the angles.
 
     (phi, rho, roll) and (-phi, rho + pi, roll + pi) are one camera. Of the two, the one is taken that lies within the
     ranges, or that misses them by less; if both do alike, as where both ranges are full circles, the one of the smaller
@@ -67,7 +67,9 @@ def viewpoint_of(
     right, backward = turn[:, 0], -turn[:, 2]
     toward = -torch.einsum("nij,ni->nj", turn, offset) / distance.clamp_min(1e-300)[:, None]
     if not bool((distance > 0.0).all() and ((backward * toward).sum(-1) > -1.0 + 1e-12).all()):
-        raise ValueError("viewpoint: want cameras that stand off the object's centre and do not turn their back to it")
+        raise ValueError(
+            "viewpoint: want cameras that stand off the object's centre and do not turn their back to it"
+        )
     right = _turned(right, backward, toward)
     theta = torch.atan2(toward[:, :2].norm(dim=-1), toward[:, 2])
     azimuth = torch.atan2(toward[:, 1], toward[:, 0])
@@ -90,8 +92,8 @@ def bins_of_poses(
 ) -> Int[Tensor, "n"]:
     """The bin of each pose by the first binned factor of p_psi, from 0, as :attr:`LabelledImages.bins` has it.
 
-    Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is not
-    told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance
+    Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is
+    not told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance
     outside of the range falls in the bin at that end.
     """
     unknown = torch.full((len(object_to_camera),), -1)
