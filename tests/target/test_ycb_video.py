@@ -134,12 +134,18 @@ def sets_of(target, names=NAMES, seed=3):
     return target.sets({name: Unseen(name, 0.06) for name in names}, POSES, camera, synthesizer, seed)
 
 
-def test_scenes_are_split_whole(shared_root):
+def test_scenes_are_split_whole(shared_root, caplog):
     target = of(shared_root)
     scenes = [{name.scene for name in part} for part in target.parts(1).values()]
     assert scenes[0] and scenes[1] and not scenes[0] & scenes[1] and len(scenes[0] | scenes[1]) == 3
     assert any(target.parts(seed) != target.parts(1) for seed in range(2, 9))
-    made = sets_of(target)
+    with caplog.at_level(logging.INFO):
+        made = sets_of(target)
+    for part in made.values():  # the log counts boxes by bins from 1
+        for label, name in enumerate(NAMES):
+            own = (part.bins[part.labels == label] + 1).tolist()
+            counted = ", ".join(f"{b}: {own.count(b)}" for b in sorted(set(own)))
+            assert not own or f"{name} {counted}" in caplog.text
     assert {name: len(part) for name, part in made.items()} == {"val": 3, "test": 6}
     assert all(bool(part.bins[part.present].ge(0).all()) for part in made.values())
     assert made["val"].images.shape[-2:] == (45, 60)

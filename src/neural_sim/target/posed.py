@@ -198,16 +198,14 @@ class PosedTarget(ABC):
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
         radii = {name: item.radius for name, item in objects.items()}
-        size = camera.height, camera.width
-        parts = self.parts(seed)
-        for part, names in parts.items():
-            scenes = sorted({name.scene for name in names})
+        size, names, made = (camera.height, camera.width), list(objects), {}
+        for part, frames in self.parts(seed).items():
+            made[part] = self.load(frames, names, *size, distribution, radii)
             _log.info(
-                "%s: %s has %d photographs of scenes %s", self._root, part, len(names), ", ".join(scenes)
-            )
-        return {
-            part: self.load(names, list(objects), *size, distribution, radii) for part, names in parts.items()
-        }
+                "%s: %s has %d photographs of scenes %s; boxes in each pose bin, from 1: %s", self._root, part,
+                len(frames), ", ".join(sorted({frame.scene for frame in frames})), _counted(made[part], names),
+            )  # fmt: skip
+        return made
 
     def load(
         self,
@@ -289,3 +287,12 @@ class PosedTarget(ABC):
         centre = self._centre(class_name)
         at: Tensor | None = None if centre is None else torch.from_numpy(centre)[None]
         return int(bins_of_poses(distribution, torch.from_numpy(pose)[None], radius, at))
+
+
+def _counted(images: LabelledImages, names: Sequence[str]) -> str:
+    """How many boxes of each object are in each bin, for the log."""
+    counts = [Counter((images.bins[images.labels == label] + 1).tolist()) for label in range(len(names))]
+    return "; ".join(
+        f"{name} " + ", ".join(f"{b or 'unknown'}: {count}" for b, count in sorted(own.items()))
+        for name, own in zip(names, counts, strict=True) if own
+    )  # fmt: skip
