@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from neural_sim.cameras import opencv_camera
 from neural_sim.objects.capture import ROTATION_TOLERANCE
@@ -154,17 +155,24 @@ def camera_of_matrix(matrix: Any, width: int, height: int, where: str) -> Pinhol
         raise ValueError(f"{where}: {error}") from error
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) by the file's header.
+@contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """The image of a file.
 
     Raises:
-        ValueError: no such file, or none that is an image.
+        ValueError: no such file, or none that can be read as an image, to its end where its pixels are asked for.
     """
     try:
         with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
+            yield image
+    except OSError as error:  # UnidentifiedImageError is one
         raise ValueError(f"{path}: not a readable image ({error})") from error
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) by the file's header. Raises ``ValueError`` for a file that is none, see :func:`opened`."""
+    with opened(path) as image:
+        return image.size
 
 
 def grid_of(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -175,7 +183,7 @@ def grid_of(path: Path, size: tuple[int, int]) -> np.ndarray:
     """
     if (got := image_size(path)) != size:
         raise ValueError(f"{path}: is {_by(got)} pixels, its photograph {_by(size)}")
-    with Image.open(path) as image:
+    with opened(path) as image:
         grid = np.asarray(image)
     if grid.ndim != 2:
         raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")

@@ -14,7 +14,6 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from neural_sim.digests import digest
@@ -24,7 +23,7 @@ from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, large_enough
-from neural_sim.target.frames import Frame, FrameName, Listed
+from neural_sim.target.frames import Frame, FrameName, Listed, opened
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.split import split
 from neural_sim.target.viewpoint import bins_of_poses
@@ -111,7 +110,7 @@ class PosedTarget(ABC):
 
     @abstractmethod
     def _files(self, name: FrameName) -> list[Path]:
-        """All files that :meth:`frame` may read for it."""
+        """The files that its labelled image is made from."""
 
     def _centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
         """An object's centre in the frame of its poses, in metres; None: the origin."""
@@ -255,7 +254,7 @@ class PosedTarget(ABC):
         left_out: Counter[str],
     ) -> tuple[Photo, int]:
         """The letterboxed photograph, and how many of its boxes were too small."""
-        with Image.open(frame.image) as photo:
+        with opened(frame.image) as photo:
             image, placing = letterbox(photo, height, width)
         boxes, labels, bins = [], [], []
         for item in frame.objects:
