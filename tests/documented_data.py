@@ -13,9 +13,11 @@ import trimesh
 from captures import capture
 from documented import PAGES, ROOT
 from PIL import Image
+from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
 
 from neural_sim.objects.procedural import Procedural
 from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.target.ycb_video import CLASSES
 
 COLOURS = np.array(
     [[200, 40, 40], [40, 70, 200], [230, 200, 40], [60, 160, 70], [240, 240, 240], [120, 60, 30]], np.uint8
@@ -87,7 +89,8 @@ def coco(path: Path) -> Path:
                 left, top = 8 + 55 * slot + 2 * frame, 20 + 10 * slot
                 picture[top : top + 40, left : left + 36] = COLOURS[label % 6]
                 annotations.append({"id": len(annotations), "image_id": len(images), "category_id": label,
-                                    "bbox": [left, top, 36, 40], "area": 1440, "iscrowd": 0})  # fmt: skip
+                                    "bbox": [left, top, 36, 40], "area": 1440, "iscrowd": 0,
+                                    "pose": video % 8 + 1})  # fmt: skip
             name = f"{folder.name}/{frame:04d}.png"
             Image.fromarray(picture).save(path.parent / name)
             images.append({"id": len(images), "file_name": name, "width": 120, "height": 90, "scene": video})
@@ -96,6 +99,23 @@ def coco(path: Path) -> Path:
     document = {"images": images, "annotations": annotations, "categories": categories, "camera": camera}
     path.write_text(json.dumps(document))
     return path
+
+
+def ycb_video(root: Path) -> Path:
+    """Six scenes of YCB-Video that show the objects of the documentation and another, and which are key frames."""
+    meshes = meshes_in_metres({"019_pitcher_base": "pitcher", "035_power_drill": "drill", "025_mug": "mug"})
+    write_ycb_video(root, photographs(meshes, 6, 2), meshes, CLASSES, hdf5=(3,))
+    (root / "image_sets").mkdir()
+    for name, scenes in (("train", range(4)), ("keyframe", range(4, 6))):
+        lines = [f"{scene:04d}/{number:06d}\n" for scene in scenes for number in (1, 2)]
+        (root / "image_sets" / f"{name}.txt").write_text("".join(lines))
+    return root
+
+
+def bop_scenes(root: Path) -> Path:
+    """Six scenes that show the two objects of :func:`bop`."""
+    meshes = meshes_in_metres({"obj_000001": "tall_box", "obj_000002": "flat_box"})
+    return write_bop(root, photographs(meshes, 6, 2), meshes)
 
 
 def backgrounds(root: Path) -> Path:
@@ -123,6 +143,8 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/captures": captures,
     "/data/val.json": coco,
     "/data/backgrounds": backgrounds,
+    "/data/YCB_Video": ycb_video,
+    "/data/ycbv": bop_scenes,
 }
 """What the documentation's paths stand for."""
 

@@ -90,14 +90,14 @@ class LabelledImages:
     """Images with boxes. Rows of ``boxes`` whose label is -1 are padding.
 
     ``images`` in [0, 1]; ``boxes`` are (x0, y0, x1, y1) in pixels, the image spanning [0, width] x [0, height];
-    ``labels`` are class indices from 0. ``bins`` is the pose bin an image was drawn from (-1: unknown),
-    for reports only.
+    ``labels`` are class indices from 0. ``bins`` is the pose bin an image was drawn from, or that of each of its boxes
+    (-1: unknown), for reports only.
     """
 
     images: Float[Tensor, "images 3 height width"]
     boxes: Float[Tensor, "images boxes 4"]
     labels: Int[Tensor, "images boxes"]
-    bins: Int[Tensor, "images"]
+    bins: Int[Tensor, "images *each"]
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -116,16 +116,21 @@ class LabelledImages:
 
     @staticmethod
     def concatenate(parts: list[LabelledImages]) -> LabelledImages:
-        """Join sets of equal image size; boxes are padded to the longest list among them."""
+        """Join sets of equal image size; boxes are padded to the longest list among them. Where one set has a bin for
+        each box all have, those of an image that has one for all its boxes being equal."""
         if not parts:
             raise ValueError("concatenate: got no image sets, want at least one")
-        most = max(part.boxes.shape[1] for part in parts)
+        most, each = max(part.boxes.shape[1] for part in parts), any(part.bins.ndim == 2 for part in parts)
 
         def pad(part: LabelledImages) -> LabelledImages:
             missing = most - part.boxes.shape[1]
             boxes = torch.nn.functional.pad(part.boxes, (0, 0, 0, missing))
             labels = torch.nn.functional.pad(part.labels, (0, missing), value=-1)
-            return LabelledImages(part.images, boxes, labels, part.bins)
+            bins = part.bins
+            if each:
+                rows = bins if bins.ndim == 2 else torch.where(part.present, bins[:, None], -1)
+                bins = torch.nn.functional.pad(rows, (0, missing), value=-1)
+            return LabelledImages(part.images, boxes, labels, bins)
 
         padded = [pad(part) for part in parts]
         joined = {f.name: torch.cat([getattr(p, f.name) for p in padded]) for f in fields(LabelledImages)}

@@ -191,6 +191,51 @@ def test_groups_are_checked_before_any_photo_is_read(tmp_path: Path) -> None:
         CocoTarget(path, split_by=r"^(\w+)/", limit=5)
 
 
+def tagged(folder: Path, annotation: Any, image: Any, key: str = "pose") -> Path:
+    """Two mugs in the wide photo, of which the first has its own ``key``, and the photo's ``key``."""
+    own = {} if annotation is None else {key: annotation}
+    items = [{"image_id": 2, "category_id": 7, "bbox": [4, 2, 20, 10], **own},
+             {"image_id": 2, "category_id": 7, "bbox": [10, 2, 20, 10]},
+             {"image_id": 2, "category_id": 7, "bbox": [1, 1, 0.5, 9], key: 5}]  # fmt: skip
+    entries = [{"id": 9, "file_name": "tall.png"}, {"id": 2, "file_name": "wide.png"}]
+    entries[1] |= {} if image is None else {key: image}
+    return write(folder, images=entries, annotations=items)
+
+
+def test_pose_bins_are_an_attribute_of_annotations_or_images(tmp_path: Path) -> None:
+    """From 1 in the file, from 0 inside; the speck of bin 5 is dropped with its bin."""
+
+    def bins(path: Path, attribute: str = "pose") -> list[list[int]]:
+        return CocoTarget(path, bin_attribute=attribute).load(NAMES, 80, 80).bins.tolist()
+
+    assert bins(tagged(tmp_path, 3, 8)) == [[2, 7], [-1, -1]]
+    assert bins(tagged(tmp_path, 3, None)) == [[2, -1], [-1, -1]]
+    nested = tagged(tmp_path, {"pose": 1}, {"pose": 2}, "attributes")
+    document = json.loads(nested.read_text())
+    document["annotations"][2]["attributes"] = {"pose": 5}
+    nested.write_text(json.dumps(document))
+    assert bins(nested, "attributes.pose") == [[0, 1], [-1, -1]]
+    assert CocoTarget(nested).load(NAMES, 80, 80).bins.tolist() == [-1, -1]
+
+
+def test_pose_bins_that_are_none_are_refused(tmp_path: Path) -> None:
+    for wrong in (0, 2.5, "side", True):
+        with pytest.raises(
+            ValueError, match=r"bin_attribute='pose': want a whole number from 1, annotations\[0\] or"
+        ):
+            CocoTarget(tagged(tmp_path, wrong, None), bin_attribute="pose")
+    with pytest.raises(
+        ValueError, match=r"annotations\.json: target\.bin_attribute='side': no annotation and no image has"
+    ):
+        CocoTarget(tagged(tmp_path, 3, 8), bin_attribute="side")
+    with pytest.raises(
+        ValueError, match=r"bin_attribute='pose': bin 9 of an annotation is beyond the 8 of pose"
+    ):
+        sets_of(CocoTarget(tagged(tmp_path, 3, 9), bin_attribute="pose", val_fraction=0.5))
+    made = sets_of(CocoTarget(tagged(tmp_path, 3, 8), bin_attribute="pose", val_fraction=0.5))
+    assert sorted(b for part in made.values() for b in part.bins[part.present].tolist()) == [2, 7]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -88,8 +88,8 @@ class TargetCamera:
         read = getattr(target, "camera", None)
         if not callable(read):
             raise ValueError(
-                "camera=from_target wants a target with a camera of its own (target=coco, its file with an entry "
-                f"'camera'), got {type(target).__name__}"
+                "camera=from_target wants a target with a camera of its own (target=ycb_video, bop, or coco with an "
+                f"entry 'camera' in its file), got {type(target).__name__}"
             )
         own = cast(PinholeCamera, read())
         if self.width is None:

@@ -20,6 +20,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.assembling import Photo, assemble, large_enough
+from neural_sim.target.bin_attribute import bins_of
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
@@ -28,6 +30,7 @@ from neural_sim.target.split import joined, split
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
+_Row = tuple[int, dict[str, Any]]  # an annotation with its place in the file
 
 REQUIRED: dict[str, tuple[str, ...]] = {
     "images": ("id", "file_name"),
@@ -37,12 +40,10 @@ REQUIRED: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class _Photo:
-    """A letterboxed photograph with its boxes [b, 4] and labels [b]; how many boxes were too small."""
+class _Read:
+    """A photograph, how many of its boxes were too small, and what it looks like."""
 
-    image: Tensor
-    boxes: Tensor
-    labels: Tensor
+    photo: Photo
     dropped: int
     thumbnail: Tensor
 
@@ -65,10 +66,13 @@ class CocoTarget:
             parts are warned of.
         limit: at most so many images, the first by id.
         minimum_side: boxes with a side shorter than this many pixels after resizing are dropped and counted.
+        bin_attribute: the attribute of the file's annotations, or else of their image, that says the pose bin, counted
+            from 1 as ``dominant`` of a distribution is; dots lead into entries of entries (``attributes.pose``). Boxes
+            without one have no bin. None: no box has.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a number out of its range, or images that
-            ``split_by`` does not put into two or more groups.
+        ValueError: no such file, one that is not in COCO form, a number out of its range, images that
+            ``split_by`` does not put into two or more groups, or a bin that is none or that no entry has.
     """
 
     renders: ClassVar[bool] = False  # of the objects it takes the names alone
@@ -79,6 +83,7 @@ class CocoTarget:
     limit: int | None = None
     minimum_side: float = 2.0
     split_by: str | None = None
+    bin_attribute: str | None = None
 
     def __post_init__(self) -> None:
         if not self._file.is_file():
@@ -89,7 +94,7 @@ class CocoTarget:
             raise ValueError(f"target.limit must be at least 1 or null, got {self.limit}")
         if not self._entries:
             raise ValueError(f"{self._file}: holds no images")
-        _ = self._groups  # refused here rather than after the fields are fitted
+        _ = self._groups, self._bins  # refused here rather than after the fields are fitted
 
     @property
     def _file(self) -> Path:
@@ -113,6 +118,15 @@ class CocoTarget:
         if self.split_by is None:
             return range(len(self._entries))
         return groups_of(self._entries, self.split_by, self._file)
+
+    @cached_property
+    def _bins(self) -> list[int] | None:
+        """The pose bin of each annotation, from 0, -1 without one."""
+        if self.bin_attribute is None:
+            return None
+        return bins_of(
+            self._document["annotations"], self._document["images"], self.bin_attribute, self._file
+        )
 
     @cached_property
     def _digest(self) -> str:
@@ -151,18 +165,25 @@ class CocoTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
-        photos = self._photos(list(objects), camera.height, camera.width)
+        first = next(iter(distribution.binned), None)
+        if self._bins is not None and first is not None and max(self._bins) >= first.bins:
+            raise ValueError(
+                f"{self._file}: target.bin_attribute={self.bin_attribute!r}: bin {max(self._bins) + 1} of an "
+                f"annotation is beyond the {first.bins} of {first.name}"
+            )
+        read = self._photos(list(objects), camera.height, camera.width)
+        photos = [item.photo for item in read]
         pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
         groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
         val, test = split(groups, self.val_fraction, torch.Generator().manual_seed(seed))
         if self.split_by is None:
-            self._warn_of_duplicates(torch.stack([photo.thumbnail for photo in photos]), val, test)
+            self._warn_of_duplicates(torch.stack([item.thumbnail for item in read]), val, test)
         else:
             _log.info(
                 "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g)",
                 self._file, self.split_by, len(set(self._groups)), len(val), len(photos), self.val_fraction,
             )  # fmt: skip
-        images = _assemble(photos)
+        images = assemble(photos)
         return {"val": images.select(val), "test": images.select(test)}
 
     def load(self, class_names: Sequence[str], height: int, width: int) -> LabelledImages:
@@ -171,19 +192,19 @@ class CocoTarget:
         Raises:
             ValueError: a category that is no class, an image that is missing or unreadable.
         """
-        return _assemble(self._photos(class_names, height, width))
+        return assemble([item.photo for item in self._photos(class_names, height, width)])
 
-    def _photos(self, class_names: Sequence[str], height: int, width: int) -> list[_Photo]:
+    def _photos(self, class_names: Sequence[str], height: int, width: int) -> list[_Read]:
         labels = self._labels(self._document["categories"], class_names)
-        by_image: dict[Any, list[dict[str, Any]]] = {entry["id"]: [] for entry in self._entries}
-        for item in self._document["annotations"]:
+        by_image: dict[Any, list[_Row]] = {entry["id"]: [] for entry in self._entries}
+        for row, item in enumerate(self._document["annotations"]):
             if not item.get("iscrowd", 0) and item["image_id"] in by_image:
-                by_image[item["image_id"]].append(item)
-        photos = [self._photo(e, by_image[e["id"]], labels, height, width) for e in self._entries]
-        dropped = sum(photo.dropped for photo in photos)
+                by_image[item["image_id"]].append((row, item))
+        read = [self._photo(e, by_image[e["id"]], labels, height, width) for e in self._entries]
+        dropped = sum(item.dropped for item in read)
         if dropped:
             _log.warning("%s: %d boxes shorter than %g px dropped", self._file, dropped, self.minimum_side)
-        return photos
+        return read
 
     def _warn_of_duplicates(self, thumbnails: Tensor, val: Tensor, test: Tensor) -> None:
         """Warn: where psi was learned from one frame of a video, AP on the next frame says little."""
@@ -217,28 +238,34 @@ class CocoTarget:
     def _photo(
         self,
         entry: dict[str, Any],
-        annotations: list[dict[str, Any]],
+        annotations: list[_Row],
         labels: dict[Any, int | None],
         height: int,
         width: int,
-    ) -> _Photo:
+    ) -> _Read:
         path = self._folder / entry["file_name"]
         try:
-            with Image.open(path) as photo:
-                image, placing = letterbox(photo, height, width)
+            with Image.open(path) as file:
+                image, placing = letterbox(file, height, width)
         except (OSError, UnidentifiedImageError) as error:
             raise ValueError(f"{path} (named in {self._file}): not a readable image ({error})") from error
-        unknown = {item["category_id"] for item in annotations} - set(labels)
+        unknown = {item["category_id"] for _, item in annotations} - set(labels)
         if unknown:
             raise ValueError(f"{self._file}: category ids {sorted(unknown)} of {path.name} are not declared")
-        kept = [item for item in annotations if labels[item["category_id"]] is not None]
-        corners = torch.tensor([item["bbox"] for item in kept], dtype=torch.float32).reshape(-1, 4)
+        kept = [(row, item) for row, item in annotations if labels[item["category_id"]] is not None]
+        corners = torch.tensor([item["bbox"] for _, item in kept], dtype=torch.float32).reshape(-1, 4)
         corners[:, 2:] += corners[:, :2]
         boxes = placing.boxes(corners)
-        large = ((boxes[:, 2:] - boxes[:, :2]) >= self.minimum_side).all(-1)
-        classes = torch.tensor([labels[item["category_id"]] for item in kept], dtype=torch.long)
+        large = large_enough(boxes, self.minimum_side)
+        classes = torch.tensor([labels[item["category_id"]] for _, item in kept], dtype=torch.long)
+        bins = (
+            None
+            if self._bins is None
+            else torch.tensor([self._bins[row] for row, _ in kept], dtype=torch.long)[large]
+        )
         inside = image[:, placing.top :, placing.left :][:, : placing.inner_height, : placing.inner_width]
-        return _Photo(image, boxes[large], classes[large], int((~large).sum()), thumbnail(inside))
+        photo = Photo(image, boxes[large], classes[large], bins)
+        return _Read(photo, int((~large).sum()), thumbnail(inside))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -257,13 +284,3 @@ def _read(path: Path) -> dict[str, Any]:
             if section == "annotations" and len(entry["bbox"]) != 4:
                 raise ValueError(f"{path}: annotations[{number}].bbox must be x, y, width, height")
     return data
-
-
-def _assemble(photos: Sequence[_Photo]) -> LabelledImages:
-    most = max(1, *(len(photo.boxes) for photo in photos))
-    boxes = torch.zeros(len(photos), most, 4)
-    labels = torch.full((len(photos), most), -1)
-    for row, photo in enumerate(photos):
-        boxes[row, : len(photo.boxes)], labels[row, : len(photo.boxes)] = photo.boxes, photo.labels
-    images = torch.stack([photo.image for photo in photos])
-    return LabelledImages(images, boxes, labels, torch.full((len(photos),), -1))

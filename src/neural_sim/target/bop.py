@@ -1,0 +1,241 @@
+"""Scenes of a BOP benchmark data set: https://github.com/thodan/bop_toolkit, docs/bop_datasets_format.md.
+
+``<split>/<scene>/{scene_gt,scene_gt_info,scene_camera}.json`` beside ``rgb`` (or ``gray``), ``depth`` and
+``mask_visib``; ``models/models_info.json``; ``test_targets_bop19.json``. Millimetres, OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from neural_sim.target.frames import (
+    Frame,
+    FrameName,
+    Listed,
+    PosedObject,
+    box_of_mask,
+    camera_of_matrix,
+    grid_of,
+    image_size,
+    numbers,
+    rigid,
+)
+from neural_sim.target.posed import PosedTarget
+from neural_sim.types import PinholeCamera
+
+MILLIMETRE = 1e-3
+TARGETS = "test_targets_bop19.json"
+IMAGES = ("rgb/*.png", "rgb/*.jpg", "gray/*.png", "gray/*.tif")
+
+
+@dataclass(frozen=True)
+class BopTarget(PosedTarget):
+    """Frames of a BOP data set. An object's centre is that of its box in ``models/models_info.json``, its poses' origin
+    where there is none; its visibility is ``visib_fract``.
+
+    Args:
+        val: the folder of scenes whose frames steer psi, of each scene one in ``every``, such as ``train_real``; None:
+            scenes of ``test``.
+        test: the folder of scenes that are scored: the images of ``test_targets_bop19.json`` where present and the
+            folder is ``test``, else of each scene one in ``every``.
+
+    Classes are ``obj_000001`` and so on. See :class:`PosedTarget` for the other arguments.
+    """
+
+    val: str | None = None
+    test: str = "test"
+
+    @property
+    def class_names(self) -> list[str]:
+        """Those of ``models_info.json``, or of all that the frames show where there is none."""
+        if self._info:
+            return sorted(map(_class_name, self._info))
+        listed = self._listed()
+        scenes = {name.scene for name in (*listed.val, *(listed.test or ()))}
+        shown = (
+            item
+            for scene in scenes
+            for items in self._json(scene, "scene_gt.json").values()
+            for item in items
+        )
+        return sorted(
+            {_class_name(item["obj_id"]) for item in shown if isinstance(item, dict) and "obj_id" in item}
+        )
+
+    def frame(self, name: FrameName, depth: bool = False) -> Frame:
+        """See :class:`PosedTarget`."""
+        poses, infos = self._entry(name, "scene_gt.json"), self._entry(name, "scene_gt_info.json")
+        where = f"{self._folder(name) / 'scene_gt.json'}: {name.number}"
+        if not isinstance(poses, list) or not isinstance(infos, list) or len(poses) != len(infos):
+            raise ValueError(f"{where}: want a list of objects, and as many in scene_gt_info.json")
+        camera, size = self._camera(name), image_size(self._image(name))
+        objects = [
+            self._object_of(name, i, *both, size) for i, both in enumerate(zip(poses, infos, strict=True))
+        ]
+        return Frame(
+            name.scene,
+            name.number,
+            self._image(name),
+            camera,
+            tuple(objects),
+            self._depth(name, size) if depth else None,
+        )
+
+    def _object_of(
+        self, name: FrameName, index: int, pose: Any, info: Any, size: tuple[int, int]
+    ) -> PosedObject:
+        where = f"{self._folder(name) / 'scene_gt.json'}: {name.number}[{index}]"
+        _want(pose, ("obj_id", "cam_R_m2c", "cam_t_m2c"), where)
+        _want(info, ("visib_fract", "bbox_visib"), where.replace("scene_gt.json", "scene_gt_info.json"))
+        moved = rigid(
+            pose["cam_R_m2c"], numbers(pose["cam_t_m2c"], 3, f"{where}: cam_t_m2c") * MILLIMETRE, where
+        )
+        file = self._folder(name) / "mask_visib" / f"{name.number:06d}_{index:06d}.png"
+        mask = grid_of(file, size) > 0 if file.is_file() else None
+        if mask is not None:
+            box = box_of_mask(mask)
+        else:
+            # The toolkit's width and height are differences of first and last pixels.
+            x, y, width, height = numbers(info["bbox_visib"], 4, f"{where}: bbox_visib").tolist()
+            box = (x, y, x + width + 1, y + height + 1) if width >= 0 and height >= 0 else None
+        return PosedObject(
+            _class_name(pose["obj_id"]), moved, box, float(numbers(info["visib_fract"], 1, where)[0]), mask
+        )
+
+    def _camera(self, name: FrameName) -> PinholeCamera:
+        entry = self._entry(name, "scene_camera.json")
+        where = f"{self._folder(name) / 'scene_camera.json'}: {name.number}"
+        _want(entry, ("cam_K",), where)
+        size = image_size(self._image(name))
+        said = (entry.get("width", size[0]), entry.get("height", size[1]))
+        if said != size:
+            raise ValueError(
+                f"{where}: is of images of {said[0]} x {said[1]}, {self._image(name)} is {size[0]} x {size[1]}"
+            )
+        return camera_of_matrix(entry["cam_K"], *size, f"{where}: cam_K")
+
+    def _depth(self, name: FrameName, size: tuple[int, int]) -> np.ndarray | None:
+        file = self._folder(name) / "depth" / f"{name.number:06d}.png"
+        if not file.is_file():
+            return None
+        entry = self._entry(name, "scene_camera.json")
+        where = f"{self._folder(name) / 'scene_camera.json'}: {name.number}"
+        _want(entry, ("depth_scale",), where)
+        return grid_of(file, size) * (float(numbers(entry["depth_scale"], 1, where)[0]) * MILLIMETRE)
+
+    def _centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
+        entry = self._info.get(str(int(class_name.removeprefix("obj_"))))
+        if entry is None:
+            return None
+        where = f"{self._info_file}: {class_name}"
+        _want(entry, [f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"], where)
+        low, size = (
+            numbers([entry[f"{kind}_{axis}"] for axis in "xyz"], 3, where) for kind in ("min", "size")
+        )
+        return (low + 0.5 * size) * MILLIMETRE
+
+    # --- files ---
+
+    @property
+    def _info_file(self) -> Path:
+        return self._root / "models" / "models_info.json"
+
+    @cached_property
+    def _info(self) -> dict[str, Any]:
+        return _mapping(self._info_file) if self._info_file.is_file() else {}
+
+    @cached_property
+    def _read(self) -> dict[tuple[str, str], dict[str, Any]]:
+        return {}
+
+    def _json(self, scene: str, file: str) -> dict[str, Any]:
+        """A scene's file, read once."""
+        if (scene, file) not in self._read:
+            self._read[scene, file] = _mapping(self._root / scene / file)
+        return self._read[scene, file]
+
+    def _entry(self, name: FrameName, file: str) -> Any:
+        entries = self._json(name.scene, file)
+        if str(name.number) not in entries:
+            raise ValueError(f"{self._folder(name) / file}: has no entry of image {name.number}")
+        return entries[str(name.number)]
+
+    def _folder(self, name: FrameName) -> Path:
+        return self._root / name.scene
+
+    def _image(self, name: FrameName) -> Path:
+        files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in IMAGES]
+        return next((file for file in files if file.is_file()), files[0])
+
+    def _files(self, name: FrameName) -> list[Path]:
+        folder = self._folder(name)
+        labels = [folder / file for file in ("scene_gt.json", "scene_gt_info.json", "scene_camera.json")]
+        masks = (folder / "mask_visib").glob(f"{name.number:06d}_*.png")
+        return [*labels, self._image(name), *masks, *([self._info_file] if self._info else [])]
+
+    # --- which frames ---
+
+    def _listed(self) -> Listed:
+        scored = (
+            self._targets
+            if self.test == "test" and (self._root / TARGETS).is_file()
+            else self._thinned(self.test)
+        )
+        return Listed(scored, None) if self.val is None else Listed(self._thinned(self.val), scored)
+
+    @property
+    def _targets(self) -> list[FrameName]:
+        path = self._root / TARGETS
+        entries = _json_of(path)
+        if not isinstance(entries, list):
+            raise ValueError(f"{path}: want a list of targets")
+        for number, entry in enumerate(entries):
+            _want(entry, ("scene_id", "im_id"), f"{path}: [{number}]")
+        return sorted(
+            {FrameName(f"test/{int(entry['scene_id']):06d}", int(entry["im_id"])) for entry in entries}
+        )
+
+    def _thinned(self, split: str) -> list[FrameName]:
+        """Of each scene of a folder one image in ``every``."""
+        folder = self._root / split
+        scenes = sorted(path.parent.name for path in folder.glob("*/scene_gt.json"))
+        if not scenes:
+            raise ValueError(f"{folder}: holds no scene (<scene>/scene_gt.json)")
+        chosen = []
+        for scene in scenes:
+            numbered = sorted(map(int, self._json(f"{split}/{scene}", "scene_gt.json")))
+            chosen += [FrameName(f"{split}/{scene}", number) for number in numbered[:: self.every]]
+        return chosen
+
+
+def _class_name(number: int | str) -> str:
+    return f"obj_{int(number):06d}"
+
+
+def _want(entry: Any, keys: Sequence[str], where: str) -> None:
+    lacking = [key for key in keys if not isinstance(entry, dict) or key not in entry]
+    if lacking:
+        raise ValueError(f"{where}: lacks {lacking}")
+
+
+def _json_of(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not readable as JSON ({error})") from error
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    """A JSON file of entries by number. Raises ``ValueError`` for another."""
+    data = _json_of(path)
+    if not isinstance(data, dict) or not all(key.isdigit() for key in data):
+        raise ValueError(f"{path}: want entries by number")
+    return {str(int(key)): value for key, value in data.items()}

@@ -1,0 +1,141 @@
+"""From which side a camera sees an object: the inverse of the project's orbit, and the bin of p_psi it falls in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.types import SceneDraw
+
+TURN = 2.0 * math.pi
+SAME = 1e-6
+"""Radians by which two names of one viewpoint may differ in how far they lie outside of the ranges."""
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Cameras as :func:`neural_sim.cameras.orbit` places them, float64.
+
+    ``phi`` and ``rho`` are its angles in radians, ``distance`` is that from the object's centre, in the unit of the
+    poses. ``roll`` in [-pi, pi] turns the orbit's camera about its own backward axis, anticlockwise seen from behind:
+    camera_to_world = orbit(phi, rho, distance) Rz(roll), for a camera that looks straight at the object's centre.
+    """
+
+    phi: Float[Tensor, "n"]
+    rho: Float[Tensor, "n"]
+    distance: Float[Tensor, "n"]
+    roll: Float[Tensor, "n"]
+
+
+def viewpoint_of(
+    object_to_camera: Float[Tensor, "n 4 4"],
+    centre: Float[Tensor, "#n 3"] | None = None,
+    phi_range: Range = (0.0, TURN),
+    rho_range: Range = (-math.pi, math.pi),
+) -> Viewpoint:
+    """The orbit's camera that sees an object from the side from which a real camera sees it.
+
+    An orbit's camera looks straight at the object, a real one rarely does. Its direction from the object is kept, and
+    it is turned to face the object by the smallest rotation that does; what is left over is the roll. Where the object
+    lies in the image has no part in the angles.
+
+    (phi, rho, roll) and (-phi, rho + pi, roll + pi) are one camera. Of the two, the one is taken that lies within the
+    ranges, or that misses them by less; if both do alike, as where both ranges are full circles, the one of the smaller
+    roll. Angles are given within half a turn of the middle of their range. At the poles, where rho and roll turn alike,
+    rho is 0 or pi.
+
+    Args:
+        object_to_camera: rigid, OpenCV axes (x right, y down, view along +z); the object stands upright along its +z.
+        centre: of the object in its own frame, in the unit of the poses; None: its origin.
+        phi_range, rho_range: the angles that are drawn, in radians.
+
+    Raises:
+        ValueError: a camera that stands in the object's centre, or has it straight behind its back.
+    """
+    pose = object_to_camera.double()
+    turn, offset = pose[:, :3, :3], pose[:, :3, 3]
+    if centre is not None:
+        offset = offset + torch.einsum("nij,nj->ni", turn, centre.double().expand(len(pose), 3))
+    distance = offset.norm(dim=-1)
+    # The camera's OpenGL axes in the object's frame are rows of the rotation, z the other way round.
+    right, backward = turn[:, 0], -turn[:, 2]
+    toward = -torch.einsum("nij,ni->nj", turn, offset) / distance.clamp_min(1e-300)[:, None]
+    if not bool((distance > 0.0).all() and ((backward * toward).sum(-1) > -1.0 + 1e-12).all()):
+        raise ValueError(
+            "viewpoint: want cameras that stand off the object's centre and do not turn their back to it"
+        )
+    right = _turned(right, backward, toward)
+    theta = torch.atan2(toward[:, :2].norm(dim=-1), toward[:, 2])
+    azimuth = torch.atan2(toward[:, 1], toward[:, 0])
+    orbits_right, orbits_up = _orbit_axes(theta, azimuth)
+    roll = torch.atan2((right * orbits_up).sum(-1), (right * orbits_right).sum(-1))
+    names = [_named(theta, azimuth, roll, phi_range, rho_range),
+             _named(-theta, azimuth + math.pi, roll + math.pi, phi_range, rho_range)]  # fmt: skip
+    outside = [_outside(name[0], phi_range) + _outside(name[1], rho_range) for name in names]
+    alike = (outside[0] - outside[1]).abs() <= SAME
+    second = torch.where(alike, names[1][2].abs() < names[0][2].abs(), outside[1] < outside[0])
+    phi, rho, roll = (torch.where(second, b, a) for a, b in zip(*names, strict=True))
+    return Viewpoint(phi, rho, distance, roll)
+
+
+def bins_of_poses(
+    distribution: SceneDistribution,
+    object_to_camera: Float[Tensor, "n 4 4"],
+    radius: float | None,
+    centre: Float[Tensor, "#n 3"] | None = None,
+) -> Int[Tensor, "n"]:
+    """The bin of each pose by the first binned factor of p_psi, from 0, as :attr:`LabelledImages.bins` has it.
+
+    Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is
+    not told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance
+    outside of the range falls in the bin at that end.
+    """
+    unknown = torch.full((len(object_to_camera),), -1)
+    first = next(iter(distribution.binned), None)
+    if first is None or first.coordinate not in ("phi", "rho", "distance"):
+        return unknown
+    ranges = {**distribution.ranges, **{f.coordinate: (f.low, f.high) for f in distribution.binned}}
+    seen = viewpoint_of(object_to_camera, centre, ranges["phi"], ranges["rho"])
+    distance = seen.distance
+    if distribution.distance_unit == "radii":
+        if radius is None and first.coordinate == "distance":
+            return unknown
+        distance = distance / (1.0 if radius is None else radius)
+    none = torch.zeros(len(distance), 0, dtype=torch.long)
+    return first.stratum_of(SceneDraw(seen.phi, seen.rho, distance, none))
+
+
+def _turned(axis: Tensor, start: Tensor, end: Tensor) -> Float[Tensor, "n 3"]:
+    """``axis`` under the smallest rotation that takes the unit vector ``start`` to ``end``, by Rodrigues' formula."""
+    normal = torch.linalg.cross(start, end)
+    once = torch.linalg.cross(normal, axis)
+    return axis + once + torch.linalg.cross(normal, once) / (1.0 + (start * end).sum(-1, keepdim=True))
+
+
+def _orbit_axes(phi: Tensor, rho: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Right and up of the orbit's camera."""
+    up = torch.stack([-phi.cos() * rho.cos(), -phi.cos() * rho.sin(), phi.sin()], -1)
+    return torch.stack([-rho.sin(), rho.cos(), torch.zeros_like(rho)], -1), up
+
+
+def _named(
+    phi: Tensor, rho: Tensor, roll: Tensor, phi_range: Range, rho_range: Range
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same angles in the turn about the middle of their ranges, the roll in the turn about 0."""
+    middles = 0.5 * sum(phi_range), 0.5 * sum(rho_range), 0.0
+    phi, rho, roll = (
+        middle + torch.remainder(angle - middle + math.pi, TURN) - math.pi
+        for angle, middle in zip((phi, rho, roll), middles, strict=True)
+    )
+    return phi, rho, roll
+
+
+def _outside(angle: Tensor, range_: Range) -> Tensor:
+    """By how much an angle lies outside of its range."""
+    return ((angle - 0.5 * sum(range_)).abs() - 0.5 * (range_[1] - range_[0])).clamp_min(0.0)

@@ -1,0 +1,204 @@
+"""YCB-Video in its original layout (Xiang et al., PoseCNN, RSS 2018).
+
+``data/<scene>/<frame>-{color,label,depth}.png``, ``-box.txt`` (class, x0, y0, x1, y1 of the whole object's projection,
+from the centre of the upper left pixel) and ``-meta.mat`` (poses in metres, camera matrix); ``image_sets/*.txt`` with a
+line <scene>/<frame> for each frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from neural_sim.target.frames import (
+    Frame,
+    FrameName,
+    Listed,
+    PosedObject,
+    box_of_mask,
+    camera_of_matrix,
+    grid_of,
+    image_size,
+    numbers,
+    rigid,
+)
+from neural_sim.target.matlab import read_arrays
+from neural_sim.target.posed import PosedTarget
+from neural_sim.types import PinholeCamera
+
+CLASSES = (
+    "002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle",
+    "007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can", "011_banana",
+    "019_pitcher_base", "021_bleach_cleanser", "024_bowl", "025_mug", "035_power_drill", "036_wood_block",
+    "037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick",
+)  # fmt: skip
+"""The data set's classes 1 to 21, whose names are those of the objects' folders."""
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class YcbVideoTarget(PosedTarget):
+    """Frames of YCB-Video. An object's centre is taken to be its poses' origin.
+
+    An object's visibility is the fraction of its whole projection's box (clipped to the image) that the box of its
+    visible pixels covers: the data set has no masks of whole objects.
+
+    Args:
+        val_list: the list of ``image_sets`` whose frames steer psi, of each scene one in ``every``; None: ``train``
+            where present, else scenes without another part.
+        test_list: the list whose frames are scored, all of them; None: ``keyframe`` where present, else scenes without
+            another part.
+
+    See :class:`PosedTarget` for the others.
+    """
+
+    val_list: str | None = None
+    test_list: str | None = None
+
+    @property
+    def class_names(self) -> list[str]:
+        return list(CLASSES)
+
+    def frame(self, name: FrameName, depth: bool = False) -> Frame:
+        """See :class:`PosedTarget`."""
+        meta = self._file(name, "meta.mat")
+        image, label_file = self._file(name, "color.png"), self._file(name, "label.png")
+        arrays = read_arrays(meta, ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth"))
+        size = image_size(image)
+        camera = camera_of_matrix(arrays["intrinsic_matrix"], *size, f"{meta}: intrinsic_matrix")
+        classes = [int(value) for value in arrays["cls_indexes"].reshape(-1)]
+        poses = _poses(arrays["poses"], classes, meta)
+        labels = grid_of(label_file, size) if label_file.is_file() else None
+        if labels is not None and (stray := sorted(set(np.unique(labels).tolist()) - {0, *classes})):
+            raise ValueError(f"{label_file}: shows classes {stray}, of which {meta.name} has no pose")
+        whole = _boxes(self._file(name, "box.txt"), size)
+        objects = []
+        for index, pose in zip(classes, poses, strict=True):
+            class_name = CLASSES[index - 1]
+            if class_name not in whole:
+                raise ValueError(
+                    f"{self._file(name, 'box.txt')}: has no box of {class_name}, of which {meta.name} has a pose"
+                )
+            mask = None if labels is None else labels == index
+            box = whole[class_name] if mask is None else box_of_mask(mask)
+            objects.append(PosedObject(class_name, pose, box, _visibility(box, whole[class_name]), mask))
+        depths = self._depth(name, size, arrays["factor_depth"]) if depth else None
+        return Frame(name.scene, name.number, image, camera, tuple(objects), depths)
+
+    def _depth(self, name: FrameName, size: tuple[int, int], factor: np.ndarray) -> np.ndarray | None:
+        file = self._file(name, "depth.png")
+        per_metre = float(numbers(factor, 1, f"{self._file(name, 'meta.mat')}: factor_depth")[0])
+        return grid_of(file, size) / per_metre if file.is_file() else None
+
+    def _camera(self, name: FrameName) -> PinholeCamera:
+        meta = self._file(name, "meta.mat")
+        matrix = read_arrays(meta, ("intrinsic_matrix",))["intrinsic_matrix"]
+        return camera_of_matrix(
+            matrix, *image_size(self._file(name, "color.png")), f"{meta}: intrinsic_matrix"
+        )
+
+    def _files(self, name: FrameName) -> list[Path]:
+        return [self._file(name, end) for end in ("color.png", "label.png", "box.txt", "meta.mat")]
+
+    def _file(self, name: FrameName, end: str) -> Path:
+        return self._root / "data" / name.scene / f"{name.number:06d}-{end}"
+
+    # --- which frames ---
+
+    def _listed(self) -> Listed:
+        val = self._list("val_list", self.val_list, "train")
+        test = self._list("test_list", self.test_list, "keyframe")
+        if val is not None:
+            val = self._thinned(val)
+        if val is None and test is None:
+            return Listed(self._thinned(self._all), None)
+        if val is None:
+            val = self._without(test or ())
+        return Listed(val, self._without(val) if test is None else test)
+
+    def _without(self, taken: Sequence[FrameName]) -> list[FrameName]:
+        """Every so manieth frame of the scenes that ``taken`` has none of."""
+        scenes = {name.scene for name in taken}
+        return self._thinned([name for name in self._all if name.scene not in scenes])
+
+    @cached_property
+    def _all(self) -> list[FrameName]:
+        found = (self._root / "data").glob("*/*-color.png")
+        return sorted(
+            FrameName(path.parent.name, int(path.name.removesuffix("-color.png"))) for path in found
+        )
+
+    def _thinned(self, names: Sequence[FrameName]) -> list[FrameName]:
+        scenes: dict[str, list[FrameName]] = {}
+        for name in sorted(names):
+            scenes.setdefault(name.scene, []).append(name)
+        return [name for scene in scenes.values() for name in scene[:: self.every]]
+
+    def _list(self, key: str, given: str | None, usual: str) -> list[FrameName] | None:
+        """The frames of a list; None where none is given and there is no usual one."""
+        path = self._root / "image_sets" / f"{given or usual}.txt"
+        if not path.is_file():
+            if given is None:
+                return None
+            raise ValueError(f"target.{key}: no such file: {path}")
+        names = []
+        for number, line in enumerate(path.read_text(encoding="utf-8").split(), 1):
+            scene, _, frame = line.removeprefix("data/").rpartition("/")
+            if scene == "data_syn":  # rendered images, which are no target
+                continue
+            if not scene or "/" in scene or not frame.isdigit():
+                raise ValueError(f"{path}: line {number}: want <scene>/<frame>, got {line!r}")
+            names.append(FrameName(scene, int(frame)))
+        absent = [name for name in names if not self._file(name, "color.png").is_file()]
+        if absent:
+            raise ValueError(
+                f"{path}: {len(absent)} of {len(names)} frames have no image, the first {absent[0]}"
+            )
+        return names
+
+
+def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.ndarray]:
+    strange = [index for index in classes if not 1 <= index <= len(CLASSES)]
+    if strange or len(set(classes)) < len(classes):
+        raise ValueError(
+            f"{meta}: cls_indexes: want different numbers from 1 to {len(CLASSES)}, got {list(classes)}"
+        )
+    if poses.size != 12 * len(classes) or (classes and poses.shape[:2] != (3, 4)):
+        raise ValueError(
+            f"{meta}: poses: want 3 x 4 x {len(classes)}, one for each of cls_indexes, got "
+            + " x ".join(map(str, poses.shape))
+        )
+    stacked = poses.reshape(3, 4, len(classes))
+    return [
+        rigid(stacked[:, :3, i], stacked[:, 3, i], f"{meta}: poses: {CLASSES[index - 1]}")
+        for i, index in enumerate(classes)
+    ]
+
+
+def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
+    """Boxes of whole projections by class, along pixel edges and clipped to the image; None: outside of it."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ValueError(f"{path}: not readable ({error})") from error
+    boxes: dict[str, Box | None] = {}
+    for number, words in enumerate(map(str.split, lines), 1):
+        if len(words) != 5:
+            raise ValueError(f"{path}: line {number}: want a class and four numbers, got {' '.join(words)!r}")
+        corners = numbers(words[1:], 4, f"{path}: line {number}") + 0.5  # from the corner of the first pixel
+        x0, y0, x1, y1 = (float(v) for v in np.clip(corners, 0.0, (*size, *size)))
+        boxes[words[0]] = (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+    return boxes
+
+
+def _visibility(visible: Box | None, whole: Box | None) -> float:
+    if visible is None:
+        return 0.0
+    if whole is None:
+        return 1.0
+    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (visible, whole)]
+    return min(1.0, areas[0] / areas[1])
