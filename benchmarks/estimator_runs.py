@@ -19,7 +19,6 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.frozen import FrozenLoop, centred
 from neural_sim.parameter.update import shrinkage
-from neural_sim.synthesis.scene import join
 from neural_sim.types import SceneDraw
 
 COUNTS = (16, 32, 64, 128)
@@ -138,8 +137,8 @@ def run_stratified(world: FrozenLoop, pool: int) -> dict[str, Result]:
 def run_reinforce(world: FrozenLoop, pool: int) -> Result:
     """Disjoint parts of ``pool`` hard draws of every object."""
     began = time.process_time()
-    parts = world.scene.training_set(world.psi, pool, torch.Generator().manual_seed(41))
-    images = join(parts)
+    rendered = world.scene.training_set(world.psi, pool, torch.Generator().manual_seed(41))
+    images, parts = rendered.images, rendered.objects
     cached = CachedSet.of(world.detector, world.backbone, images)
     seconds, result = (time.process_time() - began) / len(images), Result()
     for count in COUNTS:

@@ -147,8 +147,8 @@ def probes(context: Context, at: State, v: Tensor, truth: Tensor, error: Tensor)
     fresh, _ = clocked(lambda: loop.probes(per_bin, torch.Generator().manual_seed(3)), 1)
     pooled, held = clocked(
         lambda: ProbeSet.draw(
-            pool, context.results(context.graph.scene), loop.detector, loop.backbone, per_bin, loop.psi,
-            torch.Generator().manual_seed(3), range(len(context.graph.names)),
+            context.results(context.graph.scene), loop.detector, loop.backbone, per_bin, loop.psi,
+            torch.Generator().manual_seed(3), range(len(context.graph.names)), pool,
         ), 1,
     )  # fmt: skip
     changed = dataclasses.replace(at, probed=held)

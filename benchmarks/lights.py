@@ -25,7 +25,6 @@ from neural_sim.main import build, conf_directory
 from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.stages.context import Context
-from neural_sim.synthesis.scene import join
 
 WAY = (0.0, 0.2, 0.4, 0.7, 1.0)
 
@@ -40,7 +39,7 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
     for seed in range(seeds):
         generator = torch.Generator().manual_seed(seed)
         inner = InnerLoop(scene, detector, warm_start, validation, x.loop.outer, x.training, generator)
-        images = join(inner.draw(psi))
+        images = inner.draw(psi).images
         inner.train(CachedSet.of(detector, inner.backbone, images))
         loop = FrozenLoop.at(
             scene,

@@ -28,7 +28,7 @@ from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.stages.context import Context
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import Scene
 
 SMALL_FIELDS = [
     "scale=quick", "progress=false", "views.count=40", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",
@@ -52,8 +52,8 @@ def loop(context: Context, count: int, images: int) -> SimulatorModule:
         num_classes=count, image_size=context.experiment.training.image_size
     )
     psi = torch.zeros(count, context.graph.psi("initial").shape[1])
-    parts = scene.training_set(psi, context.experiment.imaging.target.val_per_object, generator)
-    validation = join([dataclasses.replace(part, images=part.images.to("cpu")) for part in parts])
+    count = context.experiment.imaging.target.val_per_object
+    validation = scene.training_set(psi, count, generator).images.to("cpu")
     settings, training = (
         dataclasses.replace(context.experiment.loop.outer, images_per_object=images),
         context.experiment.training,

@@ -51,7 +51,7 @@ from neural_sim.solver.newton import Minimum
 from neural_sim.solver.nystrom import Nystrom
 from neural_sim.solver.operator import Matvec, Shifted
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -104,15 +104,15 @@ def trained_problem() -> tuple[BinnedProblem, list[Term]]:
     """detector=micro, warm from its usual training, on one image of every bin and object; and L_val, both float64."""
     generator, scene = torch.Generator().manual_seed(0), small_scene()
     detector = detector_of("micro", 2, 32)
-    images = join(scene.training_set(PSI, 40, generator))
-    validation = join(scene.training_set(PSI.flip(-1), 8, generator))
-    probes = join([scene.probes(label, 1, generator) for label in range(2)])
+    images = scene.training_set(PSI, 40, generator).images
+    validation = scene.training_set(PSI.flip(-1), 8, generator).images
+    probes = [scene.probes(label, "pose", 1, PSI, generator)[0] for label in range(2)]
     params, _ = train_detector(
         detector, detector.init(generator), images, generator,
         Optimisation(40, batch_size=16, learning_rate=1e-2, weight_decay=1e-2),
     )  # fmt: skip
     backbone, warm = detector.split(params)
-    held = CachedSet.of(detector, backbone, probes).double()
+    held = CachedSet.of(detector, backbone, LabelledImages.concatenate(probes)).double()
     bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
     problem = BinnedProblem(
         held.losses, bins, scene.distribution.factors[0].log_probabilities, 0.0, as_double(warm)

@@ -30,7 +30,6 @@ from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos
 from neural_sim.stages.context import Context
-from neural_sim.synthesis.scene import join
 
 STEPS = (4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 30)
 SUBSETS = (16, 32, 64, 128)
@@ -71,7 +70,7 @@ def state(context: Context, which: str, seed: int) -> State:
     cached = CachedSet.of(
         detector,
         backbone,
-        join(context.results(context.graph.scene).training_set(psi, outer.images_per_object, generator)),
+        context.results(context.graph.scene).training_set(psi, outer.images_per_object, generator).images,
     )
     theta, _ = train_detector(
         detector, {**detector.init(generator), **backbone}, cached, generator,

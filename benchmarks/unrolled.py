@@ -38,7 +38,7 @@ from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import gradient
 from neural_sim.stages.context import Context
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import join
+from neural_sim.types import LabelledImages
 
 START = ("+experiment=pose_gap", "gap=uniform")
 PER_BIN = 24
@@ -68,8 +68,8 @@ class World:
         detector = graph.warm_start.build()
         backbone, _ = detector.split(results(graph.warm_start).params)
         source = ImagePool.render(scene, PER_BIN, generator)
-        drawn = [source.probes(i, "pose", PER_BIN, psi[i], generator) for i in range(len(psi))]
-        pool = CachedSet.of(detector, backbone, join(drawn))
+        drawn = [scene.probes(i, "pose", PER_BIN, psi, generator, source)[0] for i in range(len(psi))]
+        pool = CachedSet.of(detector, backbone, LabelledImages.concatenate(drawn))
         p = scene.distribution.probabilities(psi)["pose"].float()
         validation = CachedSet.of(detector, backbone, results(graph.targets).val)
         return World(context, pool, validation, {**detector.init(generator), **backbone}, p)

@@ -12,7 +12,6 @@ from neural_sim.parameter.update import Mirror
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.synthesis.scene import join
 
 SOLVER = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
 TINY = {
@@ -35,7 +34,7 @@ def small_loop(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
-    validation = join(scene.training_set(psi, 3, generator))
+    validation = scene.training_set(psi, 3, generator).images
     settings = Outer(
         update or Mirror(),
         iterations=iterations,

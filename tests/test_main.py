@@ -56,7 +56,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
     assert figures == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}
     coco = json.loads((tmp_path / "run" / "training_set" / "annotations.json").read_text())
-    assert coco["images"] and "phi" in coco["images"][0]["pose"]
+    assert coco["images"] and "phi" in coco["images"][0]["poses"][0]
 
     again = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false")
     assert again.returncode == 0, again.stderr[-3000:]

@@ -26,8 +26,9 @@ from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted
 from neural_sim.solver.solution import Status
+from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import moved_by
-from neural_sim.synthesis.scene import RelaxedDraws, Scene
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import Maps
 
 DOUBLE = torch.float64
@@ -103,13 +104,13 @@ def against_central_differences(scene, part, psi, generator):
     maps = Maps(
         *(torch.randn(value.shape, generator=generator, dtype=DOUBLE) for value in (part.rgb, part.opacity))
     )
-    path = rendered_path(scene, 0, part)
+    path = rendered_path(scene, 0, part, lambda rgb, opacity: None)
     along = contract(part.tangents or {}, maps)
     along = along or draw_cotangents(path.render_rays, scene.camera, part.draw, maps, 500)
     found = psi_contributions(path.relaxed, psi, along).sum(0)
 
     def energy(psi):
-        again = scene.render(0, path.relaxed(psi), part.noise, torch.Generator())
+        again = scene.render(0, path.relaxed(psi))
         return float((again.rgb * maps.rgb).sum() + (again.opacity * maps.opacity).sum())
 
     steps = 1e-6 * torch.eye(3, dtype=DOUBLE)
@@ -131,7 +132,7 @@ def test_the_focal_length_of_every_image_against_central_differences(pipeline, m
         distribution,
     )
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
-    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    part = scene.drawn(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
     assert len(part.draw.magnification.unique()) == COUNT
     against_central_differences(scene, part, psi, generator)
 
@@ -149,7 +150,7 @@ def test_an_off_centre_camera_and_metres_against_central_differences(pipeline, m
     scene = Scene(("block",), (pipeline.field,), renderer, camera, pipeline.synthesizer, distribution,
                   radii=distribution.radii({"block": 0.2}))  # fmt: skip
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
-    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    part = scene.drawn(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
     distance = scene._poses(0, part.draw)[:, :3, 3].norm(dim=-1)
     torch.testing.assert_close(distance, part.draw.distance / 0.2)
     against_central_differences(scene, part, psi, generator)

@@ -27,7 +27,6 @@ from neural_sim.solver.damping import LanczosDamping
 from neural_sim.solver.hvp import HessianOperator
 from neural_sim.solver.operator import Shifted
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import join
 from neural_sim.synthesis.training_set import Synthesizer
 
 TINY = {
@@ -44,7 +43,7 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
         fields=tuple(copy.deepcopy(field).to(device) for field in scene.fields),
         synthesizer=Synthesizer(ProceduralClutter(octaves=1, shapes=1), shift=0.1),
     )
-    validation = join(scene.training_set(psi, 3, generator)).to("cpu")
+    validation = scene.training_set(psi, 3, generator).images.to("cpu")
     settings = Outer(
         Mirror(),
         iterations=iterations,

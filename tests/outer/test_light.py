@@ -28,7 +28,8 @@ from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import HARD, Scene, join
+from neural_sim.synthesis.draws import HARD
+from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
@@ -64,7 +65,7 @@ def test_the_derivative_by_weights_against_central_differences():
     vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
     psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
     rendered = scene.training_set(psi, 3, generator, estimator.draws)
-    images = join(rendered)
+    images = rendered.images
     losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)
     weights = torch.full((6,), 1.0 / 6, dtype=DOUBLE)
     held = object_images(scene, rendered, psi, weights)
@@ -72,12 +73,10 @@ def test_the_derivative_by_weights_against_central_differences():
 
     def objective(label, light):
         """sum_i w_i <dl_i / dtheta, v> of one object's images under another light, all else replayed."""
-        part = rendered[label]
+        part = rendered.objects[label]
         draw = dataclasses.replace(part.draw, weights=light.expand(3, -1))
         maps = scene._maps(label, draw)
-        pixels = scene.synthesizer.compose(
-            maps.rgb, maps.opacity, part.nuisance, label, part.images.bins
-        ).images
+        pixels = rendered.compose[label](maps.rgb, maps.opacity).images
         index = torch.arange(3 * label, 3 * label + 3)
         loss = image_losses(detector, backbone, targets, images.labels)
         along = scores(lambda p, rows: loss(p, pixels[rows - 3 * label], rows), trainable, vector, index, 3)
@@ -95,13 +94,14 @@ def test_the_derivative_by_weights_against_central_differences():
 def test_probes_are_the_same_scenes_under_one_light_after_the_other():
     scene = _scene(DOUBLE, [Pose(bins=3), Illumination(anchors=ANCHORS)])
     psi = scene.distribution.psi("initial", ["a"])[0]
-    part = scene.probes(0, "illumination", 5, psi, torch.Generator().manual_seed(0))
-    assert torch.equal(part.draw.weights, torch.eye(ANCHORS, dtype=DOUBLE).repeat_interleave(5, 0))
-    for values in (part.draw.phi, part.draw.bins[:, 0], part.opacity):
+    images, draw = scene.probes(0, "illumination", 5, psi[None], torch.Generator().manual_seed(0))
+    opacity = scene.render(0, draw).opacity
+    assert torch.equal(draw.weights, torch.eye(ANCHORS, dtype=DOUBLE).repeat_interleave(5, 0))
+    for values in (draw.phi, draw.bins[:, 0], opacity):
         assert torch.equal(values[:5], values[5:10]) and len(values[:5].flatten().unique()) > 1
-    first, second = part.images.images[:5], part.images.images[5:10]
+    first, second = images.images[:5], images.images[5:10]
     # Sensor noise, shifts and backgrounds are shared, so that only the object's own pixels differ.
-    differ, covered = (first != second).any(1).flatten(1).sum(1), (part.opacity[:5] > 0.0).flatten(1).sum(1)
+    differ, covered = (first != second).any(1).flatten(1).sum(1), (opacity[:5] > 0.0).flatten(1).sum(1)
     assert bool((differ > 0).all()) and bool((differ <= covered).all())
     assert bool((covered < first[0, 0].numel()).all())
 
@@ -115,9 +115,9 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
     vector = {name: torch.randn(v.shape, generator=generator, dtype=DOUBLE) for name, v in trainable.items()}
     psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
     rendered = scene.training_set(psi, 3, generator)
-    probed = ProbeSet.draw(scene, scene, detector, backbone, 4, psi, generator, range(2))
-    cached = CachedSet.of(detector, backbone, join(rendered))
-    losses = bound_losses(cached, backbone, join(rendered).labels, probed.cached)
+    probed = ProbeSet.draw(scene, detector, backbone, 4, psi, generator, range(2))
+    cached = CachedSet.of(detector, backbone, rendered.images)
+    losses = bound_losses(cached, backbone, rendered.images.labels, probed.cached)
     held = object_images(scene, rendered, psi, torch.full((6,), 1.0 / 6, dtype=DOUBLE))
     estimator = StratifiedEstimator(4, theta_mode="forward")
     for label, name in enumerate(scene.names):
@@ -147,7 +147,7 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
     scene = _scene(parameters=[Pose(bins=3), Illumination(anchors=ANCHORS)])
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
     detector = RetinaNet(2, 32, **DETECTOR)
-    validation = join(scene.training_set(start.float(), 3, generator, HARD))
+    validation = scene.training_set(start.float(), 3, generator, HARD).images
     light_update = Mirror(0.6, max_step=1.0, shrink=False)
     settings = Outer(
         Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update,
@@ -186,11 +186,11 @@ def test_opacity_does_not_know_the_light():
 def test_explored_lights_differ_and_carry_their_density():
     scene, generator = _scene(), torch.Generator().manual_seed(0)
     psi = scene.distribution.psi("initial", ["a"])[0].float()
-    part = scene.draw(0, psi, 4, generator, ReinforceEstimator().draws)
+    part = scene.drawn(0, psi, 4, generator, ReinforceEstimator().draws)
     assert part.draw.explored is not None and part.draw.weights is not None
     assert len(part.draw.weights.unique(dim=0)) == 4
     density = torch.distributions.Normal(psi, 0.1).log_prob(part.draw.explored).sum(-1)
     torch.testing.assert_close(scene.distribution.log_prob(psi, part.draw), density)
-    still = scene.draw(0, psi, 2, generator)
+    still = scene.drawn(0, psi, 2, generator)
     with pytest.raises(ValueError, match="no density"):
         scene.distribution.log_prob(psi, still.draw)

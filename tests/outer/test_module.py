@@ -20,8 +20,8 @@ from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
+from neural_sim.synthesis.draws import HARD, RelaxedDraws
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import HARD, RelaxedDraws, join
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
@@ -79,11 +79,12 @@ def test_the_backbone_stays_frozen(scene):
 def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
     generator = torch.Generator().manual_seed(3)
     psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
-    part = scene.draw(1, psi, 4, generator, RelaxedDraws())
+    rendered = scene.training_set(psi.expand(2, -1), 4, generator, RelaxedDraws())
+    part, images = rendered.objects[1], rendered.images.select(rendered.rows[1])
     draw = scene.distribution.relaxed(psi, part.noise)
     torch.testing.assert_close(draw.phi, part.draw.phi)
-    again = scene.synthesizer.compose(part.rgb, part.opacity, part.nuisance, 1, part.draw.bins[:, 0])
-    assert torch.equal(again.images, part.images.images) and torch.equal(again.boxes, part.images.boxes)
+    again = rendered.compose[1](part.rgb, part.opacity)
+    assert torch.equal(again.images, images.images) and torch.equal(again.boxes, images.boxes)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +115,8 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
     psi = torch.randn(2, 4, generator=generator, dtype=torch.float64)
     forward = PathwiseEstimator(mode="forward", **settings)
     rendered = wide.training_set(psi, 4, generator, forward.draws)
-    assert all(set(part.tangents) == {"phi"} for part in rendered)
-    images = join(rendered)
+    assert all(set(part.tangents) == {"phi"} for part in rendered.objects)
+    images = rendered.images
     losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)
     weights = torch.full((8,), 0.125, dtype=torch.float64)
     for held in object_images(wide, rendered, psi, weights).values():
@@ -131,49 +132,53 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(
 
 
 def test_pairs_share_what_they_are_asked_to_share(scene):
-    psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
+    psi = torch.tensor([0.5, -0.2, 0.1, 0.0]).expand(2, -1)
     paired = RelaxedDraws(antithetic=True, common_backgrounds=True)
-    part = scene.draw(0, psi, 6, torch.Generator().manual_seed(0), paired)
-    backgrounds = part.nuisance.backgrounds.unflatten(0, (3, 2))
+    rendered = scene.training_set(psi, 6, torch.Generator().manual_seed(0), paired)
+    part = rendered.objects[0]
+    # Without the object what is left is the background; with the same maps, what differs is background and shift.
+    empty = rendered.compose[0](torch.zeros_like(part.rgb), torch.zeros_like(part.opacity))
+    backgrounds = empty.images.unflatten(0, (3, 2))
     assert torch.equal(backgrounds[:, 0], backgrounds[:, 1])
     assert not torch.equal(backgrounds[0, 0], backgrounds[1, 0])
-    assert torch.equal(part.nuisance.shifts[::2], part.nuisance.shifts[1::2])
+    same = rendered.compose[0](part.rgb[:1].expand(6, -1, -1, -1), part.opacity[:1].expand(6, -1, -1))
+    assert torch.equal(same.boxes[::2], same.boxes[1::2]) and len(same.boxes.unique(dim=0)) > 1
     uniform = torch.exp(-torch.exp(-part.noise.bins["pose"].gumbel.double())).unflatten(0, (3, 2))
     torch.testing.assert_close(uniform.sum(1), torch.ones(3, 4, dtype=torch.float64), rtol=0.0, atol=1e-5)
-    held = object_images(scene, [part], psi[None], torch.full((6,), 1 / 6))
+    held = object_images(scene, rendered, psi, torch.full((12,), 1 / 12))
     assert held["a"].group == 2
     for odd in (RelaxedDraws(antithetic=True), RelaxedDraws(common_backgrounds=True)):
         with pytest.raises(ValueError, match=r"even outer\.images_per_object, got 5"):
-            scene.draw(0, psi, 5, torch.Generator(), odd)
+            scene.training_set(psi, 5, torch.Generator(), odd)
 
 
 def test_straight_through_images_are_those_of_hard_draws(scene):
-    psi = torch.tensor([0.5, -0.2, 0.1, 0.0])
+    psi = torch.tensor([0.5, -0.2, 0.1, 0.0]).expand(2, -1)
     hard, through = (
-        scene.draw(1, psi, 4, torch.Generator().manual_seed(2), how)
+        scene.training_set(psi, 4, torch.Generator().manual_seed(2), how).images
         for how in (HARD, RelaxedDraws("straight_through", tangents=True))
     )
-    torch.testing.assert_close(through.images.images, hard.images.images, rtol=0.0, atol=1e-5)
-    assert torch.equal(through.images.boxes, hard.images.boxes)
+    torch.testing.assert_close(through.images, hard.images, rtol=0.0, atol=1e-5)
+    assert torch.equal(through.boxes, hard.boxes)
 
 
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
     for mode, carried in (("forward", True), ("reverse", False)):
         drawn = small_loop(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))
-        assert all((part.tangents is not None) is carried for part in drawn)
+        assert all((part.tangents is not None) is carried for part in drawn.objects)
 
 
 def test_probes_cover_every_bin_equally(scene):
-    part = scene.probes(0, "pose", 3, torch.zeros(4), torch.Generator().manual_seed(0))
-    assert part.draw.bins[:, 0].tolist() == [b for b in range(4) for _ in range(3)]
-    assert torch.equal(scene.distribution.bins_of(part.draw), part.draw.bins)
+    images, draw = scene.probes(0, "pose", 3, torch.zeros(2, 4), torch.Generator().manual_seed(0))
+    assert draw.bins[:, 0].tolist() == images.bins.tolist() == [b for b in range(4) for _ in range(3)]
+    assert torch.equal(scene.distribution.bins_of(draw), draw.bins)
 
 
 def test_cached_losses_equal_losses_from_images(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     backbone, trainable = detector.split(detector.init(generator))
-    images = join(scene.training_set(torch.zeros(2, 4), 4, generator))
+    images = scene.training_set(torch.zeros(2, 4), 4, generator).images
     cached = CachedSet.of(detector, backbone, images)
     targets = detector.assign(images.boxes, images.labels)
     direct = detector.per_image_loss(trainable, detector.features(backbone, images.images), targets)
@@ -210,22 +215,22 @@ def checked_loop(scene, iterations=3, **outer):
 def test_checked_trainings_differ_by_psi_alone(scene):
     inner = checked_loop(scene).inner
     psi = torch.zeros(2, 4)
-    first, second = (join(inner.draw(psi)).images for _ in range(2))
+    first, second = (inner.draw(psi).images.images for _ in range(2))
     assert torch.equal(first, second)
-    moved = join(inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]]))).images
+    moved = inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]])).images.images
     assert torch.equal(moved[:6], first[:6]) and not torch.equal(moved[6:], first[6:])
     thetas = []
     for _ in range(2):
-        inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
+        inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
         thetas.append(inner.trainable)
     assert all(torch.equal(thetas[0][name], value) for name, value in thetas[1].items())
     inner.renew()
-    assert not torch.equal(join(inner.draw(psi)).images, first)
+    assert not torch.equal(inner.draw(psi).images.images, first)
 
 
 def test_methods_that_are_not_checked_get_new_random_numbers(scene):
     inner = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2).inner
-    first, second = (join(inner.draw(torch.zeros(2, 4))).images for _ in range(2))
+    first, second = (inner.draw(torch.zeros(2, 4)).images.images for _ in range(2))
     assert not torch.equal(first, second)
 
 
@@ -272,6 +277,6 @@ def test_the_pool_holds_every_combination_of_bins(scene):
     held = pool.objects[0].draw
     assert len(held) == 2 * 6  # 4 a bin of the finest factor: 2 in each of 3 x 2 cells
     assert torch.equal(joint.bins_of(held), held.bins)
-    drawn = pool.draw(1, psi, 200, generator).draw
+    drawn = pool.drawn(1, psi, 200, generator).draw
     assert torch.equal(joint.bins_of(drawn), drawn.bins)
-    assert pool.probes(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
+    assert pool.probed(1, "zoom", 5, psi, generator)[0].draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5

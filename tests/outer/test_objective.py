@@ -10,7 +10,6 @@ from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.outer.objective import Objective
 from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import gradient
-from neural_sim.synthesis.scene import join
 
 
 @pytest.fixture
@@ -19,7 +18,7 @@ def made(scene, generator):
 
     def make(kind):
         detector = RetinaNet(**TINY)
-        images = join(scene.training_set(torch.zeros(2, 4), 5, generator))
+        images = scene.training_set(torch.zeros(2, 4), 5, generator).images
         backbone, trainable = detector.split(detector.init(generator))
         noisy = {
             k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double()

@@ -27,7 +27,7 @@ from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
@@ -99,7 +99,7 @@ def scene():
 def test_the_loop_draws_a_part_of_its_probes_anew(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
-    validation = join(scene.training_set(torch.zeros(1, 4), 2, generator))
+    validation = scene.training_set(torch.zeros(1, 4), 2, generator).images
     settings = Outer(
         Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2, **FREE
     )
@@ -129,7 +129,7 @@ def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
     two = dataclasses.replace(scene, names=("a", "b"), fields=scene.fields * 2)
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
-    validation = join(two.training_set(psi, 2, generator))
+    validation = two.training_set(psi, 2, generator).images
     settings = Outer(
         Mirror(shrink=False), 2, 2, epochs=1, curvature_images=2, pool_per_bin=2, learned=("b",), **FREE
     )

@@ -13,7 +13,6 @@ from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import Response, ResponseLoop, agreement, response
-from neural_sim.synthesis.scene import join
 
 CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
 PSI = torch.tensor([[0.5, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -44,7 +43,7 @@ def test_it_is_what_trainings_run_by_hand_do(inner):
 
     def scored(p):
         psi = inner.scene.distribution.factors[0].psi_of(p)
-        inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
+        inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
         return inner.scores().sum(1)
 
     inner.common_numbers = True

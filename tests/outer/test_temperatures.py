@@ -14,7 +14,6 @@ from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.synthesis.scene import join
 
 
 def test_bias_and_spread_of_known_estimates(generator):
@@ -50,9 +49,9 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
     psi = torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
-    theta, validation = detector.init(generator), join(scene.training_set(psi, 3, generator))
+    theta, validation = detector.init(generator), scene.training_set(psi, 3, generator).images
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
-    images = join(scene.training_set(psi, 4, generator))
+    images = scene.training_set(psi, 4, generator).images
     loop = FrozenLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
     rows, truths = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100).measure(
         loop, PathwiseEstimator(), 4, seed=0

@@ -17,7 +17,7 @@ from neural_sim.parameter.zoom import Zoom
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping
-from neural_sim.synthesis.scene import HARD
+from neural_sim.synthesis.draws import HARD
 
 PROXIMAL = 20.0  # past the negative curvature of an untrained detector
 NOTHING_WILL_DO = Trust(max_stationarity=0.0)

@@ -25,7 +25,6 @@ from neural_sim.parameter.zoom import Zoom
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.solution import Status
-from neural_sim.synthesis.scene import join
 
 MICRO = {
     "backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)), reference=48), "head": Head(8, 1)
@@ -44,7 +43,7 @@ def _module(scene, estimator, psi=None, **outer):
         "iterations": 2, "images_per_object": 6, "epochs": 2, "train_first": True, "adjoint": "unrolled",
         "pool_per_bin": 2, "steps": "free", "objective": "loss", "on_untrusted": "shrink",
     }  # fmt: skip
-    validation = join(scene.training_set(psi, 3, generator))
+    validation = scene.training_set(psi, 3, generator).images
     chosen = Outer(Mirror(shrink=False), **(settings | outer))
     inner = InnerLoop(
         scene,
@@ -89,17 +88,16 @@ def _trained(scene, estimator, **settings):
     """A module whose inner loop has trained once, with what that training was on."""
     module = _module(scene, estimator, **settings)
     rendered = module.inner.draw(module.psi)
-    images = join(rendered)
-    cached = CachedSet.of(module.inner.detector, module.inner.backbone, images)
+    cached = CachedSet.of(module.inner.detector, module.inner.backbone, rendered.images)
     module.inner.train(cached, module.settings.unrolled.recording)
-    return module, rendered, images, cached
+    return module, rendered, cached
 
 
 def test_the_loops_stratified_gradient_is_that_of_its_recorded_training(scene):
     """The same sums over the steps, and by hand the derivative of sum_b p_b s_b / objects."""
-    module, rendered, images, cached = _trained(scene, StratifiedEstimator(2), unrolled=EXACT)
+    module, rendered, cached = _trained(scene, StratifiedEstimator(2), unrolled=EXACT)
     module._prepare()
-    found = module._derivative(rendered, images, cached)
+    found = module._derivative(rendered, cached)
     inner, probed = module.inner, module._probes
     slope = gradient(inner.validation.mean_terms(), inner.trainable)
     tables = [part["pose"].index.view(4, 2) for part in probed.probes]
@@ -119,7 +117,8 @@ def test_the_loops_stratified_gradient_is_that_of_its_recorded_training(scene):
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_inputs_are_made_again_of_images_and_boxes(scene, moving):
-    module, _, images, cached = _trained(scene, PathwiseEstimator())
+    module, rendered, cached = _trained(scene, PathwiseEstimator())
+    images = rendered.images
     rows = torch.tensor([5, 0, 11])
     leaves = (images.images[rows], *([images.boxes[rows]] if moving else []))
     made = inputs_of(module.inner, cached, images.labels)(leaves, rows)
@@ -132,10 +131,10 @@ def test_forward_and_reverse_mode_agree_through_the_training(scene, label_gradie
     """The scene's tangents and the paper's second forward, both in float32, from one training."""
     synthesizer = dataclasses.replace(scene.synthesizer, label_gradient=label_gradient)
     scene = dataclasses.replace(scene, synthesizer=synthesizer)
-    module, rendered, images, cached = _trained(scene, PathwiseEstimator(), unrolled=EXACT)
-    forward = module._derivative(rendered, images, cached)
-    bare = [dataclasses.replace(part, tangents=None) for part in rendered]
-    reverse = module._derivative(bare, images, cached)
+    module, rendered, cached = _trained(scene, PathwiseEstimator(), unrolled=EXACT)
+    forward = module._derivative(rendered, cached)
+    bare = tuple(dataclasses.replace(part, tangents=None) for part in rendered.objects)
+    reverse = module._derivative(dataclasses.replace(rendered, objects=bare), cached)
     for name in scene.names:
         one, other = forward.psi_gradients[name], reverse.psi_gradients[name]
         assert float((one - other).norm()) < 1e-3 * float(other.norm())
@@ -144,11 +143,10 @@ def test_forward_and_reverse_mode_agree_through_the_training(scene, label_gradie
 def test_a_training_that_was_not_recorded_is_refused(scene):
     module = _module(scene, ReinforceEstimator())
     rendered = module.inner.draw(module.psi)
-    images = join(rendered)
-    cached = CachedSet.of(module.inner.detector, module.inner.backbone, images)
+    cached = CachedSet.of(module.inner.detector, module.inner.backbone, rendered.images)
     module.inner.train(cached)
     with pytest.raises(ValueError, match="was not recorded"):
-        module._derivative(rendered, images, cached)
+        module._derivative(rendered, cached)
 
 
 @pytest.mark.parametrize(

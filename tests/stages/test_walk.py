@@ -18,7 +18,6 @@ from neural_sim.report.tracking import tracking_uri
 from neural_sim.stages.target_sets import TargetSets
 from neural_sim.stages.walk import walk
 from neural_sim.synthesis.export import write_coco
-from neural_sim.synthesis.scene import join
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
@@ -59,7 +58,7 @@ def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distr
     graph, training, targets = context.graph, context.experiment.training, _targets(context)
     generator, detector = torch.Generator().manual_seed(1_000_003 + 1), graph.warm_start.build()
     scene = context.results(graph.scene)
-    drawn = join(scene.training_set(graph.psi("initial"), training.images_per_object, generator))
+    drawn = scene.training_set(graph.psi("initial"), training.images_per_object, generator).images
     params, _ = train_detector(
         detector, detector.init(generator), drawn, generator, training.of(training.cold_epochs)
     )

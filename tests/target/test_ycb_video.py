@@ -21,7 +21,7 @@ from posed_scenes import (
 from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.subject import Unseen
+from neural_sim.renderer.subject import FieldSubject
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.camera import TargetCamera
@@ -131,7 +131,9 @@ def test_bins_by_image_and_by_box_join():
 def sets_of(target, names=NAMES, seed=3):
     camera = TargetCamera(60).camera(64, 40.0, target)
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.0)
-    return target.sets({name: Unseen(name, 0.06) for name in names}, POSES, camera, synthesizer, seed)
+    return target.sets(
+        {name: FieldSubject(name, radius=0.06) for name in names}, POSES, camera, synthesizer, seed
+    )
 
 
 def test_scenes_are_split_whole(shared_root, caplog):

@@ -18,7 +18,7 @@ from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import Factor
-from neural_sim.synthesis.scene import Draws, HardDraws
+from neural_sim.synthesis.draws import Draws, HardDraws
 
 
 class Estimator(Protocol):

@@ -35,8 +35,8 @@ from neural_sim.gradient.mixed import ThetaMode, input_cotangents
 from neural_sim.gradient.significance import zero_mean
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import COORDINATES, Relaxation
+from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
-from neural_sim.synthesis.scene import RelaxedDraws
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 Mode = Literal["forward", "reverse"]

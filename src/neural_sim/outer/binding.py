@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Int
 from torch import Tensor
 
@@ -10,8 +9,9 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.targets import Targets
 from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
-from neural_sim.synthesis.scene import RenderedObject, Scene
-from neural_sim.types import LabelledImages, SceneDraw
+from neural_sim.synthesis.assembly import Compose, RenderedImages, RenderedObject
+from neural_sim.synthesis.scene import Scene
+from neural_sim.types import SceneDraw
 
 
 def image_losses(
@@ -39,8 +39,8 @@ def bound_losses(
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
 
-def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPath:
-    """The path from psi to one object's images through a relaxed draw.
+def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compose) -> RenderedPath:
+    """The path from psi to one object's images through a relaxed draw; ``compose`` makes them of its maps.
 
     Raises:
         ValueError: images of hard draws.
@@ -54,11 +54,6 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPat
 
     def replay(psi: Tensor) -> SceneDraw:
         return scene.distribution.relaxed(psi, noise, relaxed.relaxation)
-
-    def compose(rgb: Tensor, opacity: Tensor) -> LabelledImages:
-        return scene.synthesizer.compose(
-            rgb, opacity, part.nuisance, label, scene.distribution.label_of(part.draw)
-        )
 
     moving = scene.synthesizer.label_gradient == "differentiable"
     return RenderedPath(
@@ -74,21 +69,20 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject) -> RenderedPat
 
 
 def object_images(
-    scene: Scene, rendered: list[RenderedObject], psi: Tensor, weights: Tensor
+    scene: Scene, rendered: RenderedImages, psi: Tensor, weights: Tensor
 ) -> dict[str, ObjectImages]:
-    """Every object's images by name, with their rows in the joined training set; a path where draws are relaxed."""
-    bound, first = {}, 0
-    for label, part in enumerate(rendered):
-        index = torch.arange(first, first + len(part.images))
-        first += len(part.images)
+    """The images in which each object shows, by its name, with their rows in the training set; a path where draws are
+    relaxed. ``weights`` are those of all images in the training loss."""
+    bound = {}
+    for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
         bound[scene.names[label]] = ObjectImages(
             psi=psi[label].detach().to(part.rgb.dtype),
             distribution=scene.distribution,
-            images=part.images.images,
-            index=index,
-            weights=weights[index],
+            images=rendered.images.images[rows.to(part.rgb.device)],
+            index=rows,
+            weights=weights[rows],
             draw=part.draw,
-            path=rendered_path(scene, label, part) if part.relaxed else None,
+            path=rendered_path(scene, label, part, rendered.compose[label]) if part.relaxed else None,
             group=part.relaxed.group if part.relaxed else 1,
         )
     return bound

@@ -16,8 +16,7 @@ from neural_sim.outer.checked import CheckedSteps
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.steps import FreeSteps, Steps
-from neural_sim.synthesis.scene import RenderedObject, join
-from neural_sim.types import LabelledImages
+from neural_sim.synthesis.assembly import RenderedImages
 
 
 class GradientLoop(OuterLoop, ABC):
@@ -47,7 +46,7 @@ class GradientLoop(OuterLoop, ABC):
         seconds: dict[str, float] = {}
         with timed(seconds, "render", self.inner.device):
             rendered = self.inner.draw(self.psi)
-            images = join(rendered)
+            images = rendered.images
         last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
         if not last:
             with timed(seconds, "probes", self.inner.device):
@@ -67,7 +66,7 @@ class GradientLoop(OuterLoop, ABC):
             self._go_to(self.steps.reported)
             return
         with timed(seconds, "hypergradient", self.inner.device):
-            result = self._derivative(rendered, images, cached)
+            result = self._derivative(rendered, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
         with timed(seconds, "certify", self.inner.device):
             every = self.settings.certify_every
@@ -91,10 +90,9 @@ class GradientLoop(OuterLoop, ABC):
         """The derivative at psi as an iteration takes it, by new images and a training on them; psi does not move."""
         self._prepare()
         rendered = self.inner.draw(self.psi)
-        images = join(rendered)
-        cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+        cached = CachedSet.of(self.inner.detector, self.inner.backbone, rendered.images)
         self.inner.train(cached, self._recording)
-        return self._derivative(rendered, images, cached)
+        return self._derivative(rendered, cached)
 
     def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
         self.psi.data[self._learned] = psi
@@ -109,9 +107,7 @@ class GradientLoop(OuterLoop, ABC):
         """Draw what the derivative needs beside the training images."""
 
     @abstractmethod
-    def _derivative(
-        self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
-    ) -> Hypergradient:
+    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
         """dL_val/dpsi of the learned objects, zeros for the others."""
 
     def _cosine(self, result: Hypergradient) -> float:

@@ -21,7 +21,7 @@ from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.flatten import unflatten
-from neural_sim.synthesis.scene import Scene, join
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 
@@ -87,9 +87,7 @@ class FrozenLoop:
     def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
         """``per_bin`` images of every bin of every object."""
         objects = range(len(self.scene.names))
-        return ProbeSet.draw(
-            self.scene, self.scene, self.detector, self.backbone, per_bin, self.psi, generator, objects
-        )
+        return ProbeSet.draw(self.scene, self.detector, self.backbone, per_bin, self.psi, generator, objects)
 
     def truth(self, per_bin: int, generator: torch.Generator) -> list[MixedDerivative]:
         """The derivative over hard bins of every object, from ``per_bin`` images of each."""
@@ -109,10 +107,11 @@ class FrozenLoop:
     ) -> list[MixedDerivative]:
         """Every object's estimate from ``count`` relaxed draws of each, through the psi loop's own binding."""
         rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
-        images = join(rendered)
+        images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
         losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets, images.labels))
-        weights = torch.full((len(images),), len(rendered) / len(images))  # those of an object sum to 1
+        # The weights of an object's images sum to 1.
+        weights = torch.full((len(images),), len(rendered.objects) / len(images))
         parts = object_images(self.scene, rendered, self.psi, weights).values()
         return [estimator.estimate(losses, self.trainable, self.vector, part, {}) for part in parts]
 

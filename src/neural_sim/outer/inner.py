@@ -20,8 +20,10 @@ from neural_sim.devices import placed, synchronise
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.synthesis.draws import HARD, Draws, HardDraws
 from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import HARD, Draws, HardDraws, RenderedObject, Scene
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 
@@ -96,14 +98,13 @@ class InnerLoop:
         """The trained part of theta."""
         return self.detector.split(self.theta)[1]
 
-    def draw(self, psi: Float[Tensor, "objects K"]) -> list[RenderedObject]:
-        """An iteration's training images of every object."""
-        count, labels = self.settings.images_per_object, range(len(self.scene.names))
-        self.images += count * len(labels)
-        generator = self._common(0)
-        if self.pool is None:
-            return self.scene.training_set(psi, count, generator, self.draws)
-        return [self.pool.draw(label, psi[label], count, generator) for label in labels]
+    def draw(self, psi: Float[Tensor, "objects K"]) -> RenderedImages:
+        """An iteration's training images."""
+        rendered = self.scene.training_set(
+            psi, self.settings.images_per_object, self._common(0), self.draws, self.pool
+        )
+        self.images += len(rendered)
+        return rendered
 
     def _common(self, purpose: int) -> torch.Generator:
         """A generator of the same random numbers until :meth:`renew`, or of new ones without ``common_numbers``."""

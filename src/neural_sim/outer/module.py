@@ -22,8 +22,7 @@ from neural_sim.outer.response import agreement
 from neural_sim.outer.retrained import as_double, binned_problem, retrained_cosine
 from neural_sim.outer.unrolling import through_training
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.synthesis.scene import RenderedObject
-from neural_sim.types import LabelledImages
+from neural_sim.synthesis.assembly import RenderedImages
 
 
 class SimulatorModule(GradientLoop):
@@ -41,11 +40,9 @@ class SimulatorModule(GradientLoop):
         if self.settings.adjoint == "unrolled":
             self._recording = self.settings.unrolled.recording
 
-    def _derivative(
-        self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
-    ) -> Hypergradient:
-        trainable = self.inner.trainable
-        count = len(images)
+    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
+        trainable, labels = self.inner.trainable, rendered.images.labels
+        count = len(rendered)
         weights = torch.full((count,), 1.0 / count)
         wanted = self.settings.curvature_images
         subset = (
@@ -62,9 +59,9 @@ class SimulatorModule(GradientLoop):
         learned = {name: by_object[name] for name in self._names}
         if self.settings.adjoint == "unrolled":
             return self._with_fixed(
-                through_training(self.inner, inner, self.estimator, cached, images.labels, learned, probed)
+                through_training(self.inner, inner, self.estimator, cached, labels, learned, probed)
             )
-        losses = bound_losses(cached, self.inner.backbone, images.labels, probed.cached if probed else None)
+        losses = bound_losses(cached, self.inner.backbone, labels, probed.cached if probed else None)
         estimates = {
             name: self._bind(losses, learned[name], probed.probes[label] if probed else {})
             for label, name in zip(self._learned, self._names, strict=True)
@@ -102,9 +99,9 @@ class SimulatorModule(GradientLoop):
 
     def _every_bin(self, per_bin: int, generator: torch.Generator, objects: Sequence[int]) -> ProbeSet:
         """``per_bin`` images of every bin of every factor of the objects, with their features."""
-        source, inner = self.inner.pool or self.scene, self.inner
+        inner = self.inner
         probed = ProbeSet.draw(
-            source, self.scene, inner.detector, inner.backbone, per_bin, self.psi, generator, objects
+            self.scene, inner.detector, inner.backbone, per_bin, self.psi, generator, objects, inner.pool
         )
         inner.images += len(probed.cached)
         return probed

@@ -12,8 +12,8 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Probes
-from neural_sim.synthesis.pool import ImagePool
-from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.scene import Scene, Source
+from neural_sim.types import LabelledImages
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class ProbeSet:
 
     @staticmethod
     def draw(
-        source: Scene | ImagePool,
         scene: Scene,
         detector: Detector,
         backbone: Parameters,
@@ -38,19 +37,22 @@ class ProbeSet:
         psi: Float[Tensor, "objects K"],
         generator: torch.Generator,
         objects: Sequence[int],
+        source: Source | None = None,
     ) -> ProbeSet:
-        """Probes of some ``objects`` from ``source``; all factors but the stratified one are drawn from p_psi."""
-        drawn: list[RenderedObject] = []
+        """Probes of some ``objects``, rendered by ``source`` (None: the scene); all factors but the stratified one are
+        drawn from p_psi."""
+        drawn: list[LabelledImages] = []
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
         first = 0
         for label in objects:
             for factor in scene.distribution.factors:
-                part = source.probes(label, factor.name, per_bin, psi[label], generator)
-                index = torch.arange(first, first + len(part.images))
-                probes[label][factor.name] = Probes(index, factor.stratum_of(part.draw))
+                images, draw = scene.probes(label, factor.name, per_bin, psi, generator, source)
+                index = torch.arange(first, first + len(images))
+                probes[label][factor.name] = Probes(index, factor.stratum_of(draw))
                 first += len(index)
-                drawn.append(part)
-        return ProbeSet(probes, CachedSet.of(detector, backbone, join(drawn)), per_bin)
+                drawn.append(images)
+        cached = CachedSet.of(detector, backbone, LabelledImages.concatenate(drawn))
+        return ProbeSet(probes, cached, per_bin)
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
         """These probes with the next ``fresh.per_bin`` of every bin, cyclically by the iteration ``turn``, replaced by

@@ -24,8 +24,7 @@ from neural_sim.outer.retrained import centred_cosine
 from neural_sim.parameter.factor import Factor
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.solution import Solution, Status
-from neural_sim.synthesis.scene import RenderedObject, join
-from neural_sim.types import LabelledImages
+from neural_sim.synthesis.assembly import RenderedImages
 
 PART = 0.15
 """Fraction of an object's images that move."""
@@ -101,9 +100,7 @@ class ResponseLoop(GradientLoop):
         super().__init__(inner, psi)
         self.part = part
 
-    def _derivative(
-        self, rendered: list[RenderedObject], images: LabelledImages, cached: CachedSet
-    ) -> Hypergradient:
+    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
         slopes = response(self.inner, self.psi, self.part).slopes(self.inner, self.psi)
         zero = torch.zeros_like(slopes[0])
         gradients = {
@@ -126,5 +123,5 @@ def _moved(
 
 def _scores(inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "classes"]:
     """Scores of a detector trained on images of ``psi``."""
-    inner.train(CachedSet.of(inner.detector, inner.backbone, join(inner.draw(psi))))
+    inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
     return inner.scores().sum(1)

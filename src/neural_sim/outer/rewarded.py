@@ -9,7 +9,6 @@ from neural_sim.baseline.base import RewardMethod
 from neural_sim.detector.cached import CachedSet
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
-from neural_sim.synthesis.scene import join
 
 
 class RewardLoop(OuterLoop):
@@ -24,13 +23,13 @@ class RewardLoop(OuterLoop):
         psi = self.search.ask()
         with timed(seconds, "render", self.inner.device):
             rendered = self.inner.draw(psi)
-            images = join(rendered)
+            images = rendered.images
         with timed(seconds, "features", self.inner.device):
             cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
         with timed(seconds, "train", self.inner.device):
             training_loss = self.inner.train(cached)
         with timed(seconds, "reward", self.inner.device):
             record = self.record(psi, images, training_loss, seconds)
-        self.search.tell(-record.validation_loss, [part.draw for part in rendered])
+        self.search.tell(-record.validation_loss, [part.draw for part in rendered.objects])
         self.psi.data = self.search.psi.clone()
         self.trajectory.append(self.psi.detach().clone())

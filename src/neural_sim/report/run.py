@@ -17,8 +17,8 @@ from neural_sim.cameras import orbit
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report import figures
+from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.export import write_coco
-from neural_sim.synthesis.scene import RenderedObject, join
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -212,14 +212,18 @@ def write_figures(
     return paths
 
 
-def write_training_set(parts: Sequence[RenderedObject], names: Sequence[str], folder: Path) -> Path:
-    """The final training set as COCO: images and a JSON that holds every image's pose."""
-    named = ("phi", "rho", "distance", "magnification", "bins")
-    drawn = {key: [getattr(part.draw, key) for part in parts] for key in named}
-    poses = {key: torch.cat(values) for key, values in drawn.items() if values[0] is not None}
-    poses["distance"] = torch.cat([part.draw.distance / part.draw.radius for part in parts])  # object radii
-    poses["camera_to_world"] = orbit(poses["phi"], poses["rho"], poses["distance"])
-    return write_coco(join(parts), list(names), folder, poses)
+def write_training_set(rendered: RenderedImages, names: Sequence[str], folder: Path) -> Path:
+    """The final training set as COCO: images and a JSON that holds the pose of every object in them."""
+    poses: list[list[dict[str, Any]]] = [[] for _ in range(len(rendered))]
+    for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
+        draw, distance = part.draw, part.draw.distance / part.draw.radius  # object radii
+        values = {name: getattr(draw, name) for name in ("phi", "rho", "magnification", "bins")}
+        values |= {"distance": distance, "camera_to_world": orbit(draw.phi, draw.rho, distance)}
+        listed = {key: value.tolist() for key, value in values.items() if value is not None}
+        for place, row in enumerate(rows.tolist()):
+            pose = {key: value[place] for key, value in listed.items()}
+            poses[row].append({"category_id": label + 1, **pose})
+    return write_coco(rendered.images, list(names), folder, poses)
 
 
 def write_detections(

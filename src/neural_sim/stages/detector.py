@@ -18,7 +18,8 @@ from neural_sim.devices import placed, synchronise
 from neural_sim.outer.cost import Cost
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
-from neural_sim.synthesis.scene import RenderedObject, Scene, join
+from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.synthesis.scene import Scene
 
 CPU = torch.device("cpu")
 
@@ -61,7 +62,7 @@ class DetectorStage(Stage[TrainedDetector]):
         camera = self.scene.camera
         return self.detector(num_classes=len(self.scene.names), image_size=(camera.height, camera.width))
 
-    def images(self, scene: Scene, generator: torch.Generator | None = None) -> list[RenderedObject]:
+    def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
         """The training images, equal in every call."""
         generator = self.generator() if generator is None else generator
         return scene.training_set(self.psi, self.training.images_per_object, generator)
@@ -78,7 +79,7 @@ class DetectorStage(Stage[TrainedDetector]):
             self.generator(),
         )
         begun, cpu_begun = time.perf_counter(), time.process_time()
-        images = join(self.images(scene, generator))
+        images = self.images(scene, generator).images
         params, history = train_detector(
             detector,
             placed(detector.init(generator), self.device),

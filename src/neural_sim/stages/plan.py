@@ -11,8 +11,8 @@ from neural_sim.outer.inner import pooled
 from neural_sim.stages.account import Omission
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.graph import Graph
+from neural_sim.synthesis.draws import HardDraws
 from neural_sim.synthesis.pool import pool_cells
-from neural_sim.synthesis.scene import HardDraws
 
 
 def plan(graph: Graph) -> list[Omission]:

@@ -26,7 +26,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
-from neural_sim.synthesis.scene import Draws, HardDraws
+from neural_sim.synthesis.draws import Draws, HardDraws
 
 Method = Fixed | HypergradientLoop | Response | RewardMethod
 

@@ -17,7 +17,6 @@ from neural_sim.report.run import (
 )
 from neural_sim.stages.context import Context
 from neural_sim.stages.evaluate import Scores
-from neural_sim.synthesis.scene import join
 
 
 def write_report(context: Context) -> None:
@@ -32,10 +31,10 @@ def write_report(context: Context) -> None:
         compared = graph.compared(learned).items()
         scores = {called: results(graph.scores(psi, called)) for called, psi in compared}
     report = _results(context, scores)
-    parts = graph.trained_on(learned.last, "learned").images(results(graph.scene))
-    drawn = [dataclasses.replace(part, images=part.images.to("cpu")) for part in parts]
+    rendered = graph.trained_on(learned.last, "learned").images(results(graph.scene))
+    drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
     detections = scores["learned"].detections if scores else []
-    write_figures(report, join(drawn), test, detections, folder / "figures")
+    write_figures(report, drawn.images, test, detections, folder / "figures")
     write_training_set(drawn, list(graph.names), folder / "training_set")
     if scores:
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)

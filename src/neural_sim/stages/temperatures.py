@@ -12,7 +12,6 @@ from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.temperatures import Temperatures
 from neural_sim.report.temperatures import report_temperatures
 from neural_sim.stages.context import Context
-from neural_sim.synthesis.scene import join
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ def frozen_loop(context: Context, seed: int) -> FrozenLoop:
     graph, results, generator = context.graph, context.results, torch.Generator().manual_seed(seed)
     psi, scene = graph.psi("initial"), results(graph.scene)
     images = context.experiment.loop.outer.images_per_object
-    drawn = join(scene.training_set(psi, images, generator))
+    drawn = scene.training_set(psi, images, generator).images
     theta, validation = results(graph.warm_start).params, results(graph.targets).val
     detector, solver = graph.warm_start.build(), context.experiment.loop.solver
     return FrozenLoop.at(scene, detector, theta, psi, drawn, validation, solver, generator)

@@ -27,7 +27,8 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
 from neural_sim.stress.rendering import block
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.scene import HardDraws, Scene, join
+from neural_sim.synthesis.draws import HardDraws
+from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
@@ -197,7 +198,7 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
     )
     network = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     psi = torch.zeros(1, 4)
-    validation = join(scene.training_set(psi, 2, generator))
+    validation = scene.training_set(psi, 2, generator).images
     settings = Outer(
         Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
         on_untrusted=choice, objective="loss", adjoint="implicit", steps="free", train_first=False,

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from PIL import Image
-from torch import Tensor
 
 from neural_sim.types import LabelledImages
 
@@ -19,19 +18,18 @@ def write_coco(
     images: LabelledImages,
     class_names: Sequence[str],
     folder: str | Path,
-    poses: Mapping[str, Tensor] | None = None,
+    poses: Sequence[Sequence[Mapping[str, Any]]] | None = None,
 ) -> Path:
     """Write ``folder/images/*.png`` (8 bit) and ``folder/annotations.json``, whose path is returned.
 
-    ``poses`` maps names to a value per image, of any shape: phi, rho (radians), distance (object radii),
-    camera_to_world [n, 4, 4] (OpenGL axes) and whatever else made the images. They become each image's ``pose``,
-    beside its ``bin``. The JSON comes last and at once, so that where it exists all its images do.
+    ``poses`` are those of the objects in each image, labelled or hidden: their ``category_id``, phi, rho (radians),
+    distance (object radii), camera_to_world [4, 4] (OpenGL axes) and whatever else made the image. They become each
+    image's ``poses``, beside its ``bin``. The JSON comes last and at once, so that where it exists all its images do.
 
     Raises:
         ValueError: a label without a name, or poses of another number of images.
     """
     folder = Path(folder)
-    poses = {"bin": images.bins, **(poses or {})}
     _check(images, class_names, poses)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     pixels = images.images.detach().clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8).movedim(1, -1).cpu()
@@ -40,8 +38,8 @@ def write_coco(
         name = f"images/{row:06d}.png"
         Image.fromarray(pixels[row].numpy()).save(folder / name, compress_level=1)
         entry = {"id": row + 1, "file_name": name, "height": pixels.shape[1], "width": pixels.shape[2]}
-        pose = {key: value[row].detach().cpu().tolist() for key, value in poses.items()}
-        entries.append({**entry, "pose": pose})
+        known = {} if poses is None else {"poses": [dict(pose) for pose in poses[row]]}
+        entries.append({**entry, "bin": int(images.bins[row]), **known})
         for box, label in zip(images.boxes[row].tolist(), images.labels[row].tolist(), strict=True):
             if label >= 0:
                 annotations.append(_annotation(len(annotations) + 1, row + 1, label, box))
@@ -59,14 +57,15 @@ def write_coco(
     return path
 
 
-def _check(images: LabelledImages, class_names: Sequence[str], poses: Mapping[str, Tensor]) -> None:
+def _check(
+    images: LabelledImages, class_names: Sequence[str], poses: Sequence[Sequence[Mapping[str, Any]]] | None
+) -> None:
     if images.labels.numel() and int(images.labels.max()) >= len(class_names):
         raise ValueError(
             f"write_coco: label {int(images.labels.max())} has no name among {list(class_names)}"
         )
-    for key, value in poses.items():
-        if len(value) != len(images):
-            raise ValueError(f"write_coco: poses[{key!r}] has {len(value)} rows for {len(images)} images")
+    if poses is not None and len(poses) != len(images):
+        raise ValueError(f"write_coco: poses has {len(poses)} rows for {len(images)} images")
 
 
 def _annotation(number: int, image: int, label: int, box: Sequence[float]) -> dict[str, Any]:

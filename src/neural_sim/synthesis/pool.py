@@ -15,7 +15,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.synthesis.scene import RenderedObject, Scene
+from neural_sim.synthesis.assembly import RenderedObject
+from neural_sim.synthesis.draws import HARD, Draws, HardDraws
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import SceneDraw
 
 
@@ -63,40 +65,44 @@ class ImagePool:
         pools = []
         for label in range(len(scene.names)):
             noise = scene.distribution.draw_noise(len(bins), generator, scene.dtype(label))
-            part = scene.render(label, scene.distribution.at_bins(named, noise), noise, generator)
+            part = scene.render(label, scene.distribution.at_bins(named, noise))
             maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
             pools.append(ObjectPool((maps * 255).round().to(torch.uint8), part.draw, per_cell))
         return ImagePool(scene, tuple(pools))
 
-    def draw(
-        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator
+    def drawn(
+        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
     ) -> RenderedObject:
-        """``count`` images of one object from p_psi, its maps drawn with replacement."""
-        noise = self.scene.distribution.draw_noise(count, generator)
-        return self._compose(label, self.scene.distribution.hard(psi.float(), noise).bins, generator)
+        """One object alone, ``count`` times from p_psi, its maps drawn with replacement.
 
-    def probes(
+        Raises:
+            ValueError: for relaxed draws.
+        """
+        if not isinstance(how, HardDraws):
+            raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
+        noise = self.scene.distribution.draw_noise(count, generator)
+        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, generator)
+
+    def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
-    ) -> RenderedObject:
-        """``per_bin`` images of every bin of a factor, in the order of its bins; other factors from p_psi."""
+    ) -> tuple[RenderedObject, Int[Tensor, "m"]]:
+        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; other factors from
+        p_psi. Every render is a scene of its own."""
         distribution = self.scene.distribution
         bins = torch.arange(distribution.factor(factor).size).repeat_interleave(per_bin)
-        if len(distribution.binned) == 1:
-            return self._compose(label, bins[:, None], generator)
-        noise = distribution.draw_noise(len(bins), generator)
-        return self._compose(label, distribution.stratum(factor, bins, psi.float(), noise).bins, generator)
+        scenes, chosen = torch.arange(len(bins)), bins[:, None]
+        if len(distribution.binned) > 1:
+            noise = distribution.draw_noise(len(bins), generator)
+            chosen = distribution.stratum(factor, bins, psi.float(), noise).bins
+        return self._taken(label, chosen, generator), scenes
 
-    def _compose(
+    def _taken(
         self, label: int, bins: Int[Tensor, "n factors"], generator: torch.Generator
     ) -> RenderedObject:
-        pool, scene = self.objects[label], self.scene
+        pool = self.objects[label]
         cell = torch.zeros(len(bins), dtype=torch.long)
-        for column, factor in zip(bins.unbind(1), scene.distribution.binned, strict=True):
+        for column, factor in zip(bins.unbind(1), self.scene.distribution.binned, strict=True):
             cell = cell * factor.bins + column
-        within = torch.randint(pool.per_cell, cell.shape, generator=generator)
-        index = cell * pool.per_cell + within
+        index = cell * pool.per_cell + torch.randint(pool.per_cell, cell.shape, generator=generator)
         maps = pool.maps[index.to(pool.maps.device)].float() / 255
-        rgb, opacity = maps[..., :3], maps[..., 3]
-        nuisance = scene.synthesizer.draw_nuisance(len(bins), scene.camera, generator, maps.device)
-        images = scene.synthesizer.compose(rgb, opacity, nuisance, label, bins[:, 0])
-        return RenderedObject(images, None, pool.draw.select(index), nuisance, rgb, opacity)
+        return RenderedObject(pool.draw.select(index), maps[..., :3], maps[..., 3])

@@ -2,84 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.cameras import cameras_of, orbit
 from neural_sim.field.base import RadianceField
-from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.synthesis.assembly import RenderedImages, RenderedObject, Shared, one_each
+from neural_sim.synthesis.draws import HARD, Draws, RelaxedDraws
+from neural_sim.synthesis.layout import Layout, draw_layout, own_labels
 from neural_sim.synthesis.motion import light_names, moved_by, pose_rates
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, PinholeCamera, SceneDraw
 
 
-@dataclass(frozen=True)
-class RelaxedDraws:
-    """How images for the pathwise estimator are drawn.
+class Source(Protocol):
+    """Draws and renders one object alone: a :class:`Scene`, or a pool of its renders."""
 
-    ``relaxation`` and ``conditional_draws`` (of ``gumbel_rao``): see :meth:`BinnedFactor.relaxed`. ``antithetic``:
-    Gumbel noise in pairs from u and 1 - u. ``common_backgrounds``: the images of a pair share background and shift.
-    ``tangents``: also render the maps' derivatives by the numbers that depend on psi.
-    """
+    def drawn(
+        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws, /
+    ) -> RenderedObject: ...
 
-    relaxation: Relaxation = "gumbel_softmax"
-    conditional_draws: int = 8
-    antithetic: bool = False
-    common_backgrounds: bool = False
-    tangents: bool = False
-
-    @property
-    def group(self) -> int:
-        """How many consecutive images share randomness."""
-        return 2 if self.antithetic or self.common_backgrounds else 1
-
-    def noise(
-        self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
-    ) -> SceneNoise:
-        """Raises ``ValueError`` for a count that does not divide into pairs where pairs are asked for."""
-        if count % self.group:
-            raise ValueError(
-                "gradient.antithetic and gradient.common_backgrounds pair images: want an even "
-                f"outer.images_per_object, got {count}"
-            )
-        conditional = self.conditional_draws if self.relaxation == "gumbel_rao" else 0
-        return distribution.draw_noise(count, generator, dtype, self.antithetic, conditional)
-
-
-@dataclass(frozen=True)
-class HardDraws:
-    """Exact samples of p_psi. ``explore``: lights around psi's, for estimators that need a density."""
-
-    explore: bool = False
-
-
-Draws = HardDraws | RelaxedDraws
-HARD = HardDraws()
-
-
-@dataclass(frozen=True)
-class RenderedObject:
-    """One object's images, with the ``noise`` and ``nuisance`` that reproduce them.
-
-    ``noise`` is None for images from a pool or of probes, ``relaxed`` for hard draws. ``tangents``, if rendered, are
-    the maps' derivatives by the named numbers of the draw.
-    """
-
-    images: LabelledImages
-    noise: SceneNoise | None
-    draw: SceneDraw
-    nuisance: Nuisance
-    rgb: Float[Tensor, "n h w 3"]
-    opacity: Float[Tensor, "n h w"]
-    relaxed: RelaxedDraws | None = None
-    tangents: Mapping[str, Maps] | None = None
+    def probed(
+        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator, /
+    ) -> tuple[RenderedObject, Int[Tensor, "m"]]: ...
 
 
 @dataclass(frozen=True)
@@ -98,14 +51,11 @@ class Scene:
     def _sized(self, label: int, draw: SceneDraw) -> SceneDraw:
         return draw if self.radii is None else replace(draw, radius=self.radii[label])
 
-    def render(
-        self, label: int, draw: SceneDraw, noise: SceneNoise, generator: torch.Generator
-    ) -> RenderedObject:
-        """Images of object ``label`` at given scene parameters, over fresh backgrounds; no derivatives."""
+    def render(self, label: int, draw: SceneDraw, noise: SceneNoise | None = None) -> RenderedObject:
+        """Object ``label`` alone at given scene parameters; no derivatives."""
         draw = self._sized(label, draw)
         maps = self._maps(label, draw)
-        nuisance = self._nuisance(label, len(draw), generator)
-        return self._compose(label, draw, noise, maps, nuisance)
+        return RenderedObject(draw, maps.rgb, maps.opacity, noise)
 
     @torch.no_grad()
     def _maps(self, label: int, draw: SceneDraw) -> Maps:
@@ -130,14 +80,6 @@ class Scene:
             )
         return self.renderer
 
-    def _compose(
-        self, label: int, draw: SceneDraw, noise: SceneNoise | None, maps: Maps, nuisance: Nuisance
-    ) -> RenderedObject:
-        bins = self.distribution.label_of(draw)
-        with torch.no_grad():
-            images = self.synthesizer.compose(maps.rgb, maps.opacity, nuisance, label, bins)
-        return RenderedObject(images, noise, draw, nuisance, maps.rgb, maps.opacity)
-
     def dtype(self, label: int) -> torch.dtype:
         """The type of an object's field and images."""
         return next(self.fields[label].parameters()).dtype
@@ -151,24 +93,27 @@ class Scene:
             self.device(label), self.dtype(label)
         )
 
-    def _nuisance(self, label: int, count: int, generator: torch.Generator) -> Nuisance:
-        return self.synthesizer.draw_nuisance(count, self.camera, generator, self.device(label))
-
-    def draw(
-        self,
-        label: int,
-        psi: Float[Tensor, "K"],
-        count: int,
-        generator: torch.Generator,
-        how: Draws = HARD,
+    def drawn(
+        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
     ) -> RenderedObject:
-        """``count`` images of one object from p_psi, as the estimator wants them."""
+        """One object alone, ``count`` times from p_psi, as the estimator wants it."""
         logits = psi.detach().to(self.dtype(label))
         if isinstance(how, RelaxedDraws):
-            return self._draw_relaxed(label, logits, count, generator, how)
+            return self._drawn_relaxed(label, logits, count, generator, how)
         noise = self.distribution.draw_noise(count, generator, self.dtype(label), explore=how.explore)
-        draw = self.distribution.hard(logits, noise)
-        return self.render(label, draw, noise, generator)
+        return self.render(label, self.distribution.hard(logits, noise), noise)
+
+    def probed(
+        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
+    ) -> tuple[RenderedObject, Int[Tensor, "m"]]:
+        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; other factors from
+        p_psi. And which renders are of one scene.
+
+        For an illumination the bins are the anchor lights, all with the same ``per_bin`` scenes.
+        """
+        dtype = self.dtype(label)
+        draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
+        return self.render(label, draw), scenes
 
     def _maps_with_tangents(
         self, label: int, draw: SceneDraw, names: tuple[str, ...]
@@ -193,7 +138,7 @@ class Scene:
         maps, *moved = (_joined(parts) for parts in zip(*each, strict=True))
         return maps, dict(zip((*names, *light_names(lights)), moved, strict=True))
 
-    def _draw_relaxed(
+    def _drawn_relaxed(
         self, label: int, logits: Tensor, count: int, generator: torch.Generator, relaxed: RelaxedDraws
     ) -> RenderedObject:
         noise = relaxed.noise(self.distribution, count, generator, self.dtype(label))
@@ -208,12 +153,9 @@ class Scene:
         maps, tangents = (
             self._maps_with_tangents(label, draw, names) if moving else (self._maps(label, draw), None)
         )
-        group = 2 if relaxed.common_backgrounds else 1
-        nuisance = self._nuisance(label, count // group, generator)
-        if group > 1:
-            nuisance = nuisance.select(torch.arange(count) // group)
-        rendered = self._compose(label, draw, noise, maps, nuisance)
-        return replace(rendered, relaxed=relaxed, tangents=tangents)
+        return RenderedObject(draw, maps.rgb, maps.opacity, noise, relaxed, tangents)
+
+    # --- images ---
 
     def training_set(
         self,
@@ -221,22 +163,89 @@ class Scene:
         count: int,
         generator: torch.Generator,
         how: Draws = HARD,
-    ) -> list[RenderedObject]:
-        """``count`` images of every object."""
-        return [self.draw(label, psi[label], count, generator, how) for label in range(len(self.names))]
+        source: Source | None = None,
+    ) -> RenderedImages:
+        """``count`` images of every object, which ``source`` (None: this scene) draws and renders.
+
+        Raises:
+            ValueError: for draws in pairs with several objects an image.
+        """
+        source, labels = source or self, range(len(self.names))
+        if self.synthesizer.several:
+            return self._of_several(psi, count, generator, how, source)
+        group = how.background_group if isinstance(how, RelaxedDraws) else 1
+        objects, nuisances = [], []
+        for label in labels:
+            objects.append(source.drawn(label, psi[label], count, generator, how))
+            nuisance = self._nuisance(count // group, generator)
+            nuisances.append(nuisance if group == 1 else nuisance.select(torch.arange(count) // group))
+        return one_each(objects, nuisances, labels, self._bins(objects), self.synthesizer)
+
+    def _of_several(
+        self,
+        psi: Float[Tensor, "objects K"],
+        count: int,
+        generator: torch.Generator,
+        how: Draws,
+        source: Source,
+    ) -> RenderedImages:
+        if isinstance(how, RelaxedDraws) and how.group > 1:
+            raise ValueError(
+                "gradient.antithetic and gradient.common_backgrounds pair images of one object: want "
+                f"synthesis.objects_per_image=[1, 1], got {list(self.synthesizer.objects_per_image)}"
+            )
+        classes = len(self.names)
+        layout = draw_layout(own_labels([count] * classes), classes, self.synthesizer.count, generator)
+        return self._around(layout, psi, generator, how, source).composed()
+
+    def _around(
+        self,
+        layout: Layout,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+        how: Draws,
+        source: Source,
+    ) -> Shared:
+        """Images of the layout, every object from its own p_psi."""
+        nuisance = self._nuisance(len(layout), generator, layout.labels.shape[1])
+        counts = [len(layout.places(label)[0]) for label in range(len(self.names))]
+        objects = [
+            source.drawn(label, psi[label], shown, generator, how) for label, shown in enumerate(counts)
+        ]
+        return Shared.of(objects, layout, nuisance, self._bins(objects), self.synthesizer)
 
     def probes(
-        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
-    ) -> RenderedObject:
-        """``per_bin`` images of every bin of a factor, in the order of its bins; other factors from p_psi.
+        self,
+        label: int,
+        factor: str,
+        per_bin: int,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+        source: Source | None = None,
+    ) -> tuple[LabelledImages, SceneDraw]:
+        """``per_bin`` images of every bin of a factor of one object, in the order of its bins, and the object's draws.
 
-        For an illumination the bins are the anchor lights, all with the same ``per_bin`` poses and backgrounds.
+        All else is as in an image of the training set in which the object shows: other factors from p_psi, other
+        objects from theirs. Probes of lights share scenes, other objects and backgrounds.
         """
-        dtype = self.dtype(label)
-        draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
-        draw = self._sized(label, draw)
-        nuisance = self._nuisance(label, int(scenes.max()) + 1, generator).select(scenes)
-        return self._compose(label, draw, None, self._maps(label, draw), nuisance)
+        source = source or self
+        part, scenes = source.probed(label, factor, per_bin, psi[label], generator)
+        (bins,) = self._bins([part])
+        count = int(scenes.max()) + 1
+        if not self.synthesizer.several:
+            nuisance = self._nuisance(count, generator)
+            nuisance = nuisance if count == len(scenes) else nuisance.select(scenes)
+            return one_each([part], [nuisance], [label], [bins], self.synthesizer).images, part.draw
+        own = torch.full((count,), label)
+        layout = draw_layout(own, len(self.names), self.synthesizer.count, generator, present=True)
+        around = self._around(layout, psi, generator, HARD, source)
+        return around.repeated(scenes, label, part, bins).composed().images, part.draw
+
+    def _bins(self, objects: Sequence[RenderedObject]) -> list[Int[Tensor, "m"]]:
+        return [self.distribution.label_of(part.draw) for part in objects]
+
+    def _nuisance(self, count: int, generator: torch.Generator, objects: int | None = None) -> Nuisance:
+        return self.synthesizer.draw_nuisance(count, self.camera, generator, self.device(0), objects)
 
 
 def _joined(parts: Sequence[Maps]) -> Maps:
@@ -244,8 +253,3 @@ def _joined(parts: Sequence[Maps]) -> Maps:
     if len(parts) == 1:
         return parts[0]
     return Maps(torch.cat([part.rgb for part in parts]), torch.cat([part.opacity for part in parts]))
-
-
-def join(parts: Sequence[RenderedObject]) -> LabelledImages:
-    """All objects' images as one set, object by object."""
-    return LabelledImages.concatenate([part.images for part in parts])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -13,6 +14,9 @@ from torch import Tensor
 from neural_sim.synthesis.background import Background
 from neural_sim.synthesis.boxes import boxes_from_opacity
 from neural_sim.synthesis.compositing import apply_shift, composite, draw_shift
+from neural_sim.synthesis.layers import by_depth, stacked, visible_boxes
+from neural_sim.synthesis.layout import Layout, ObjectCount
+from neural_sim.synthesis.sensor import Sensor, SensorDraw, seen_by
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -20,16 +24,19 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Nuisance:
-    """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU."""
+    """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU, one for each
+    object in an image; ``sensor`` is what the camera does to it (None: nothing)."""
 
     backgrounds: Float[Tensor, "n 3 h w"]
-    shifts: Int[Tensor, "n 2"]
+    shifts: Int[Tensor, "n *objects 2"]
+    sensor: SensorDraw | None = None
 
     def __len__(self) -> int:
         return self.backgrounds.shape[0]
 
     def select(self, index: Tensor | slice) -> Nuisance:
-        return Nuisance(self.backgrounds[index], self.shifts[index])
+        sensor = None if self.sensor is None else self.sensor.select(index)
+        return Nuisance(self.backgrounds[index], self.shifts[index], sensor)
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,17 @@ class Synthesizer:
         background: where backgrounds come from.
         shift: largest in-image shift, as a fraction of the image's width and height.
         threshold: opacity above which a pixel belongs to the object.
-        minimum_area: fewest pixels of an object that get a box; below, the image has none.
+        minimum_area: fewest visible pixels of an object that get a box; below, it has none.
+        objects_per_image: fewest and most objects of an image, each of another class; [0, 6] has images without any.
+        min_visibility: smallest part of an object's pixels, of those within the image, that other objects leave visible
+            for it to get a box.
+        sensor: blur and noise of the camera.
         label_gradient: ``ignored`` is the paper's; ``differentiable`` lets boxes carry the derivative of their
             edges, so that the pathwise gradient sees that regression targets move with the object.
 
     Raises:
-        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, another label_gradient.
+        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, another label_gradient, a
+            range that is none; boxes that move, with several objects an image.
     """
 
     background: Background
@@ -53,6 +65,9 @@ class Synthesizer:
     threshold: float = 0.5
     minimum_area: float = 16.0
     label_gradient: Literal["ignored", "differentiable"] = "ignored"
+    objects_per_image: Sequence[int] = (1, 1)
+    min_visibility: float = 0.1
+    sensor: Sensor = field(default_factory=Sensor)
 
     def __post_init__(self) -> None:
         if not hasattr(self.background, "draw"):
@@ -63,17 +78,47 @@ class Synthesizer:
             raise ValueError(f"synthesis.threshold must lie in [0, 1), got {self.threshold}")
         if not self.minimum_area >= 0.0:
             raise ValueError(f"synthesis.minimum_area must not be negative, got {self.minimum_area}")
+        if not 0.0 <= self.min_visibility <= 1.0:
+            raise ValueError(f"synthesis.min_visibility must lie in [0, 1], got {self.min_visibility}")
         if self.label_gradient not in ("ignored", "differentiable"):
             raise ValueError(
                 f"synthesis.label_gradient must be ignored or differentiable, got {self.label_gradient!r}"
             )
+        if len(self.objects_per_image) != 2:
+            raise ValueError(
+                f"synthesis.objects_per_image: want fewest and most, got {list(self.objects_per_image)}"
+            )
+        if self.count.most > 1 and self.label_gradient == "differentiable":
+            raise ValueError(
+                "synthesis.label_gradient=differentiable wants one object an image: how a box moves with what hides it "
+                "is not derived"
+            )
+
+    @property
+    def count(self) -> ObjectCount:
+        """Of objects an image."""
+        return ObjectCount(*self.objects_per_image)
+
+    @property
+    def several(self) -> bool:
+        """Whether an image may have another number of objects than one."""
+        return self.count != ObjectCount(1, 1)
 
     def draw_nuisance(
-        self, n: int, camera: PinholeCamera, generator: torch.Generator, device: torch.device | str = "cpu"
+        self,
+        n: int,
+        camera: PinholeCamera,
+        generator: torch.Generator,
+        device: torch.device | str = "cpu",
+        objects: int | None = None,
     ) -> Nuisance:
-        """Backgrounds, on ``device``, and shifts of n images; independent of the scene parameters."""
-        backgrounds = self.background.draw(n, camera.height, camera.width, generator, device)
-        return Nuisance(backgrounds, draw_shift(n, self.shift, camera.height, camera.width, generator))
+        """Backgrounds, on ``device``, and shifts of n images; independent of the scene parameters. ``objects`` is the
+        number of shifts of each image, None for one shift without that axis."""
+        height, width = camera.height, camera.width
+        backgrounds = self.background.draw(n, height, width, generator, device)
+        shifts = draw_shift(n * (objects or 1), self.shift, height, width, generator)
+        sensor = self.sensor.draw(n, height, width, generator, device)
+        return Nuisance(backgrounds, shifts if objects is None else shifts.view(n, objects, 2), sensor)
 
     def compose(
         self,
@@ -90,7 +135,7 @@ class Synthesizer:
         an image without a box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
-        images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
+        images = seen_by(composite(rgb, opacity, nuisance.backgrounds.to(rgb)), nuisance.sensor)
         moving = self.label_gradient == "differentiable"
         boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
         labels = torch.where(present, label, -1)[:, None]
@@ -99,6 +144,34 @@ class Synthesizer:
             missing = images_without_boxes(labelled)
             _log.debug("class %d: %d of %d images without a box", label, missing, len(labelled))
         return labelled
+
+    def compose_several(
+        self,
+        rgb: Float[Tensor, "n layers h w 3"],
+        opacity: Float[Tensor, "n layers h w"],
+        distance: Float[Tensor, "n layers"],
+        layout: Layout,
+        nuisance: Nuisance,
+        bins: Int[Tensor, "n"],
+    ) -> LabelledImages:
+        """Images of several objects, a layer for each column of ``layout``, with the boxes of what is visible.
+
+        Layers of no object are zeros. A pure function, differentiable in ``rgb`` (premultiplied) and ``opacity``;
+        boxes carry no derivative.
+        """
+        shifts = nuisance.shifts.flatten(0, 1)
+        rgb = apply_shift(rgb.flatten(0, 1), shifts).view(rgb.shape)
+        opacity = apply_shift(opacity.flatten(0, 1), shifts).view(opacity.shape)
+        nearest = by_depth(distance, layout.order).to(rgb.device)
+        place = nearest[..., None, None].expand_as(opacity)
+        rgb, opacity = rgb.gather(1, place[..., None].expand_as(rgb)), opacity.gather(1, place)
+        labels = layout.labels.to(rgb.device).gather(1, nearest)
+        images, visible = stacked(rgb, opacity, nuisance.backgrounds.to(rgb))
+        boxes, present = visible_boxes(
+            opacity.detach(), visible.detach(), self.threshold, self.minimum_area, self.min_visibility
+        )
+        labels = torch.where(present & (labels >= 0), labels, -1)
+        return LabelledImages(seen_by(images, nuisance.sensor), boxes, labels, bins.to(rgb.device))
 
 
 def images_without_boxes(images: LabelledImages) -> int:

@@ -13,6 +13,8 @@ from neural_sim.cameras import cameras_of, orbit
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
+from neural_sim.synthesis.assembly import RenderedObject, Shared
+from neural_sim.synthesis.layout import Layout
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
@@ -29,16 +31,39 @@ def render_target(
     synthesizer: Synthesizer,
     generator: torch.Generator,
     rig: LightRig | None = None,
+    layout: Layout | None = None,
 ) -> LabelledImages:
     """Images of every object at its draw, object by object; labels are positions in ``objects``.
 
-    Draws that weigh lights weigh those of ``rig``. Float32 on the CPU. Images without a box are counted in the log.
-    Raises ``ValueError`` for another number of draws than of objects, or none.
+    With a ``layout`` the images are its own, of several objects each; an object's draws are those of the images that
+    show it, in their order. Draws that weigh lights weigh those of ``rig``. Float32 on the CPU. Images without a box
+    are counted in the log.
+
+    Raises:
+        ValueError: another number of draws than of objects, or none.
     """
     if len(objects) != len(draws) or not objects:
         raise ValueError(
             f"render_target: want one draw per object, got {len(draws)} draws for {len(objects)} objects"
         )
+    if layout is None:
+        images = _one_each(objects, draws, camera, synthesizer, generator, rig)
+    else:
+        images = _of_several(objects, draws, camera, synthesizer, generator, rig, layout)
+    missing = images_without_boxes(images)
+    if missing:
+        _log.info("target: %d of %d rendered images hold no box", missing, len(images))
+    return images
+
+
+def _one_each(
+    objects: Sequence[Subject],
+    draws: Sequence[SceneDraw],
+    camera: PinholeCamera,
+    synthesizer: Synthesizer,
+    generator: torch.Generator,
+    rig: LightRig | None,
+) -> LabelledImages:
     parts = []
     for label, (item, draw) in enumerate(zip(objects, draws, strict=True)):
         for start in range(0, len(draw), CHUNK):
@@ -46,11 +71,25 @@ def render_target(
             rgb, opacity = _premultiplied(item, camera, here, rig)
             nuisance = synthesizer.draw_nuisance(len(here), camera, generator)
             parts.append(synthesizer.compose(rgb, opacity, nuisance, label, _label(here)))
-    images = LabelledImages.concatenate(parts)
-    missing = images_without_boxes(images)
-    if missing:
-        _log.info("target: %d of %d rendered images hold no box", missing, len(images))
-    return images
+    return LabelledImages.concatenate(parts)
+
+
+def _of_several(
+    objects: Sequence[Subject],
+    draws: Sequence[SceneDraw],
+    camera: PinholeCamera,
+    synthesizer: Synthesizer,
+    generator: torch.Generator,
+    rig: LightRig | None,
+    layout: Layout,
+) -> LabelledImages:
+    nuisance = synthesizer.draw_nuisance(len(layout), camera, generator, objects=layout.labels.shape[1])
+    rendered = [
+        RenderedObject(draw, *_premultiplied(item, camera, draw, rig))
+        for item, draw in zip(objects, draws, strict=True)
+    ]
+    bins = [_label(draw) for draw in draws]
+    return Shared.of(rendered, layout, nuisance, bins, synthesizer).composed().images
 
 
 def _label(draw: SceneDraw) -> Int[Tensor, "n"]:

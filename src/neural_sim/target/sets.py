@@ -10,6 +10,7 @@ import torch
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
+from neural_sim.synthesis.layout import draw_layout, own_labels
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.rendered import render_target
 from neural_sim.types import LabelledImages, PinholeCamera
@@ -46,11 +47,21 @@ class RenderedTarget:
         parts = {}
         for part, name in enumerate(("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
+            counts = [self._count(name, item.name in biased) for item in objects.values()]
+            layout = None
+            if synthesizer.several:
+                layout = draw_layout(own_labels(counts), len(objects), synthesizer.count, generator)
+                counts = [len(layout.places(label)[0]) for label in range(len(objects))]
             draws = []
-            for label, (item, psi) in enumerate(zip(objects.values(), target, strict=True)):
-                test_count = self.test_per_biased_object if item.name in biased else self.test_per_object
-                count = test_count if name == "test" else self.val_per_object
+            for label, (count, psi) in enumerate(zip(counts, target, strict=True)):
                 drawn = distribution.hard(psi, distribution.draw_noise(count, generator))
                 draws.append(drawn if radii is None else replace(drawn, radius=radii[label]))
-            parts[name] = render_target(list(objects.values()), draws, camera, synthesizer, generator, rig)
+            items = list(objects.values())
+            parts[name] = render_target(items, draws, camera, synthesizer, generator, rig, layout)
         return parts
+
+    def _count(self, part: str, biased: bool) -> int:
+        """Images of an object; of several objects an image, those whose own object it is."""
+        if part == "val":
+            return self.val_per_object
+        return self.test_per_biased_object if biased else self.test_per_object

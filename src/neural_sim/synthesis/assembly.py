@@ -1,0 +1,168 @@
+"""From objects rendered alone to labelled images of one or several of them, which can be composed again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.parameter.product import SceneNoise
+from neural_sim.synthesis.draws import RelaxedDraws
+from neural_sim.synthesis.layout import Layout
+from neural_sim.synthesis.training_set import Nuisance, Synthesizer
+from neural_sim.types import LabelledImages, Maps, SceneDraw
+
+CHUNK = 64
+"""Images composed together, which bounds the memory."""
+
+Compose = Callable[[Float[Tensor, "m h w 3"], Float[Tensor, "m h w"]], LabelledImages]
+
+
+@dataclass(frozen=True)
+class RenderedObject:
+    """One object alone, m times: premultiplied colour and opacity, and the scene parameters of each.
+
+    ``noise`` reproduces the draw; None for renders from a pool or of probes. ``relaxed`` is None for hard draws.
+    ``tangents``, if rendered, are the maps' derivatives by the named numbers of the draw.
+    """
+
+    draw: SceneDraw
+    rgb: Float[Tensor, "m h w 3"]
+    opacity: Float[Tensor, "m h w"]
+    noise: SceneNoise | None = None
+    relaxed: RelaxedDraws | None = None
+    tangents: Mapping[str, Maps] | None = None
+
+    def __len__(self) -> int:
+        return len(self.draw)
+
+
+@dataclass(frozen=True)
+class RenderedImages:
+    """Labelled images with what they are made of, class by class.
+
+    ``rows[c]`` are the images of ``objects[c]``, which shows in each at most once. ``compose[c]`` makes these images
+    again from other maps of that object, with all else as it was; it is differentiable in the maps.
+    """
+
+    images: LabelledImages
+    objects: tuple[RenderedObject, ...]
+    rows: tuple[Int[Tensor, "m"], ...]
+    compose: tuple[Compose, ...]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def one_each(
+    objects: Sequence[RenderedObject],
+    nuisances: Sequence[Nuisance],
+    labels: Sequence[int],
+    bins: Sequence[Int[Tensor, "m"]],
+    synthesizer: Synthesizer,
+) -> RenderedImages:
+    """An image for every render, object by object; ``labels`` are the objects' classes."""
+    images, rows, compose, first = [], [], [], 0
+    for part, nuisance, label, own in zip(objects, nuisances, labels, bins, strict=True):
+
+        def again(
+            rgb: Tensor, opacity: Tensor, nuisance: Nuisance = nuisance, label: int = label, own: Tensor = own
+        ) -> LabelledImages:
+            return synthesizer.compose(rgb, opacity, nuisance, label, own)
+
+        with torch.no_grad():
+            images.append(again(part.rgb, part.opacity))
+        rows.append(torch.arange(first, first + len(part)))
+        compose.append(again)
+        first += len(part)
+    return RenderedImages(LabelledImages.concatenate(images), tuple(objects), tuple(rows), tuple(compose))
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Images of several objects. ``place[i, l]`` is which render of its object is layer l of image i, -1 for none."""
+
+    objects: tuple[RenderedObject, ...]
+    layout: Layout
+    place: Int[Tensor, "n layers"]
+    nuisance: Nuisance
+    bins: Int[Tensor, "n"]
+    synthesizer: Synthesizer
+
+    @staticmethod
+    def of(
+        objects: Sequence[RenderedObject],
+        layout: Layout,
+        nuisance: Nuisance,
+        bins: Sequence[Int[Tensor, "m"]],
+        synthesizer: Synthesizer,
+    ) -> Shared:
+        """``objects`` hold each class's renders in the order in which ``layout`` shows it, ``bins`` their bins."""
+        place = torch.full_like(layout.labels, -1)
+        own = torch.full((len(layout),), -1)
+        for label, (part, each) in enumerate(zip(objects, bins, strict=True)):
+            rows, columns = layout.places(label)
+            if len(rows) != len(part):
+                raise ValueError(f"layout: shows class {label} {len(rows)} times, got {len(part)} renders")
+            place[rows, columns] = torch.arange(len(rows))
+            mine = columns == 0
+            own[rows[mine]] = each[mine].to(own)
+        return Shared(tuple(objects), layout, place, nuisance, own, synthesizer)
+
+    def composed(self) -> RenderedImages:
+        count = range(len(self.objects))
+        with torch.no_grad():
+            parts = [self.images(rows) for rows in torch.arange(len(self.layout)).split(CHUNK)]
+        rows = tuple(self.layout.places(label)[0] for label in count)
+        return RenderedImages(
+            LabelledImages.concatenate(parts),
+            self.objects,
+            rows,
+            tuple(self._again(label) for label in count),
+        )
+
+    def images(
+        self, rows: Int[Tensor, "m"], columns: Int[Tensor, "m"] | None = None, maps: Maps | None = None
+    ) -> LabelledImages:
+        """The images ``rows``; with ``maps`` in the place of their layers ``columns``."""
+        labels, place = self.layout.labels[rows], self.place[rows]
+        like = self.objects[0]
+        size = (*place.shape, *like.opacity.shape[1:])
+        rgb, opacity = like.rgb.new_zeros(*size, 3), like.opacity.new_zeros(size)
+        distance = torch.zeros(place.shape, dtype=torch.float64)
+        for label, part in enumerate(self.objects):
+            here = labels == label
+            index, there = place[here], here.to(rgb.device)
+            rgb[there], opacity[there] = part.rgb[index.to(rgb.device)], part.opacity[index.to(rgb.device)]
+            distance[here] = part.draw.distance.detach().double()[index]
+        if columns is not None and maps is not None:
+            layer = (torch.arange(len(rows), device=rgb.device), columns.to(rgb.device))
+            rgb, opacity = rgb.index_put(layer, maps.rgb), opacity.index_put(layer, maps.opacity)
+        return self.synthesizer.compose_several(
+            rgb,
+            opacity,
+            distance,
+            Layout(labels, self.layout.order[rows]),
+            self.nuisance.select(rows),
+            self.bins[rows],
+        )
+
+    def _again(self, label: int) -> Compose:
+        rows, columns = self.layout.places(label)
+        return lambda rgb, opacity: self.images(rows, columns, Maps(rgb, opacity))
+
+    def repeated(
+        self, index: Int[Tensor, "m"], label: int, part: RenderedObject, bins: Int[Tensor, "m"]
+    ) -> Shared:
+        """The images ``index``, whose own object, of class ``label``, is ``part``'s instead, one after the other."""
+        place = self.place[index].clone()
+        place[:, 0] = torch.arange(len(index))
+        objects = [part if i == label else other for i, other in enumerate(self.objects)]
+        return replace(
+            self,
+            objects=tuple(objects), layout=self.layout.select(index), place=place,
+            nuisance=self.nuisance.select(index), bins=bins.to(self.bins),
+        )  # fmt: skip

@@ -1,0 +1,89 @@
+"""Which objects share an image, and which lies in front: what p_psi does not say, drawn before anything is rendered.
+
+An image's number of objects is uniform in a range, and its classes are different ones, each set of them as likely as
+any other. Every image has a class of its own, so that all classes get equally many; the others follow at random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ObjectCount:
+    """Objects an image, uniform from ``fewest`` to ``most``.
+
+    Raises:
+        ValueError: a negative number, or ``most`` below ``fewest`` or 1.
+    """
+
+    fewest: int = 1
+    most: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.fewest <= self.most or self.most < 1:
+            raise ValueError(
+                f"synthesis.objects_per_image: want 0 <= fewest <= most and most of at least 1, got "
+                f"[{self.fewest}, {self.most}]"
+            )
+
+    @property
+    def mean(self) -> float:
+        return 0.5 * (self.fewest + self.most)
+
+    def draw(self, n: int, generator: torch.Generator, present: bool = False) -> Int[Tensor, "n"]:
+        """Of n images; or, if ``present``, of n images in which one given class is. It is in an image of c objects with
+        a probability in proportion to c, so that such images have c objects in proportion to c."""
+        numbers = torch.arange(self.fewest, self.most + 1)
+        weights = numbers.double() if present else torch.ones(len(numbers), dtype=torch.float64)
+        return numbers[torch.multinomial(weights, n, replacement=True, generator=generator)]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Of n images. ``labels`` are the classes in each, -1 for none; in column 0 the image's own class. ``order`` in
+    [0, 1) says which lies in front among objects at equal distances: the smaller."""
+
+    labels: Int[Tensor, "n most"]
+    order: Float[Tensor, "n most"]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def select(self, index: Tensor) -> Layout:
+        return Layout(self.labels[index], self.order[index])
+
+    def places(self, label: int) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+        """Images (rows) and columns in which a class appears; in an image at most once."""
+        row, column = (self.labels == label).nonzero().unbind(1)
+        return row, column
+
+
+def draw_layout(
+    own: Int[Tensor, "n"], classes: int, count: ObjectCount, generator: torch.Generator, present: bool = False
+) -> Layout:
+    """Of images whose own classes are ``own``; see :meth:`ObjectCount.draw` for ``present``.
+
+    Raises:
+        ValueError: for more objects an image than classes.
+    """
+    if count.most > classes:
+        raise ValueError(
+            f"synthesis.objects_per_image: want at most the {classes} objects that there are, got {count.most}"
+        )
+    counts = count.draw(len(own), generator, present)
+    keys = torch.rand((len(own), classes), generator=generator)
+    keys[torch.arange(len(own)), own] = -1.0
+    labels = keys.argsort(1)[:, : count.most]
+    labels = torch.where(torch.arange(count.most) < counts[:, None], labels, -1)
+    return Layout(labels, torch.rand(labels.shape, generator=generator))
+
+
+def own_labels(counts: Sequence[int]) -> Int[Tensor, "n"]:
+    """Class by class, as many images of each as ``counts`` says."""
+    return torch.arange(len(counts)).repeat_interleave(torch.tensor(list(counts)))

@@ -1,0 +1,91 @@
+"""What a camera does to an image: blur and noise. Drawn first, so that every pass can be replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SensorDraw:
+    """Of n images: ``blur``, the standard deviation of a Gaussian in pixels, and ``grain``, what is added to sRGB
+    values; either is None where there is none."""
+
+    blur: Float[Tensor, "n"] | None
+    grain: Float[Tensor, "n 3 h w"] | None
+
+    def select(self, index: Tensor | slice) -> SensorDraw:
+        return SensorDraw(*(None if part is None else part[index] for part in (self.blur, self.grain)))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Blur and noise of an image, each uniform in a range.
+
+    Args:
+        blur: smallest and largest standard deviation of the blur, in pixels.
+        noise: smallest and largest standard deviation of the noise, of sRGB values in [0, 1].
+
+    Raises:
+        ValueError: a range that is not 0 <= smallest <= largest.
+    """
+
+    blur: Sequence[float] = (0.0, 0.0)
+    noise: Sequence[float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for key in ("blur", "noise"):
+            bounds = list(getattr(self, key))
+            if len(bounds) != 2 or not 0.0 <= bounds[0] <= bounds[1] < float("inf"):
+                raise ValueError(f"synthesis.sensor.{key}: want 0 <= smallest <= largest, got {bounds}")
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
+    ) -> SensorDraw | None:
+        """Of n images; None, and no random number is drawn, where neither blur nor noise is asked for."""
+        if self.blur[1] == self.noise[1] == 0.0:
+            return None
+        blur = grain = None
+        if self.blur[1] > 0.0:
+            blur = _uniform(self.blur, n, generator).to(device)
+        if self.noise[1] > 0.0:
+            size = _uniform(self.noise, n, generator)[:, None, None, None]
+            grain = (size * torch.randn((n, 3, height, width), generator=generator)).to(device)
+        return SensorDraw(blur, grain)
+
+
+def seen_by(images: Float[Tensor, "n 3 h w"], sensor: SensorDraw | None) -> Float[Tensor, "n 3 h w"]:
+    """The images blurred, then with noise, in [0, 1]; differentiable in the images where they do not saturate."""
+    if sensor is None:
+        return images
+    if sensor.blur is not None:
+        images = blurred(images, sensor.blur)
+    if sensor.grain is not None:
+        images = images + sensor.grain.to(images)
+    return images.clamp(0.0, 1.0)
+
+
+def blurred(images: Float[Tensor, "n c h w"], deviation: Float[Tensor, "n"]) -> Float[Tensor, "n c h w"]:
+    """Each image convolved with its own Gaussian, cut at three of the largest standard deviations; edges repeat."""
+    n, channels, height, width = images.shape
+    reach = max(1, int(torch.ceil(3.0 * deviation.max())))
+    offset = torch.arange(-reach, reach + 1, device=images.device, dtype=images.dtype)
+    scale = deviation.to(images).clamp_min(1e-6)[:, None]
+    kernel = torch.exp(-0.5 * (offset / scale).square())
+    kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)[:, None]
+    rows = images.reshape(1, n * channels, height, width)
+    for edges, weights in (
+        ((reach, reach, 0, 0), kernel[:, :, None]),
+        ((0, 0, reach, reach), kernel[..., None]),
+    ):
+        padded = torch.nn.functional.pad(rows, edges, mode="replicate")
+        rows = torch.nn.functional.conv2d(padded, weights, groups=n * channels)
+    return rows.view(n, channels, height, width)
+
+
+def _uniform(bounds: Sequence[float], n: int, generator: torch.Generator) -> Float[Tensor, "n"]:
+    return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(n, generator=generator)
