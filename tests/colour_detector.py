@@ -1,4 +1,4 @@
-"""A detector whose results are known: red blocks where they are, green ones a quarter of their width to the right."""
+"""A detector whose results are known: red blocks where they are, green ones a part of their width to the right."""
 
 import torch
 
@@ -8,7 +8,7 @@ from neural_sim.detector.protocol import Detector
 class ColourDetector(Detector):
     """``shift`` is that of green blocks' boxes in their widths."""
 
-    def __init__(self, num_classes, image_size, shift=0.25):
+    def __init__(self, num_classes, image_size, shift=0.27):
         self.image_size, self.shift = image_size, shift
 
     def init(self, generator):

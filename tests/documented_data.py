@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Callable
@@ -14,6 +15,9 @@ from captures import capture
 from documented import PAGES, ROOT
 from PIL import Image
 
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.settings import Backbone, Head
 from neural_sim.objects.procedural import Procedural
 from neural_sim.synthesis.background import ProceduralClutter
 
@@ -115,6 +119,24 @@ def captures(root: Path) -> Path:
     return root
 
 
+def photographs(root: Path) -> Path:
+    """The pictures of :func:`coco`, in a folder of their own."""
+    coco(root / "val.json")
+    return root
+
+
+def trained(root: Path) -> Path:
+    """A run's folder with the files of a detector of the embedded objects, which has learned nothing."""
+    make, names = (
+        functools.partial(RetinaNet, backbone=Backbone("micro"), head=Head(8, 1)),
+        tuple(Procedural().names()),
+    )
+    params = make(num_classes=len(names), image_size=(64, 64)).init(torch.Generator().manual_seed(3))
+    params["head.classification_head.cls_logits.bias"] += 4.0  # else no score reaches the threshold
+    SavedDetector(make, params, names, (64, 64)).save(root)
+    return root
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycb": ycb,
     "../shared/ycb": ycb,
@@ -123,6 +145,9 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/captures": captures,
     "/data/val.json": coco,
     "/data/backgrounds": backgrounds,
+    "/data/photos": backgrounds,
+    "/data/val": photographs,
+    "outputs/runs/pose_gap/2026-11-22_09-00-00": trained,
 }
 """What the documentation's paths stand for."""
 
