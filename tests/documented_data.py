@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Callable
@@ -15,6 +16,9 @@ from documented import PAGES, ROOT
 from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
 
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.settings import Backbone, Head
 from neural_sim.objects.procedural import Procedural
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.target.ycb_video import CLASSES
@@ -135,6 +139,24 @@ def captures(root: Path) -> Path:
     return root
 
 
+def coco_photographs(root: Path) -> Path:
+    """The pictures of :func:`coco`, in a folder of their own."""
+    coco(root / "val.json")
+    return root
+
+
+def trained(root: Path) -> Path:
+    """A run's folder with the files of a detector of the embedded objects, which has learned nothing."""
+    make, names = (
+        functools.partial(RetinaNet, backbone=Backbone("micro"), head=Head(8, 1)),
+        tuple(Procedural().names()),
+    )
+    params = make(num_classes=len(names), image_size=(64, 64)).init(torch.Generator().manual_seed(3))
+    params["head.classification_head.cls_logits.bias"] += 4.0  # else no score reaches the threshold
+    SavedDetector(make, params, names, (64, 64)).save(root)
+    return root
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycb": ycb,
     "../shared/ycb": ycb,
@@ -145,6 +167,9 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/backgrounds": backgrounds,
     "/data/YCB_Video": ycb_video,
     "/data/ycbv": bop_scenes,
+    "/data/photos": backgrounds,
+    "/data/val": coco_photographs,
+    "outputs/runs/pose_gap/2026-11-22_09-00-00": trained,
 }
 """What the documentation's paths stand for."""
 

@@ -13,8 +13,11 @@ import torch
 from documented import ROOT, Command, commands
 from documented_data import MadeData
 from hydra import compose, initialize_config_dir
+from mlflow import MlflowClient
 
+from neural_sim.detector.saved import SavedDetector
 from neural_sim.main import conf_directory
+from neural_sim.report.tracking import tracking_uri
 
 pytestmark = pytest.mark.slow
 
@@ -82,7 +85,9 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
-        kinds.get(next((key for key in kinds if key in config), ""), _run)(job, config)
+        predicts = config["stages"] == ["predict"]
+        check = _predict if predicts else kinds.get(next((key for key in kinds if key in config), ""), _run)
+        check(job, config)
 
 
 def _of(folder):
@@ -121,6 +126,27 @@ def _run(folder, config):
     assert all(
         (folder / "training_set" / image["file_name"]).is_file() and image["pose"] for image in made["images"]
     )
+
+    _model(folder, config, list(results["psi"]))
+
+
+def _model(folder, config, names):
+    """README, What a run leaves."""
+    assert SavedDetector.load(folder).class_names == tuple(names)
+    assert (folder / "model.onnx").exists() == config["model"]["onnx"]
+    if config["model"]["registered_name"]:
+        client = MlflowClient(tracking_uri(config["paths"]["mlflow"]))
+        assert client.search_model_versions(f"name='{config['model']['registered_name']}'")
+
+
+def _predict(folder, config):
+    """README, The detector, and what it sees."""
+    images = json.loads((folder / "coco_images.json").read_text())["images"]
+    rows = json.loads((folder / "coco_results.json").read_text())
+    assert images and rows and {row["image_id"] for row in rows} <= {image["id"] for image in images}
+    assert all((folder / "pictures" / image["file_name"]).is_file() for image in images)
+    scored = config["predict"]["annotations"] is not None
+    assert (folder / "scores.json").exists() == scored
 
 
 def _comparison(folder, config):

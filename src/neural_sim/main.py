@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 # Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
 _PARTS = (
     "objects", "views", "field", "renderer", "synthesis", "target", "camera", "detector", "solver", "baseline",
-    "gradient", "outer", "training", "unlearned",
+    "gradient", "outer", "training", "unlearned", "model",
 )  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
     images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
     imaging = Imaging(**images, camera=_camera(parts), distribution=_product(parameters, parts))
     loop = Loop(parts["baseline"], parts["outer"], parts["gradient"], parts["solver"])
-    return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain)
+    return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain, parts["model"])
 
 
 def context_of(config: DictConfig, folder: Path) -> tuple[Context, dict[str, Step]]:

@@ -17,7 +17,7 @@ def reference(detector, sizes) -> RetinaNet:
         detector.num_classes,
         anchor_generator=AnchorGenerator(sizes, ((1.0,),) * len(sizes)),
         head=detector._predictor.head,
-        detections_per_img=detector._detections.limit,
+        detections_per_img=detector.detections.limit,
     )
 
 

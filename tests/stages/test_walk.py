@@ -1,6 +1,8 @@
 """What a run gives back to a sweep: a score that the test set has no part in. What MLflow shows while it goes on."""
 
 import json
+import logging
+import re
 import shutil
 import signal
 
@@ -10,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.training import train_detector
 from neural_sim.main import conf_directory, context_of
 from neural_sim.report import logged
@@ -104,6 +107,47 @@ def test_val_and_test_share_no_image(folder, returned):
         coco = _targets(context_of(config, folder)[0])
         assert len(coco.val) + len(coco.test) == len(twice)
         assert not _pixels(coco.val) & _pixels(coco.test)
+
+
+def test_the_report_leaves_the_detector_that_was_scored_as_learned(
+    folder, returned, tmp_path, capsys, caplog
+):
+    """Saved, loaded and run again it gives the detections that were scored; ONNX and MLflow where asked for."""
+    pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+    asked = [
+        "model.onnx=true",
+        "model.pyfunc=true",
+        "model.registered_name=shelf",
+        "stages=[psi,evaluate,report]",
+    ]
+    with caplog.at_level(logging.INFO):
+        context, steps = _context(folder, *asked)
+        walk(context, steps)
+    run, graph = folder / "run", context.graph
+    saved = SavedDetector.load(run)
+    assert saved.class_names == graph.names and saved.camera == graph.camera
+    test = _targets(context).test
+    scored = context.results(graph.scores(context.results(graph.learned).last, "learned")).detections
+    for ours, theirs in zip(saved.detector.predict(saved.params, test.images), scored, strict=True):
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+    difference = float(re.search(r"onnxruntime within (\S+) of torch on (\d+) test images", caplog.text)[1])
+    assert 0.0 < difference <= 1e-4
+    uri = tracking_uri(str(folder / "mlflow.db"))
+    (version,) = MlflowClient(uri).search_model_versions("name='shelf'")
+    assert f"model: models:/{version.source.split('/')[-1]}\n" in capsys.readouterr().out
+    assert {"model.safetensors", "model.json", "model.onnx"} <= logged.runs(uri, "pose_gap")[0].files
+
+    made = run / "training_set"
+    words = [
+        f"predict.model={run}",
+        f"predict.images={made}",
+        f"predict.annotations={made / 'annotations.json'}",
+    ]
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        walk(*context_of(compose("config", ["stages=[predict]", "progress=false", *words]), tmp_path))
+    assert (
+        json.loads((tmp_path / "scores.json").read_text())["ap"] > 0.02
+    )  # of the images that it was trained on
 
 
 LOOP = ["baseline=random_search", "outer.iterations=1", "outer.images_per_object=4"]  # two rounds

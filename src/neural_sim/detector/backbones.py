@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from torchvision.models import get_model, get_model_weights, resnet
 from torchvision.ops import FrozenBatchNorm2d
 
+from neural_sim.detector.settings import SAVED
+
 logger = logging.getLogger(__name__)
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"silu": nn.SiLU, "relu": nn.ReLU}
@@ -109,7 +111,7 @@ class ResNetBackbone(nn.Module):
         builder = {"resnet18": resnet.resnet18, "resnet50": resnet.resnet50}[architecture]
         body = builder(norm_layer=group_norm if weights is None else FrozenBatchNorm2d)
         del body.fc
-        if weights is not None:
+        if weights not in (None, SAVED):
             body.load_state_dict(load_weights(architecture, weights), strict=False)
         # Weights were trained with ReLU and keep it.
         set_activation(body, activation if weights is None else "relu")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -16,17 +17,28 @@ from torch.func import functional_call
 from torchvision.models.detection._utils import BoxCoder
 from torchvision.ops import batched_nms, clip_boxes_to_image
 
-from neural_sim.detector.backbones import ACTIVATIONS, build_backbone
+from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, build_backbone
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.losses import box_loss, focal_loss
 from neural_sim.detector.network import NormalisedBackbone, build_predictor, fixed_anchors
 from neural_sim.detector.protocol import Best, Outputs, Parameters
-from neural_sim.detector.settings import ARCHITECTURES, Anchors, Backbone, Detections, Head, Losses, check
+from neural_sim.detector.settings import (
+    ARCHITECTURES,
+    SAVED,
+    Anchors,
+    Backbone,
+    Detections,
+    Head,
+    Losses,
+    check,
+)
 from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
 
 
 class RetinaNet:
     """A RetinaNet for images of one size; holds its shape, its anchors and its loss, never its parameters.
+
+    ``normalisation`` is what the backbone does first to the channels (red, green, blue) of images in [0, 1].
 
     Args:
         num_classes: classes, from 0, without a background class.
@@ -37,6 +49,8 @@ class RetinaNet:
     Raises:
         ValueError: any of these out of its range, or strides that the backbone does not have, with the key and value.
     """
+
+    normalisation: ClassVar[dict[str, tuple[float, ...]]] = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
 
     def __init__(
         self,
@@ -73,7 +87,7 @@ class RetinaNet:
         height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
         self.image_size = (height, width)
         self.proximal = proximal
-        self._settings, self._head, self._losses, self._detections = backbone, head, losses, detections
+        self._settings, self._head, self._losses, self.detections = backbone, head, losses, detections
         self._overlaps = anchors.foreground_iou, anchors.background_iou
         network = build_backbone(backbone.architecture, own, activation, backbone.weights)
         widths = [network.channels[stride] for stride in own]
@@ -86,12 +100,26 @@ class RetinaNet:
         """Fresh parameters in float32 on the CPU; pretrained backbones keep their weights.
 
         The dictionary also holds a frozen batch normalisation's statistics, so that it is complete.
+
+        Raises:
+            ValueError: a detector of a model file, whose parameters are there.
         """
+        if self._settings.weights == SAVED:
+            raise ValueError(
+                f"detector.backbone.weights: {SAVED!r} is for detectors that are read from a model file; want null, "
+                "a file or a name of torchvision's"
+            )
         backbone = self._backbone.state_dict()
         if self._settings.weights is None:
             backbone = initialise(self._backbone, generator)
         predictor = initialise(self._predictor, generator, self._head.prior)
         return {name: value.detach().clone() for name, value in {**backbone, **predictor}.items()}
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of all parameters, by name."""
+        state = {**self._backbone.state_dict(), **self._predictor.state_dict()}
+        return {name: tuple(value.shape) for name, value in state.items()}
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
         """Parameters of the backbone, frozen in the psi loop, and of the pyramid and head, trained in it."""
@@ -163,13 +191,19 @@ class RetinaNet:
             self._decoded(deltas.detach()[image, anchor], anchor),
             top.flatten(),
             group,
-            self._detections.nms_iou,
+            self.detections.nms_iou,
         )
         kept = kept[group[kept].argsort(stable=True)]
         place = torch.arange(len(kept), device=kept.device) - torch.searchsorted(group[kept], group[kept])
         image, anchor, label = (part[kept[place < per_class]] for part in (image, anchor, label))
         boxes = self._decoded(deltas[image, anchor], anchor)
         return Best(image, label, logits[image, anchor, label], boxes)
+
+    def decode(self, deltas: Float[Tensor, "n anchors 4"]) -> Float[Tensor, "n anchors 4"]:
+        """The boxes of all anchors (x0, y0, x1, y1) in pixels, within the image."""
+        anchors = self.anchors.to(deltas).expand(deltas.shape[0], -1, -1).reshape(-1, 4)
+        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas.reshape(-1, 4), anchors)
+        return clip_boxes_to_image(boxes, self.image_size).reshape(deltas.shape)
 
     def _decoded(self, deltas: Float[Tensor, "m 4"], anchor: Int[Tensor, "m"]) -> Float[Tensor, "m 4"]:
         """Boxes in pixels, within the image."""
@@ -195,7 +229,7 @@ class RetinaNet:
         """The candidates of all images are chosen together and taken to the CPU, where each image has its own few."""
         levels = []
         for level, first in zip(scores.split(self.anchors_per_level, 1), self._first_anchors, strict=True):
-            best, index = level.flatten(1).topk(min(self._detections.candidates, level[0].numel()))
+            best, index = level.flatten(1).topk(min(self.detections.candidates, level[0].numel()))
             levels.append((best, index + first * self.num_classes))
         best, index = (torch.cat(part, 1) for part in zip(*levels, strict=True))
         anchor, labels = index // self.num_classes, index % self.num_classes
@@ -205,10 +239,10 @@ class RetinaNet:
 
     def _suppressed(self, best: Tensor, anchor: Tensor, labels: Tensor, moves: Tensor) -> dict[str, Tensor]:
         """One image's detections of its candidates."""
-        keep = best > self._detections.score_threshold
+        keep = best > self.detections.score_threshold
         best, anchor, labels, moves = (part[keep] for part in (best, anchor, labels, moves))
         boxes = self._decoded(moves, anchor)
-        keep = batched_nms(boxes, best, labels, self._detections.nms_iou)[: self._detections.limit]
+        keep = batched_nms(boxes, best, labels, self.detections.nms_iou)[: self.detections.limit]
         return {"boxes": boxes[keep], "scores": best[keep], "labels": labels[keep]}
 
     @property

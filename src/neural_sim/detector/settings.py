@@ -16,6 +16,8 @@ ARCHITECTURES = {
     "resnet50": (4, 8, 16, 32),
 }
 """Strides of the backbones' maps."""
+SAVED = "saved"
+"""``Backbone.weights`` of a detector that is read from a model file, which has their values."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Backbone:
     Args:
         architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
         weights: initial weights of a ResNet: None (random), a file with a torchvision state dictionary, or
-        torchvision's name of the weights.
+            torchvision's name of the weights. Model files have ``saved``: the shape of a backbone that had weights.
         freeze: train the predictor only, in every training. In the psi loop the backbone is always frozen.
     """
 

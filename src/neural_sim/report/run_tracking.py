@@ -8,7 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
+
 from neural_sim.report import tracking
+from neural_sim.report.pyfunc import log_detector
 from neural_sim.report.run import RunResults
 
 _COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "products", "cpu_seconds")
@@ -51,6 +55,12 @@ class LiveRun:
     def stage(self, name: str, seconds: float) -> None:
         """Write what a stage that has just ended took."""
         self._run.log({f"seconds/{name}": seconds})
+
+    def detector(
+        self, folder: Path, example: UInt8[np.ndarray, "n h w 3"], registered_name: str | None = None
+    ) -> str:
+        """Write the run's detector as a model, see :func:`pyfunc.log_detector`."""
+        return log_detector(self._run, folder, example, registered_name)
 
     def finish(self, results: RunResults, folder: Path) -> None:
         """Write what is left: iterations and fields from the store, final numbers, and ``folder`` as artifacts."""

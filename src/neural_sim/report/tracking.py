@@ -83,6 +83,21 @@ class Run:
         """Copy a folder to the run's artifacts."""
         self._client.log_artifacts(self.run_id, str(folder))
 
+    @contextmanager
+    def fluent(self) -> Iterator[Any]:
+        """The module ``mlflow`` with this run's store and experiment as its own, for what a client cannot write, which
+        are models. It keeps the experiment, which nothing else here reads."""
+        with quiet(), _guard(self.uri):
+            import mlflow
+
+            before = mlflow.get_tracking_uri()
+            mlflow.set_tracking_uri(self.uri)
+            try:
+                mlflow.set_experiment(experiment_id=self.experiment_id)
+                yield mlflow
+            finally:
+                mlflow.set_tracking_uri(before)
+
     def close(self, status: str, error: BaseException | None = None) -> None:
         """Send what waits and end the run. ``error``, its cause, becomes a tag; then what the store refuses is a
         warning."""

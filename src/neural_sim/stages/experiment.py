@@ -16,6 +16,7 @@ from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.views import Views
+from neural_sim.report.model_files import ModelFiles
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.meshes import ObjectSource
 from neural_sim.stages.psi import Method
@@ -63,7 +64,8 @@ class Loop:
 
 @dataclass(frozen=True)
 class Experiment:
-    """All parts of a run; ``config`` is the configuration that they were built from, for reports alone."""
+    """All parts of a run; ``config`` is the configuration that they were built from, for reports alone, ``model`` what
+    the report writes of the final detector."""
 
     run: Run
     imaging: Imaging
@@ -71,3 +73,4 @@ class Experiment:
     training: Training
     loop: Loop
     config: dict[str, Any]
+    model: ModelFiles

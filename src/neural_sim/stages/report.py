@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from typing import Any
 
-from neural_sim.devices import peak_memory_mb
+import torch
+
+from neural_sim.detector.saved import SavedDetector
+from neural_sim.devices import peak_memory_mb, placed
 from neural_sim.report.identity import identity
 from neural_sim.report.run import (
     RunResults,
@@ -17,6 +21,9 @@ from neural_sim.report.run import (
 )
 from neural_sim.stages.context import Context
 from neural_sim.stages.evaluate import Scores
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
 
 
 def write_report(context: Context) -> None:
@@ -38,10 +45,30 @@ def write_report(context: Context) -> None:
     write_training_set(drawn, list(graph.names), folder / "training_set")
     if scores:
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
+        _write_model(context, test)
     write_results(report, folder)
     context.live.finish(report, folder)
     print(report.summary())
     print(f"results: {folder}\n{context.live.where}")
+
+
+def _write_model(context: Context, test: LabelledImages) -> None:
+    """The detector trained on the learned distribution, which was scored as ``learned``: in the run's folder, and in
+    MLflow where that is asked for. One whose settings have no JSON is left out with a warning."""
+    graph, results, wanted = context.graph, context.results, context.experiment.model
+    stage = graph.trained_on(results(graph.learned).last, "learned")
+    camera = graph.camera
+    params = placed(results(stage).params, torch.device("cpu"))
+    saved = SavedDetector(stage.detector, params, graph.names, (camera.height, camera.width), camera)
+    try:
+        wanted.write(saved, test.images, context.folder)
+    except ValueError as error:
+        _log.warning("report: the detector's files are left out: %s", error)
+        return
+    if wanted.pyfunc and context.live is not None:
+        example = test.images[:1].mul(255).round().byte().movedim(1, -1).cpu().numpy()
+        uri = context.live.detector(context.folder, example, wanted.registered_name)
+        print(f"model: {uri}")
 
 
 def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:

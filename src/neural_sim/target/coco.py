@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, large_enough
 from neural_sim.target.bin_attribute import bins_of
 from neural_sim.target.camera import camera_of_entry
+from neural_sim.target.coco_file import labels_of_categories, read_coco
 from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.near_duplicates import near_duplicates, thumbnail
@@ -31,12 +31,6 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
 _Row = tuple[int, dict[str, Any]]  # an annotation with its place in the file
-
-REQUIRED: dict[str, tuple[str, ...]] = {
-    "images": ("id", "file_name"),
-    "categories": ("id", "name"),
-    "annotations": ("image_id", "category_id", "bbox"),
-}
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,7 @@ class CocoTarget:
 
     @cached_property
     def _document(self) -> dict[str, Any]:
-        return _read(self._file)
+        return read_coco(self._file)
 
     @cached_property
     def _entries(self) -> list[dict[str, Any]]:
@@ -195,7 +189,9 @@ class CocoTarget:
         return assemble([item.photo for item in self._photos(class_names, height, width)])
 
     def _photos(self, class_names: Sequence[str], height: int, width: int) -> list[_Read]:
-        labels = self._labels(self._document["categories"], class_names)
+        labels = labels_of_categories(
+            self._document["categories"], self.categories, class_names, self._file, "target.categories"
+        )
         by_image: dict[Any, list[_Row]] = {entry["id"]: [] for entry in self._entries}
         for row, item in enumerate(self._document["annotations"]):
             if not item.get("iscrowd", 0) and item["image_id"] in by_image:
@@ -217,23 +213,6 @@ class CocoTarget:
                 "capture, keep them together by target.split_by",
                 self._file, len(duplicates.test), duplicates.compared, *names,
             )  # fmt: skip
-
-    def _labels(self, categories: list[dict[str, Any]], class_names: Sequence[str]) -> dict[Any, int | None]:
-        """Category id -> class index, None for a category left out."""
-        mapping = dict(self.categories or {})
-        named = {entry["id"]: mapping.get(entry["name"], entry["name"]) for entry in categories}
-        strange = sorted({name for name in named.values() if name is not None and name not in class_names})
-        absent = sorted(set(mapping) - {entry["name"] for entry in categories})
-        if strange or absent:
-            raise ValueError(
-                f"{self._file}: categories {strange or absent} are "
-                f"{'no objects' if strange else 'not in the file'}; objects are {list(class_names)}, the file's "
-                f"categories {[entry['name'] for entry in categories]}. Map them by target.categories, "
-                "{name: object} or {name: null} to leave one out"
-            )
-        for name in set(class_names) - set(named.values()):
-            _log.warning("%s: no category for object %s, which gets no score", self._file, name)
-        return {key: None if name is None else list(class_names).index(name) for key, name in named.items()}
 
     def _photo(
         self,
@@ -266,21 +245,3 @@ class CocoTarget:
         inside = image[:, placing.top :, placing.left :][:, : placing.inner_height, : placing.inner_width]
         photo = Photo(image, boxes[large], classes[large], bins)
         return _Read(photo, int((~large).sum()), thumbnail(inside))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
-    for section, keys in REQUIRED.items():
-        entries = data.get(section) if isinstance(data, dict) else None
-        if not isinstance(entries, list):
-            raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
-        for number, entry in enumerate(entries):
-            missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
-            if missing:
-                raise ValueError(f"{path}: {section}[{number}] lacks {missing}")
-            if section == "annotations" and len(entry["bbox"]) != 4:
-                raise ValueError(f"{path}: annotations[{number}].bbox must be x, y, width, height")
-    return data

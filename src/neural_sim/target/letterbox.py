@@ -26,10 +26,19 @@ class Letterbox:
 
     def boxes(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
         """(x0, y0, x1, y1) of the photograph, clipped to it, in the new image."""
-        size = boxes.new_tensor([self.width, self.height, self.width, self.height])
-        inner = boxes.new_tensor([self.inner_width, self.inner_height] * 2)
-        offset = boxes.new_tensor([self.left, self.top] * 2)
+        size, inner, offset = self._sides(boxes)
         return torch.minimum(boxes.clamp_min(0.0), size) * (inner / size) + offset
+
+    def of_photo(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
+        """(x0, y0, x1, y1) of the new image in the photograph, clipped to it: the inverse of :meth:`boxes`."""
+        size, inner, offset = self._sides(boxes)
+        return torch.minimum(((boxes - offset) * (size / inner)).clamp_min(0.0), size)
+
+    def _sides(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Width and height, twice, of the photograph and of its part of the new image, and where that begins."""
+        size = like.new_tensor([self.width, self.height, self.width, self.height])
+        inner = like.new_tensor([self.inner_width, self.inner_height] * 2)
+        return size, inner, like.new_tensor([self.left, self.top] * 2)
 
 
 def letterbox(

@@ -1,0 +1,127 @@
+"""A detector as ONNX: images to the decoded boxes and scores of all anchors, or to detections."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neural_sim.detector.onnx_nms import INPUTS, with_nms
+from neural_sim.detector.saved import SavedDetector
+
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+OPSET = 18
+TOLERANCE = 1e-4
+"""Of scores, and of boxes as fractions of the image's longer side."""
+
+
+def check_packages(key: str) -> None:
+    """Raises ``ValueError`` where a package is missing that the extra ``onnx`` installs; ``key`` asked for it."""
+    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ValueError(f"{key}: {', '.join(missing)} not installed; pip install 'neural-sim[onnx]'")
+
+
+class Decoded(nn.Module):
+    """Images [n, 3, h, w] in [0, 1] to the boxes [n, anchors, 4] of all anchors as (x0, y0, x1, y1) in pixels, and
+    their scores [n, anchors, classes] in [0, 1]."""
+
+    def __init__(self, saved: SavedDetector) -> None:
+        super().__init__()
+        self.detector: Any = saved.detector
+        self.names = list(saved.params)
+        for index, name in enumerate(self.names):
+            self.register_buffer(f"p{index}", saved.params[name].detach().cpu())
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
+        params = {name: getattr(self, f"p{index}") for index, name in enumerate(self.names)}
+        backbone, trainable = self.detector.split(params)
+        logits, deltas = self.detector.outputs(trainable, self.detector.features(backbone, images))
+        return self.detector.decode(deltas), logits.sigmoid()
+
+
+def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
+    """Write ``path``: input ``images`` [n, 3, h, w] in [0, 1], any n.
+
+    Without ``nms`` the outputs are ``boxes`` [n, anchors, 4] and ``scores`` [n, anchors, classes], see
+    :class:`Decoded`. With it they are the detections of all images, as :meth:`Detector.predict` chooses them: ``image``
+    [d], ``boxes`` [d, 4], ``scores`` [d], ``labels`` [d], image by image, the best first. The file's metadata has the
+    ``class_names`` as JSON.
+
+    Raises:
+        ValueError: a package that is missing, or a detector that cannot decode the boxes of all anchors.
+    """
+    check_packages("model.onnx")
+    if not callable(getattr(saved.detector, "decode", None)):
+        raise ValueError(
+            f"model.onnx: want a detector with a method decode(deltas) -> boxes in pixels, {saved.make} has none"
+        )
+    import onnx
+
+    height, width = saved.image_size
+    network, example = Decoded(saved).eval(), torch.zeros(2, 3, height, width)
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
+            network, (example,), dynamo=True, opset_version=OPSET, verbose=False,
+            input_names=["images"], output_names=[*INPUTS] if nms else ["boxes", "scores"],
+            dynamic_shapes={"images": {0: torch.export.Dim("n", min=1)}},
+        )  # fmt: skip
+    if program is None:
+        raise RuntimeError("torch.onnx.export gave no program")
+    model = program.model_proto
+    if nms:
+        model = with_nms(model, saved)
+    model.metadata_props.clear()
+    onnx.helper.set_model_props(model, {"class_names": json.dumps(saved.class_names)})
+    onnx.checker.check_model(model, full_check=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.part")
+    onnx.save(model, draft)
+    os.replace(draft, path)
+    return path
+
+
+@torch.no_grad()
+def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "n 3 h w"]) -> float:
+    """Between torch and onnxruntime on a file without non-maximum suppression: of scores, and of boxes as fractions of
+    the image's longer side."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    network, largest = Decoded(saved), 0.0
+    for chunk in images.split(16):
+        given = chunk.float().cpu()
+        boxes, scores = (torch.from_numpy(out) for out in session.run(None, {"images": given.numpy()}))
+        wanted_boxes, wanted_scores = network(given)
+        for difference, unit in (
+            (boxes - wanted_boxes, max(saved.image_size)),
+            (scores - wanted_scores, 1.0),
+        ):
+            largest = max(largest, float(difference.abs().max()) / unit)
+    return largest
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's notices, which nobody can act on."""
+    noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in noisy]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for logger in noisy:
+            logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            for logger, level in zip(noisy, levels, strict=True):
+                logger.setLevel(level)

@@ -1,0 +1,120 @@
+"""Stage ``predict``: a saved detector on photographs, without objects, fields or a target set."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.photographs import detect
+from neural_sim.detector.saved import DOCUMENT, SavedDetector
+from neural_sim.devices import device_of
+from neural_sim.report.predictions import draw, result_rows, save_picture, scores_document, scores_table
+from neural_sim.stages.context import Context
+from neural_sim.target.photo_files import PhotoFiles
+from neural_sim.target.truth import Truth, without_pixels
+
+
+@dataclass(frozen=True)
+class PredictStep:
+    """Detections on photographs of any size.
+
+    Args:
+        model: a run's folder, or its ``model.safetensors``; None: the folder of this run, whose report writes it.
+        images: a folder, a glob or a picture.
+        annotations: a COCO file to score the detections on; None: none.
+        categories: its category names -> class names, null to leave a category out. Names not listed stand for
+            themselves.
+        draw_above: the smallest score of a box that is drawn. Results have all that the detector's own settings keep.
+        batch_size: pictures that are read at once.
+
+    Raises:
+        ValueError: no pictures, or a number out of its range.
+    """
+
+    model: str | None = None
+    images: str | None = None
+    annotations: str | None = None
+    categories: Mapping[str, str | None] | None = None
+    draw_above: float = 0.3
+    batch_size: int = 16
+
+    def __post_init__(self) -> None:
+        if not self.images:
+            raise ValueError("predict.images: want a folder of pictures, a glob or a picture, got null")
+        if not 0.0 <= self.draw_above <= 1.0:
+            raise ValueError(f"predict.draw_above must lie in [0, 1], got {self.draw_above}")
+        if self.batch_size < 1:
+            raise ValueError(f"predict.batch_size must be at least 1, got {self.batch_size}")
+        _ = PhotoFiles(self.images, "predict.images")
+
+    def run(self, context: Context) -> None:
+        """``pictures/``, ``coco_results.json``, ``coco_images.json`` and, with annotations, ``scores.json`` to the
+        run's folder; the table of scores to the screen.
+
+        Raises:
+            ValueError: a model, a picture or annotations that cannot be used, with the key and the file.
+        """
+        folder, photos = context.folder, PhotoFiles(str(self.images), "predict.images")
+        saved = self._saved(folder).to(device_of(context.config["trainer"]["accelerator"]))
+        truth = self._truth(saved, photos)
+        category_ids = truth.category_ids if truth else {i: i + 1 for i in range(len(saved.class_names))}
+        entries: list[dict[str, Any]] = []
+        rows: list[dict[str, Any]] = []
+        scored: list[tuple[dict[str, Tensor], tuple[Tensor, Tensor]]] = []
+        starts = range(0, len(photos.paths), self.batch_size)
+        for start in context.shown(starts, "predict"):
+            paths = photos.paths[start : start + self.batch_size]
+            pictures = [photos.read(path) for path in paths]
+            for path, picture, found in zip(paths, pictures, detect(saved, pictures), strict=True):
+                known = truth.boxes(path, picture) if truth and path in truth.entries else None
+                drawn = draw(picture, found, saved.class_names, self.draw_above, known[0] if known else None)
+                save_picture(drawn, folder / "pictures", photos.name(path))
+                if truth is None or known is not None:
+                    entry = _entry(path, photos, truth, len(entries) + 1) | {
+                        "width": picture.width, "height": picture.height,
+                    }  # fmt: skip
+                    entries.append(entry)
+                    rows += result_rows(found, entry["id"], category_ids)
+                if known is not None:
+                    scored.append((found, known))
+        categories = [{"id": id, "name": saved.class_names[label]} for label, id in category_ids.items()]
+        _write(folder / "coco_images.json", {"images": entries, "categories": categories})
+        _write(folder / "coco_results.json", rows)
+        if scored:
+            ap = evaluate(
+                [found for found, _ in scored], without_pixels([t for _, t in scored]), saved.class_names
+            )
+            _write(folder / "scores.json", scores_document(ap, len(scored)))
+            print(scores_table(ap, len(scored)))
+        print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
+
+    def _saved(self, folder: Path) -> SavedDetector:
+        if self.model is None and not (folder / DOCUMENT).is_file():
+            raise ValueError("predict.model: want a run's folder or its model.safetensors, got null")
+        try:
+            return SavedDetector.load(folder if self.model is None else Path(self.model).expanduser())
+        except ValueError as error:
+            raise ValueError(f"predict.model: {error}") from error
+
+    def _truth(self, saved: SavedDetector, photos: PhotoFiles) -> Truth | None:
+        if self.annotations is None:
+            return None
+        return Truth(Path(self.annotations).expanduser(), self.categories, saved.class_names, photos)
+
+
+def _entry(path: Path, photos: PhotoFiles, truth: Truth | None, number: int) -> dict[str, Any]:
+    """COCO's entry of an image: the annotations', or a new one."""
+    if truth is None:
+        return {"id": number, "file_name": photos.name(path)}
+    return {key: truth.entries[path][key] for key in ("id", "file_name")}
+
+
+def _write(path: Path, document: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, allow_nan=False), encoding="utf-8")

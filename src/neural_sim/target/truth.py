@@ -1,0 +1,154 @@
+"""Annotations of photographs that a detector is tried on, in the photographs' own pixels."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from PIL import Image
+from torch import Tensor
+
+from neural_sim.target.coco_file import labels_of_categories, read_coco
+from neural_sim.target.photo_files import PhotoFiles
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The COCO file ``path`` as classes of a detector and as entries of ``photos``.
+
+    ``categories`` maps the file's category names to class names, see :func:`coco_file.labels_of_categories`; ``node``
+    is the configuration's node that names both, for messages. A photograph's entry is the one whose ``file_name`` is
+    its path below the photographs' folder or below the file's, else the only one of its name.
+
+    Raises:
+        ValueError: no such file, one that is not in COCO form, a category without a class, or no entry for any of the
+            photographs.
+    """
+
+    path: Path
+    categories: Mapping[str, str | None] | None
+    class_names: Sequence[str]
+    photos: PhotoFiles
+    node: str = "predict"
+
+    def __post_init__(self) -> None:
+        if not self.path.is_file():
+            raise ValueError(f"{self.node}.annotations: no such file: {self.path}")
+        _ = self.labels
+        found, total = len(self.entries), len(self.photos.paths)
+        if not found:
+            raise ValueError(
+                f"{self.node}.annotations: {self.path} has no entry for any of the {total} pictures of "
+                f"{self.node}.images, such as {self.photos.name(self.photos.paths[0])}"
+            )
+        if found < total:
+            _log.warning(
+                "%s: no entry for %d of %d pictures; they are not scored", self.path, total - found, total
+            )
+        if found < len(self._document["images"]):
+            missing = len(self._document["images"]) - found
+            _log.warning(
+                "%s: %d of its images are not among the pictures; they are not scored", self.path, missing
+            )
+
+    @cached_property
+    def _document(self) -> dict[str, Any]:
+        try:
+            return read_coco(self.path)
+        except ValueError as error:
+            raise ValueError(f"{self.node}.annotations: {error}") from error
+
+    @cached_property
+    def labels(self) -> dict[Any, int | None]:
+        """Class index by category id, None for a category left out."""
+        categories = self._document["categories"]
+        key = f"{self.node}.categories"
+        try:
+            return labels_of_categories(categories, self.categories, self.class_names, self.path, key)
+        except ValueError as error:
+            raise ValueError(f"{self.node}.annotations: {error}") from error
+
+    @cached_property
+    def category_ids(self) -> dict[int, Any]:
+        """Category id by class index: the first that stands for a class. A class without one is missing."""
+        found: dict[int, Any] = {}
+        for id, label in self.labels.items():
+            if label is not None:
+                found.setdefault(label, id)
+        return found
+
+    @cached_property
+    def entries(self) -> dict[Path, dict[str, Any]]:
+        """The file's image entries by photograph."""
+        by_name = {str(entry["file_name"]): entry for entry in self._document["images"]}
+        by_last: dict[str, list[dict[str, Any]]] = {}
+        for name, entry in by_name.items():
+            by_last.setdefault(Path(name).name, []).append(entry)
+        last_names = [path.name for path in self.photos.paths]
+        found = {}
+        for path in self.photos.paths:
+            entry = by_name.get(self.photos.name(path)) or by_name.get(_below(path, self.path.parent))
+            same = by_last.get(path.name, [])
+            if entry is None and len(same) == 1 and last_names.count(path.name) == 1:
+                entry = same[0]
+            if entry is not None:
+                found[path] = entry
+        return found
+
+    @cached_property
+    def _annotations(self) -> dict[Any, list[dict[str, Any]]]:
+        by_image: dict[Any, list[dict[str, Any]]] = {}
+        crowds = 0
+        for item in self._document["annotations"]:
+            if item["category_id"] not in self.labels:
+                raise ValueError(
+                    f"{self.node}.annotations: {self.path}: category id {item['category_id']} is not declared"
+                )
+            crowds += bool(item.get("iscrowd", 0))
+            if not item.get("iscrowd", 0) and self.labels[item["category_id"]] is not None:
+                by_image.setdefault(item["image_id"], []).append(item)
+        if crowds:
+            _log.warning("%s: %d crowds are left out", self.path, crowds)
+        return by_image
+
+    def boxes(self, path: Path, photo: Image.Image) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:
+        """(x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry; crowds are left out.
+
+        Raises:
+            ValueError: a photograph of another size than its entry says.
+        """
+        entry = self.entries[path]
+        listed = entry.get("width", photo.width), entry.get("height", photo.height)
+        if listed != photo.size:
+            raise ValueError(
+                f"{self.node}.annotations: {self.path}: {entry['file_name']} is listed with {listed[0]} x {listed[1]} "
+                f"pixels, {path} has {photo.width} x {photo.height}"
+            )
+        items = self._annotations.get(entry["id"], [])
+        boxes = torch.tensor([item["bbox"] for item in items], dtype=torch.float32).reshape(-1, 4)
+        boxes[:, 2:] += boxes[:, :2]
+        return boxes, torch.tensor([self.labels[item["category_id"]] for item in items], dtype=torch.long)
+
+
+def without_pixels(truths: Sequence[tuple[Tensor, Tensor]]) -> LabelledImages:
+    """Boxes and labels of several photographs as a set to score detections on, which needs no pixels."""
+    most = max(1, *(len(labels) for _, labels in truths)) if truths else 1
+    boxes, labels = torch.zeros(len(truths), most, 4), torch.full((len(truths), most), -1)
+    for row, (box, label) in enumerate(truths):
+        boxes[row, : len(label)], labels[row, : len(label)] = box, label
+    return LabelledImages(torch.zeros(len(truths), 3, 1, 1), boxes, labels, torch.full((len(truths),), -1))
+
+
+def _below(path: Path, folder: Path) -> str:
+    """A path below a folder with ``/``; empty where it lies elsewhere."""
+    path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else ""
