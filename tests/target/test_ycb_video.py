@@ -1,4 +1,4 @@
-"""YCB-Video's layout: made frames read back, which frames are taken, what is refused, and the real sample."""
+"""YCB-Video's layout: made frames read back, which frames are taken, and the real sample."""
 
 import logging
 from pathlib import Path
@@ -12,10 +12,6 @@ from posed_scenes import (
     FACTOR,
     MATRIX,
     SIZE,
-    meshes_in_metres,
-    photographs,
-    write_mat,
-    write_ycb_video,
 )
 
 from neural_sim.cameras import focal_lengths, principal_point
@@ -26,43 +22,12 @@ from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.camera import TargetCamera
 from neural_sim.target.frames import FrameName
-from neural_sim.target.matlab import read_arrays
 from neural_sim.target.viewpoint import bins_of_poses
-from neural_sim.target.ycb_video import CLASSES, YcbVideoTarget
+from neural_sim.target.ycb_video import YcbVideoTarget
 from neural_sim.types import LabelledImages
 
-OBJECTS = {"035_power_drill": "drill", "025_mug": "mug", "019_pitcher_base": "pitcher"}
-NAMES = list(OBJECTS)
+NAMES = ["035_power_drill", "025_mug", "019_pitcher_base"]
 POSES = SceneDistribution.of([Pose()])
-
-
-@pytest.fixture(scope="module")
-def meshes():
-    return meshes_in_metres(OBJECTS)
-
-
-@pytest.fixture(scope="module")
-def made(meshes):
-    """Three scenes of three frames; the last scene shows one object alone, whose poses MATLAB stores as 3 x 4."""
-    return [
-        *photographs(meshes, 2, 3),
-        *(_of_scene(item, 2) for item in photographs(meshes, 1, 3, 1, seed=4)),
-    ]
-
-
-def _of_scene(item, scene):
-    return type(item)(**{**vars(item), "scene": scene})
-
-
-@pytest.fixture(scope="module")
-def shared_root(made, meshes, tmp_path_factory):
-    """Frames that no test changes."""
-    return write_ycb_video(tmp_path_factory.mktemp("ycb_video"), made, meshes, CLASSES, hdf5=(1, 2))
-
-
-@pytest.fixture
-def root(made, meshes, tmp_path):
-    return write_ycb_video(tmp_path, made, meshes, CLASSES)
 
 
 def of(root, **settings):
@@ -258,109 +223,6 @@ def test_the_digest_follows_contents_and_lists(root):
     (root / "image_sets" / "keyframe.txt").write_text("0002/000001\n")
     digests.append(of(root).digest())
     assert digests[0] == digests[1] and len(set(digests)) == 7
-
-
-def _meta(root, item, **changes):
-    path = root / "data" / f"{item.scene:04d}" / f"{item.number:06d}-meta.mat"
-    names = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
-    arrays = {**read_arrays(path, names), **changes}
-    write_mat(path, {name: array for name, array in arrays.items() if array is not None})
-
-
-def _reflected(poses):
-    return poses * np.array([1.0, 1.0, -1.0, 1.0])[:, None]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda poses: {"poses": poses[..., :2]}, r"poses: want 3 x 4 x 3, one for each of cls_indexes, got 3 x 4 x 2"),
-        (lambda poses: {"poses": _reflected(poses)}, r"poses: 035_power_drill: .* is a reflection"),
-        (lambda poses: {"poses": 1.1 * poses}, r"poses: 035_power_drill: .* is no rotation, R R\^T is off .* by 0\.21"),
-        (lambda poses: {"poses": poses * np.nan}, r"poses: 035_power_drill: rotation: want 9 finite numbers"),
-        (lambda poses: {"poses": None}, r"lacks \['poses'\]"),
-        (lambda poses: {"cls_indexes": np.array([[15.0], [14.0], [99.0]])},
-         r"cls_indexes: want different numbers from 1 to 21"),
-        (lambda poses: {"intrinsic_matrix": np.eye(3)[::-1]}, r"intrinsic_matrix: want \[\[fx, 0, cx\]"),
-        (lambda poses: {"intrinsic_matrix": np.diag([0.0, 1.0, 1.0])},
-         r"intrinsic_matrix: camera: fx and fy must be positive"),
-        (lambda poses: {"intrinsic_matrix": MATRIX * [[3.0], [3.0], [1.0]]},
-         r"intrinsic_matrix: the principal point \(183, 130\.5\) lies outside of the image of 120 x 90"),
-    ],
-)  # fmt: skip
-def test_bad_meta_files_are_refused_with_file_and_key(root, made, change, message):
-    poses = np.moveaxis(made[0].poses[:, :3], 0, -1)
-    _meta(root, made[0], **change(poses))
-    with pytest.raises(ValueError, match=rf"0000/000001-meta\.mat: {message}"):
-        of(root).frame(FrameName("0000", 1))
-
-
-def test_files_that_are_missing_or_of_another_size(root, made):
-    target, name, stem = of(root), FrameName("0000", 1), root / "data" / "0000"
-    label = stem / "000001-label.png"
-    Image.fromarray(np.zeros((9, 9), np.uint8)).save(label)
-    with pytest.raises(ValueError, match=r"000001-label\.png: is 9 x 9 pixels, its photograph 120 x 90"):
-        target.frame(name)
-    Image.fromarray(np.full((90, 120), 4, np.uint8)).save(label)
-    with pytest.raises(
-        ValueError, match=r"label\.png: shows classes \[4\], of which 000001-meta\.mat has no pose"
-    ):
-        target.frame(name)
-    label.unlink()
-    whole = target.frame(name)  # without masks boxes are those of whole objects
-    assert all(
-        item.mask is None and item.visibility == 1.0 and item.box is not None for item in whole.objects
-    )
-    (stem / "000001-box.txt").write_text("035_power_drill 1 2 3\n")
-    with pytest.raises(ValueError, match=r"000001-box\.txt: line 1: want a class and four numbers"):
-        target.frame(name)
-    (stem / "000001-box.txt").write_text("035_power_drill 1 2 3 4\n")
-    with pytest.raises(
-        ValueError, match=r"000001-box\.txt: has no box of \w+, of which 000001-meta\.mat has a pose"
-    ):
-        target.frame(name)
-    (stem / "000001-meta.mat").write_text("nothing")
-    with pytest.raises(ValueError, match=r"000001-meta\.mat: not a readable MATLAB file"):
-        target.frame(name)
-    write_mat(
-        stem / "000001-meta.mat",
-        {
-            "cls_indexes": np.ones((1, 1)),
-            "poses": np.eye(3, 4),
-            "intrinsic_matrix": MATRIX,
-            "factor_depth": np.ones((1, 1)),
-        },
-    )
-    (stem / "000001-color.png").unlink()
-    with pytest.raises(ValueError, match=r"000001-color\.png: not a readable image"):
-        target.frame(name)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"root": "nowhere"}, r"target\.root: nowhere is not a folder"),
-        ({"every": 0}, r"target\.every must be at least 1, got 0"),
-        ({"limit": 0}, r"target\.limit must be at least 1, got 0"),
-        ({"val_fraction": 1.0}, r"target\.val_fraction must lie in \(0, 1\), got 1\.0"),
-        ({"min_visibility": -0.1}, r"target\.min_visibility must lie in \[0, 1\], got -0\.1"),
-        ({"unmatched": "ignore"}, r"target\.unmatched must be one of .* got 'ignore'"),
-    ],
-)
-def test_bad_settings_are_refused(shared_root, settings, message):
-    with pytest.raises(ValueError, match=message):
-        of(settings.pop("root", shared_root), **settings)
-
-
-def test_one_scene_cannot_be_split(meshes, tmp_path):
-    write_ycb_video(tmp_path, photographs(meshes, 1, 1), meshes, CLASSES)
-    with pytest.raises(
-        ValueError, match=r"want at least two scenes, one for val and one for test, got \['0000'\]"
-    ):
-        of(tmp_path)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="holds no photographs for val"):
-        of(tmp_path / "empty")
 
 
 @pytest.fixture(scope="module")
