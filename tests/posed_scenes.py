@@ -221,3 +221,11 @@ def _info(item: Made, number: int) -> dict[str, object]:
         box = [columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)]
     return {"bbox_visib": [int(v) for v in box], "px_count_visib": int(mask.sum()),
             "visib_fract": float(mask.sum() / max(1, whole.sum()))}  # fmt: skip
+
+
+def change_meta(root, item, **changes):
+    """Write a frame's meta file anew with other arrays; None leaves one out."""
+    path = root / "data" / f"{item.scene:04d}" / f"{item.number:06d}-meta.mat"
+    names = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
+    arrays = {**read_arrays(path, names), **changes}
+    write_mat(path, {name: array for name, array in arrays.items() if array is not None})

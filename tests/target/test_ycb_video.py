@@ -12,6 +12,7 @@ from posed_scenes import (
     FACTOR,
     MATRIX,
     SIZE,
+    change_meta,
 )
 
 from neural_sim.cameras import focal_lengths, principal_point
@@ -202,7 +203,7 @@ def test_hidden_and_small_objects_have_no_box(shared_root, caplog):
 def test_several_cameras(root, made, caplog):
     target = of(root)
     assert TargetCamera().camera(8, 40.0, target) == target.frame(FrameName("0000", 1)).camera
-    _meta(root, made[0], intrinsic_matrix=MATRIX * np.array([[1.01, 1.0, 1.0]] * 3))
+    change_meta(root, made[0], intrinsic_matrix=MATRIX * np.array([[1.01, 1.0, 1.0]] * 3))
     with caplog.at_level(logging.WARNING):
         camera = of(root).camera()
     assert focal_lengths(camera)[0] == pytest.approx(MATRIX[0, 0])

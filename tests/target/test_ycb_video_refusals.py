@@ -3,22 +3,14 @@
 import numpy as np
 import pytest
 from PIL import Image
-from posed_scenes import MATRIX, photographs, write_mat, write_ycb_video
+from posed_scenes import MATRIX, change_meta, photographs, write_mat, write_ycb_video
 
 from neural_sim.target.frames import FrameName
-from neural_sim.target.matlab import read_arrays
 from neural_sim.target.ycb_video import CLASSES, YcbVideoTarget
 
 
 def of(root, **settings):
     return YcbVideoTarget(**{"root": root, "every": 1, **settings})
-
-
-def _meta(root, item, **changes):
-    path = root / "data" / f"{item.scene:04d}" / f"{item.number:06d}-meta.mat"
-    names = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
-    arrays = {**read_arrays(path, names), **changes}
-    write_mat(path, {name: array for name, array in arrays.items() if array is not None})
 
 
 def _reflected(poses):
@@ -44,7 +36,7 @@ def _reflected(poses):
 )  # fmt: skip
 def test_bad_meta_files_are_refused_with_file_and_key(root, made, change, message):
     poses = np.moveaxis(made[0].poses[:, :3], 0, -1)
-    _meta(root, made[0], **change(poses))
+    change_meta(root, made[0], **change(poses))
     with pytest.raises(ValueError, match=rf"0000/000001-meta\.mat: {message}"):
         of(root).frame(FrameName("0000", 1))
 
