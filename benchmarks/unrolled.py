@@ -1,7 +1,7 @@
-"""The derivative of the training that was run: what it costs, what each saving adds in error, and what it foretells.
+"""The derivative of the training that was run: what it costs, and what each saving adds in error.
 
 `python benchmarks/unrolled.py` writes docs/numerics.md, from one iteration of the psi loop on `+experiment=pose_gap` at
-64 px: a training, and for every bin of an object the same training with a part of its images drawn from that bin.
+64 px. What the derivative foretells is in `foretold.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from machine import machine
 from section import replace_section
 from torch import Tensor
-from unrolled_report import centred, report, table
+from unrolled_report import centred, report
 from worlds import SMALL
 
 from neural_sim.detector.cached import CachedSet
@@ -30,11 +30,9 @@ from neural_sim.detector.protocol import Parameters
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, probe_columns, step_weights
-from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
 from neural_sim.main import build, conf_directory
-from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import gradient
 from neural_sim.stages.context import Context
 from neural_sim.synthesis.pool import ImagePool
@@ -44,6 +42,13 @@ START = ("+experiment=pose_gap", "gap=uniform")
 PER_BIN = 24
 ALL = Unrolled(probes_per_step=0, score_every=1)
 EXACT = replace(ALL, product="reverse_over_reverse")
+CENTRAL = replace(ALL, product="central_difference")
+DEFAULT = "forward differences, a probe of each bin every second step (default)"
+OTHERS = {
+    "tiny, 24 epochs": ("outer.epochs=24",),
+    "resnet18, 12 epochs": ("detector=resnet18", "training.warm_epochs=1"),
+}
+"""Other trainings whose cost is measured; a warm start of one epoch, since costs do not depend on it."""
 PARTS = (0.75, 0.5, 0.25)
 FEW = ((2, 1), (1, 1), (1, 2), (1, 4))
 
@@ -79,18 +84,15 @@ class World:
         bins = self.p.shape[1]
         return (label * bins * PER_BIN + torch.arange(bins * PER_BIN)).view(bins, PER_BIN)
 
-    def rows(self, seed: int, label: int = 0, to: int = 0, part: float = 0.0) -> Int[Tensor, "n"]:
-        """A training set's rows, ``part`` of one object's images from the bin ``to``; all else as without."""
-        generator, found = torch.Generator().manual_seed(seed), []
+    def rows(self, seed: int) -> Int[Tensor, "n"]:
+        """A training set's rows."""
+        generator, drawn = torch.Generator().manual_seed(seed), []
         for i, p in enumerate(self.p):
-            chosen, moved = torch.rand(
-                2, self.context.experiment.loop.outer.images_per_object, generator=generator
-            )
+            chosen = torch.rand(self.context.experiment.loop.outer.images_per_object, generator=generator)
             place = torch.randint(PER_BIN, chosen.shape, generator=generator)
             bins = torch.searchsorted(p.cumsum(0), chosen).clamp_max(len(p) - 1)
-            bins = torch.where(moved < part, to, bins) if i == label else bins
-            found.append(self.probes(i)[bins, place])
-        return torch.cat(found)
+            drawn.append(self.probes(i)[bins, place])
+        return torch.cat(drawn)
 
     def train(
         self, rows: Tensor, seed: int, recording: Recording | None = None
@@ -105,10 +107,6 @@ class World:
         )  # fmt: skip
         return detector.split(theta)[1], history
 
-    @torch.no_grad()
-    def loss(self, trained: Parameters) -> float:
-        return float(sum(term(trained) for term in self.validation.mean_terms()))
-
 
 @dataclass(frozen=True)
 class Walked:
@@ -120,35 +118,18 @@ class Walked:
     trained: Parameters
     trajectory: Trajectory
 
-    def scores(self, product: Product = "central_difference") -> Float[Tensor, "steps k per_bin"]:
+    def scores(self, product: Product) -> Float[Tensor, "steps k per_bin"]:
         """Of every probe of the object in every step, the last step first."""
         world, data = self.world, self.world.pool.select(self.rows)
         slope = gradient(world.validation.mean_terms(), self.trained)
         examples = Examples(data.inputs, data.losses_from)
         table, found = world.probes(self.label), []
-        for step in reversed_steps(self.trajectory, examples, self.trained, slope, product):
+        for step in reversed_steps(self.trajectory, examples, self.trained, slope, product, "probes"):
             along = scores(
                 world.pool.losses, step.params, step.along, table.reshape(-1), 96, "central_difference"
             )
             found.append((along - along.mean()).view_as(table))
         return torch.stack(found)
-
-    def implicit(self, generator: torch.Generator, solved: bool = True) -> Float[Tensor, "k"]:
-        """The same by v = (H + lambda I)^-1 dL_val/dtheta, or by dL_val/dtheta itself."""
-        world, data = self.world, self.world.pool.select(self.rows)
-        slope = gradient(world.validation.mean_terms(), self.trained)
-        if solved:
-            chosen = torch.randperm(len(data), generator=generator)[
-                : world.context.experiment.loop.outer.curvature_images
-            ]
-            weights = torch.full((len(data),), 1.0 / len(data))
-            inner = InnerProblem(self.trained, data.losses, weights, subset=chosen)
-            slope = world.context.experiment.loop.solver.solve(
-                inner.terms(chosen), self.trained, slope, None, generator
-            ).vector
-        index = world.probes(self.label)
-        along = scores(world.pool.losses, self.trained, unflatten(slope, self.trained), index.reshape(-1))
-        return -centred(along.view_as(index).mean(1))
 
 
 def walked(world: World, label: int, seed: int) -> Walked:
@@ -166,13 +147,14 @@ def clock(work: Callable[[], Any]) -> float:
     return time.process_time() - begun
 
 
-def costs(world: World, repeats: int) -> dict[str, float]:
-    """Medians of a training's seconds, and of everything else in trainings beside it; megabytes of what is kept."""
+def costs(world: World, repeats: int, brief: bool = False) -> dict[str, float]:
+    """Medians of a training's seconds, and of everything else in trainings beside it; megabytes of what is kept, and
+    numbers that are trained. ``brief``: the default way alone."""
     rows, found, none = world.rows(0), [], torch.Generator()
     data = world.pool.select(rows)
     examples = Examples(data.inputs, data.losses_from)
-    every = ProbeGroups(world.pool.losses, [world.probes(i)[:, :16] for i in range(len(world.p))])
-    kept = 0
+    every = ProbeGroups(world.pool.losses, [world.probes(i) for i in range(len(world.p))])
+    kept, run = 0, None
     for seed in range(repeats):
         trained, history = world.train(rows, seed, Recording())
         run = history.trajectory
@@ -187,29 +169,41 @@ def costs(world: World, repeats: int) -> dict[str, float]:
             return clock(lambda: how.accumulate(run, examples, trained, slope, none, probes, **wanted))
 
         once = clock(lambda seed=seed: world.train(rows, seed))
-        walks = {
-            "recording": clock(lambda seed=seed: world.train(rows, seed, Recording())) - once,
-            "central differences": back(ALL),
-            "reverse over reverse": back(EXACT),
-            "gradients computed again": back(ALL, run=bare),
-            "with derivatives by features": back(ALL, wanted="inputs"),
-            "and a probe of each bin a step": back(replace(ALL, probes_per_step=1), every),
-            "and one every second step (default)": back(Unrolled(), every),
-        }
+        walks = {DEFAULT: back(Unrolled(), every, wanted="probes")}
+        if not brief:
+            walks = {
+                "recording": clock(lambda seed=seed: world.train(rows, seed, Recording())) - once,
+                "forward differences": back(ALL, wanted="probes"),
+                "forward differences, gradients computed again": back(ALL, run=bare, wanted="probes"),
+                "forward differences, a probe of each bin every step": back(
+                    replace(ALL, probes_per_step=1), every, wanted="probes"
+                ),
+                **walks,
+                "central differences": back(CENTRAL),
+                "central differences, with derivatives by features": back(CENTRAL, wanted="inputs"),
+                "reverse over reverse": back(EXACT),
+            }
         found.append({"seconds": once} | {key: spent / once for key, spent in walks.items()})
+    if run is None:
+        raise ValueError(f"costs: want at least one repeat, got {repeats}")
     medians = {key: float(torch.tensor([row[key] for row in found]).median()) for key in found[0]}
-    return medians | {"megabytes": kept / MEGABYTE}
+    return medians | {
+        "megabytes": kept / MEGABYTE,
+        "numbers": float(run.end.numel()),
+        "steps": float(len(run)),
+    }
 
 
 def errors(run: Walked, draws: int = 200) -> dict[str, float]:
     """Relative errors of the bins' mean scores against exact products, all probes in all steps."""
-    exact, near = run.scores("reverse_over_reverse"), run.scores()
+    exact = run.scores("reverse_over_reverse")
     means, generator = bin_means(exact), torch.Generator().manual_seed(0)
 
     def error(values: list[Tensor]) -> float:
         return float(torch.stack([(v - means).norm() / means.norm() for v in values]).square().mean().sqrt())
 
-    found = {"central differences": error([bin_means(near)])}
+    products: tuple[Product, ...] = ("forward_difference", "central_difference")
+    found = {product.replace("_", " ") + "s": error([bin_means(run.scores(product))]) for product in products}
     for count, every in FEW:
         steps = "every step" if every == 1 else f"one step in {every}"
         drawn = [few(exact, count, every, generator) for _ in range(draws)]
@@ -217,7 +211,7 @@ def errors(run: Walked, draws: int = 200) -> dict[str, float]:
     for part in PARTS:
         found[f"the last {part:.0%} of the steps"] = error([bin_means(exact, part)])
     spread = exact.sum(0).var(1)
-    for count in (16, 48):
+    for count in (24, 48):
         own = float((spread / count).sum().sqrt() / means.norm())
         found[f"(the noise of {count} probes a bin themselves)"] = own
     return found
@@ -239,32 +233,10 @@ def few(
     return centred(total)
 
 
-def responses(world: World, label: int, seeds: int, part: float) -> dict[str, Any]:
-    """Changes of the validation loss by bin, and the ways to foretell them, a row for each seed."""
-    p = world.p[label]
-    shares, share = torch.eye(len(p)) - p, part / len(world.p)  # row b: what moving to bin b changes
-    true, told = [], {}
-    for seed in range(seeds):
-        run = walked(world, label, seed)
-        base = world.loss(run.trained)
-        moved = [world.train(world.rows(seed, label, b, part), seed)[0] for b in range(len(shares))]
-        true.append(torch.tensor([world.loss(trained) - base for trained in moved]))
-        scored = run.scores()
-        ways = {"unrolled": bin_means(scored)}
-        ways |= {f"unrolled, the last {late:.0%} of the steps": bin_means(scored, late) for late in PARTS[1:]}
-        generator = torch.Generator().manual_seed(seed)
-        ways |= {"implicit": run.implicit(generator), "dL_val/dtheta alone": run.implicit(generator, False)}
-        for name, means in ways.items():
-            told.setdefault(name, []).append(share * (shares @ means))
-    return {"response": true, "foretold": told}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
-    parser.add_argument("--objects", nargs="+", default=["pitcher"])
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--part", type=float, default=0.5, help="of an object's images that move to a bin")
+    parser.add_argument("--object", default="pitcher", help="whose derivative the errors are of")
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--docs", type=Path, default=Path("docs/numerics.md"))
     parser.add_argument("--json", type=Path, default=Path("outputs/benchmarks/unrolled.json"))
@@ -272,26 +244,21 @@ def main() -> None:
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     world = World.of(arguments.overrides)
-    labels = {name: world.context.graph.names.index(name) for name in arguments.objects}
-    spent = costs(world, arguments.repeats)
-    wrong = errors(walked(world, labels[arguments.objects[0]], 0))
+    spent = {"tiny, 12 epochs": costs(world, arguments.repeats)}
+    wrong = errors(walked(world, world.context.graph.names.index(arguments.object), 0))
     print(json.dumps({"costs": spent, "errors": wrong}, indent=1), flush=True)
-    found = {}
-    for name, label in labels.items():
-        found[name] = responses(world, label, arguments.seeds, arguments.part)
-        print(table(found), flush=True)
-    text = report(found, spent, wrong, vars(arguments) | {"per_bin": PER_BIN})
-    rows = {
-        name: {
-            "response": torch.stack(held["response"]).tolist(),
-            "foretold": {way: torch.stack(told).tolist() for way, told in held["foretold"].items()},
-        }
-        for name, held in found.items()
-    }
+    for name, overrides in OTHERS.items():
+        spent[name] = costs(World.of([*arguments.overrides, *overrides]), arguments.repeats, brief=True)
+        print(json.dumps(spent[name], indent=1), flush=True)
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
-    document = {"machine": machine(), "costs": spent, "errors": wrong, "objects": rows}
-    arguments.json.write_text(json.dumps(document, indent=1))
-    replace_section(arguments.docs, "Unrolled", text)
+    arguments.json.write_text(json.dumps({"machine": machine(), "costs": spent, "errors": wrong}, indent=1))
+    settings = {
+        "object": arguments.object,
+        "repeats": arguments.repeats,
+        "per_bin": PER_BIN,
+        "default": DEFAULT,
+    }
+    replace_section(arguments.docs, "Unrolled", report(spent, wrong, settings, arguments.overrides))
 
 
 if __name__ == "__main__":
