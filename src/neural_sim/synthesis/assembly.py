@@ -39,6 +39,11 @@ class RenderedObject:
     def __len__(self) -> int:
         return len(self.draw)
 
+    def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
+        """Some of the renders, without what reproduces or differentiates them."""
+        there = index.to(self.rgb.device)
+        return RenderedObject(self.draw.select(index), self.rgb[there], self.opacity[there])
+
 
 @dataclass(frozen=True)
 class RenderedImages:

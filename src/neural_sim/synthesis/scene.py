@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -205,12 +205,15 @@ class Scene:
         generator: torch.Generator,
         how: Draws,
         source: Source,
+        known: Mapping[int, RenderedObject] | None = None,
     ) -> Shared:
-        """Images of the layout, every object from its own p_psi."""
+        """Images of the layout, every object from its own p_psi; of ``known`` classes there are renders already."""
         nuisance = self._nuisance(len(layout), generator, layout.labels.shape[1])
         counts = [len(layout.places(label)[0]) for label in range(len(self.names))]
+        known = known or {}
         objects = [
-            source.drawn(label, psi[label], shown, generator, how) for label, shown in enumerate(counts)
+            known[label] if label in known else source.drawn(label, psi[label], shown, generator, how)
+            for label, shown in enumerate(counts)
         ]
         return Shared.of(objects, layout, nuisance, self._bins(objects), self.synthesizer)
 
@@ -238,7 +241,8 @@ class Scene:
             return one_each([part], [nuisance], [label], [bins], self.synthesizer).images, part.draw
         own = torch.full((count,), label)
         layout = draw_layout(own, len(self.names), self.synthesizer.count, generator, present=True)
-        around = self._around(layout, psi, generator, HARD, source)
+        first = torch.full((count,), len(scenes)).scatter_reduce(0, scenes, torch.arange(len(scenes)), "amin")
+        around = self._around(layout, psi, generator, HARD, source, {label: part.select(first)})
         return around.repeated(scenes, label, part, bins).composed().images, part.draw
 
     def _bins(self, objects: Sequence[RenderedObject]) -> list[Int[Tensor, "m"]]:
