@@ -124,7 +124,7 @@ def _run(folder, config):
     made = json.loads((folder / "training_set" / "annotations.json").read_text())
     assert len(made["images"]) == len(results["psi"]) * config["training"]["images_per_object"]
     assert all(
-        (folder / "training_set" / image["file_name"]).is_file() and image["pose"] for image in made["images"]
+        (folder / "training_set" / image["file_name"]).is_file() and image["poses"] for image in made["images"]
     )
 
     _model(folder, config, list(results["psi"]))
@@ -150,13 +150,14 @@ def _predict(folder, config):
 
 
 def _comparison(folder, config):
-    found = {held["setting"]: held for held in json.loads((folder / "compare.json").read_text())}
+    written = json.loads((folder / "compare.json").read_text())
+    tables = {table["setting"]: table for table in written["comparisons"]}
     text = (folder / "compare.md").read_text()
-    assert set(config["compare"]["experiments"]) <= set(found)
-    for setting, held in found.items():
-        assert held["methods"][0] == config["compare"]["reference"] and len(held["methods"]) > 1
+    assert set(config["compare"]["experiments"]) <= set(tables)
+    for setting, table in tables.items():
+        assert table["methods"][0] == config["compare"]["reference"] and len(table["methods"]) > 1
         assert (folder / "figures" / f"{setting.replace(', ', '_')}.png").stat().st_size > 5000
-        assert all(f"\n| {method} |" in text for method in held["methods"])
+        assert all(f"\n| {method} |" in text for method in table["methods"])
     assert "of the gap closed" in text
 
 
