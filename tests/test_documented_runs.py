@@ -124,7 +124,8 @@ def _run(folder, config):
     made = json.loads((folder / "training_set" / "annotations.json").read_text())
     assert len(made["images"]) == len(results["psi"]) * config["training"]["images_per_object"]
     assert all(
-        (folder / "training_set" / image["file_name"]).is_file() and image["poses"] for image in made["images"]
+        (folder / "training_set" / image["file_name"]).is_file() and image["poses"]
+        for image in made["images"]
     )
 
     _model(folder, config, list(results["psi"]))

@@ -40,12 +40,21 @@ def test_heavy_libraries_stay_in_their_rooms():
     homes = {
         "pyrender": {"renderer/mesh.py"},
         "matplotlib": {
-            f"report/{name}.py" for name in ("figures", "curves", "interpolation", "temperatures")
+            f"report/{name}.py"
+            for name in (
+                "figures",
+                "curves",
+                "interpolation",
+                "temperatures",
+                "page/charts",
+                "page/comparison_page",
+            )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},
         "onnx": {"detector/onnx_export.py", "detector/onnx_nms.py"},
         "onnxruntime": {"detector/onnx_export.py"},
         "safetensors": {"detector/saved.py"},
+        "jinja2": {"report/page/render.py"},
         "filelock": {"report/tracking.py", "stages/store.py"},
         "beartype": {"main.py"},
         "optuna": {"baseline/search.py"},

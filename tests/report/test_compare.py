@@ -91,7 +91,9 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
         "Seconds are not comparable" not in text and (tmp_path / "figures" / "gap.png").stat().st_size > 5000
     )
     printed = capsys.readouterr().out
-    assert text.strip() in printed and printed.strip().endswith(logged.where_runs(database, "gap"))
+    assert text.strip() in printed and logged.where_runs(database, "gap") in printed
+    page = tmp_path / "report.html"
+    assert printed.strip().endswith(f"open {page}") and "neural_sim reaches 74.3 AP" in page.read_text()
     (own,) = logged.runs(database, "compare")
     assert own.status == "FINISHED" and {"compare.md", "compare.json", "figures"} <= own.files
 

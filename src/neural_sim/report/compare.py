@@ -12,6 +12,7 @@ from typing import Any, get_args
 from neural_sim.report import figures, logged, tracking
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
+from neural_sim.report.page.comparison_page import Section, write_comparison_page
 from neural_sim.report.selection import Group, LeftOut, Selection
 from neural_sim.report.statistics import BOUNDS, Clock, Comparison, Estimate, compare
 
@@ -59,7 +60,7 @@ class Compare:
         labels = [group.label for group in chosen.groups]
         tags = {"compared": ",".join(labels)}
         with tracking.opened(uri, "compare", ", ".join(labels), tags, tracking.flatten(config)) as tracked:
-            comparisons, text = self._compared(chosen, seed, folder)
+            comparisons, text, page = self._compared(chosen, seed, folder)
             tracked.log(
                 {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in comparisons for method in c.methods}
             )
@@ -67,12 +68,12 @@ class Compare:
         print(text)
         tables = [logged.where_runs(uri, name) for name in dict.fromkeys(self.experiments)]
         lines = dict.fromkeys(line for table in tables for line in table.splitlines())  # one command for all
-        print(f"results: {folder}", *lines, sep="\n")
+        print(f"results: {folder}", *lines, f"who is ahead? open {page}", sep="\n")
         return comparisons
 
-    def _compared(self, chosen: Selection, seed: int, folder: Path) -> tuple[list[Comparison], str]:
-        """Every group's comparison, with the files in ``folder``; and the text of compare.md."""
-        comparisons, parts, documents = [], [], []
+    def _compared(self, chosen: Selection, seed: int, folder: Path) -> tuple[list[Comparison], str, Path]:
+        """Every group's comparison, with the files in ``folder``; the text of compare.md, and the page."""
+        comparisons, parts, documents, sections = [], [], [], []
         for group in chosen.groups:
             runs = [read_run(run) for run in group.runs]
             comparison = compare(runs, self.reference, self.draws, seed, self.clock)
@@ -80,14 +81,17 @@ class Compare:
             comparisons.append(comparison)
             parts.append(markdown(comparison, runs, group.heading))
             documents.append(dataclasses.asdict(comparison) | _sources(group))
-            figures.save(curves(comparison, runs), folder / "figures" / f"{_slug(comparison)}.png")
+            drawn = curves(comparison, runs)
+            figures.save(drawn, folder / "figures" / f"{_slug(comparison)}.png")
+            sections.append(Section(comparison, drawn, group.heading, runs[0].results["biased"]))
         text = "\n\n".join([*parts, *left_out_table(chosen.left_out)])
         left = [dataclasses.asdict(run) for run in chosen.left_out]
         (folder / "compare.json").write_text(
             json.dumps({"comparisons": documents, "left_out": left}, indent=1)
         )
         (folder / "compare.md").write_text(text + "\n")
-        return comparisons, text
+        page = write_comparison_page(sections, dict(by_reason(chosen.left_out)), folder)
+        return comparisons, text, page
 
 
 def _slug(comparison: Comparison) -> str:

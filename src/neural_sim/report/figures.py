@@ -18,8 +18,9 @@ from neural_sim.types import LabelledImages
 matplotlib.use("Agg")
 
 INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
-METHOD_COLOURS = {"ns": "#c2c8cf", "learned": "#2f6db5", "matched": "#4c9f70"}
-CLASS_COLOURS = ("#2f6db5", "#e08a1e", "#4c9f70", "#b5417a", "#7b5cc4", "#b08d3c", "#3aa6b9", "#8c564b")
+# Okabe and Ito's palette (Color Universal Design, 2008), which readers with any colour vision tell apart.
+METHOD_COLOURS = {"ns": "#b0b7bf", "learned": "#0072b2", "matched": "#009e73"}
+CLASS_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a5cc4", "#8c6d1f")
 
 
 def style(axes: Any) -> None:
@@ -56,36 +57,53 @@ def psi_figure(
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
     bins = len(next(iter(target.values())))
-    colours = matplotlib.colormaps["twilight_shifted" if factor == "pose" else "viridis"](
-        np.linspace(0.08, 0.92, bins)
-    )
+    colours = bin_colours(factor, bins)
     figure.suptitle(title, color=INK, fontsize=11)
     for place, name in enumerate(names, 1):
-        axes = figure.add_subplot(rows, columns, place)
         joined = groups[name] if groups is not None else [[b] for b in range(1, bins + 1)]
-        p, wanted = (merged(torch.tensor(each), joined).numpy() for each in (history[name], target[name]))
-        shades = [colours[group[0] - 1] for group in joined]
-        steps = np.arange(len(p))
-        width = max(1.0, 0.12 * len(p))
-        axes.stackplot(steps, p.T, colors=shades, linewidth=0)
-        bottom = 0.0
-        for group, mass, shade in zip(joined, wanted, shades, strict=True):
-            axes.bar(len(p) - 1 + 1.1 * width, mass, width, bottom=bottom, color=shade, linewidth=0)
-            if mass > 0.25:
-                axes.text(len(p) - 1 + 1.1 * width, bottom + mass / 2, "=".join(map(str, group)), ha="center",
-                          va="center", color="white", fontsize=8)  # fmt: skip
-            bottom += mass
-        axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1), title=_titled(name, joined))
-        axes.title.set_fontsize(9)
-        ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
-        axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
-        style(axes)
+        axes = figure.add_subplot(rows, columns, place)
+        psi_panel(axes, history[name], target[name], joined, colours)
+        axes.set_title(_titled(name, joined), fontsize=9)
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
     figure.legend(
         handles, [str(b + 1) for b in range(bins)], loc="outside lower center", ncols=min(bins, 16),
         title=f"{factor} bin (x: outer iteration, y: probability)", fontsize=8, title_fontsize=8, frameon=False,
     )  # fmt: skip
     return figure
+
+
+def bin_colours(factor: str, bins: int) -> Any:
+    """A colour a bin; only a pose's close the circle."""
+    return matplotlib.colormaps["twilight_shifted" if factor == "pose" else "viridis"](
+        np.linspace(0.08, 0.92, bins)
+    )
+
+
+def psi_panel(
+    axes: Any,
+    history: Sequence[Sequence[float]],
+    target: Sequence[float],
+    groups: Sequence[Sequence[int]],
+    colours: Any,
+) -> None:
+    """One object's probabilities, stacked, by iteration, and its target's beside them; arguments as in
+    :func:`psi_figure`."""
+    p, wanted = (merged(torch.tensor(each), groups).numpy() for each in (history, target))
+    shades = [colours[group[0] - 1] for group in groups]
+    steps = np.arange(len(p))
+    width = max(1.0, 0.12 * len(p))
+    axes.stackplot(steps, p.T, colors=shades, linewidth=0)
+    bottom = 0.0
+    for group, mass, shade in zip(groups, wanted, shades, strict=True):
+        axes.bar(len(p) - 1 + 1.1 * width, mass, width, bottom=bottom, color=shade, linewidth=0)
+        if mass > 0.25:
+            axes.text(len(p) - 1 + 1.1 * width, bottom + mass / 2, "=".join(map(str, group)), ha="center",
+                      va="center", color="white", fontsize=8)  # fmt: skip
+        bottom += mass
+    axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1))
+    ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
+    axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
+    style(axes)
 
 
 def _titled(name: str, groups: Sequence[Sequence[int]]) -> str:

@@ -88,10 +88,10 @@ def compare(
     ]
     point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
     spread = resampled(matches, draws, seed)
-    ap = dict(zip(columns, _estimates(point, spread), strict=True))
+    ap = dict(zip(columns, estimates(point, spread), strict=True))
     gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
-    won = _estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
-    ahead = _estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
+    won = estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
+    ahead = estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
@@ -102,7 +102,8 @@ def compare(
 
 def mean_ap(matches: Sequence[Matches], weights: Float[np.ndarray, "images"] | None = None) -> float:
     """Mean over classes; those without a box among the weighted images stay out of it."""
-    return float(np.nanmean([average_precision(m, weights) for m in matches]))
+    known = [ap for m in matches if not math.isnan(ap := average_precision(m, weights))]
+    return float(np.mean(known)) if known else math.nan
 
 
 def resampled(
@@ -184,18 +185,21 @@ def _areas(
 
 def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
     """Means over seeds; seeds alone are resampled, since detections of intermediate psi are not kept."""
-    estimates = {}
+    over_seeds = {}
     for method, each in values.items():
         numbers, random = np.asarray(each), np.random.default_rng(seed)
         chosen = random.integers(len(each), size=(draws, len(each)))
-        estimates[method] = _estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
+        over_seeds[method] = estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
         if len(each) == 1:
-            estimates[method] = Estimate(estimates[method].value)
-    return estimates
+            over_seeds[method] = Estimate(over_seeds[method].value)
+    return over_seeds
 
 
-def _estimates(point: np.ndarray, spread: Float[np.ndarray, "draws columns"]) -> list[Estimate]:
-    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
+def estimates(
+    point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
+) -> list[Estimate]:
+    """Values with the 2.5 % and 97.5 % quantiles of their bootstrap draws, of those that have a value."""
+    low, high = np.nanquantile(spread, [0.025, 0.975], axis=0)
     return [Estimate(float(p), float(a), float(b)) for p, a, b in zip(point, low, high, strict=True)]
 
 

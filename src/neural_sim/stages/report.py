@@ -12,6 +12,7 @@ import torch
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
 from neural_sim.report.identity import identity
+from neural_sim.report.page.run_page import PER_OBJECT, Shown, write_run_page
 from neural_sim.report.run import (
     RunResults,
     write_detections,
@@ -21,6 +22,7 @@ from neural_sim.report.run import (
 )
 from neural_sim.stages.context import Context
 from neural_sim.stages.evaluate import Scores
+from neural_sim.stages.graph import Psi
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -47,9 +49,31 @@ def write_report(context: Context) -> None:
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
         _write_model(context, test)
     write_results(report, folder)
+    page = write_run_page(report, _shown(context, learned.last, test, scores), _commands(context), folder)
     context.live.finish(report, folder)
     print(report.summary())
     print(f"results: {folder}\n{context.live.where}")
+    for what, command in _commands(context).items():
+        print(f"{what.lower()}: {command}")
+    print(f"did it work? open {page}")
+
+
+def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str, Scores]) -> Shown:
+    """What the page shows: a few images before and after, drawn with the same random numbers, and detections."""
+    graph, scene = context.graph, context.results(context.graph.scene)
+    before, after = (
+        scene.training_set(each, max(PER_OBJECT.values()), graph.warm_start.generator()).images.to("cpu")
+        for each in (graph.psi("initial"), psi)
+    )
+    return Shown(before, after, test, {called: part.detections for called, part in scores.items()})
+
+
+def _commands(context: Context) -> dict[str, str]:
+    """What to run next, by what it does."""
+    name, folder = context.experiment.run.name, context.folder
+    compare = f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'"
+    predict = f"python -m src.main 'stages=[predict]' predict.model={folder} predict.images=/data/photos"
+    return {"To compare methods and seeds": compare, "To detect objects in photographs": predict}
 
 
 def _write_model(context: Context, test: LabelledImages) -> None:

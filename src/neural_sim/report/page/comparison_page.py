@@ -1,0 +1,70 @@
+"""report.html of a comparison: who is ahead, by how much, at what cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from neural_sim.report.page import charts, render
+from neural_sim.report.page.verdict import interval, listed
+from neural_sim.report.statistics import Comparison
+
+FILE = "report.html"
+
+
+@dataclass(frozen=True)
+class Section:
+    """One setting's comparison: its AP against cost drawn, how its runs differ from others of the setting, and the
+    classes whose AP is compared."""
+
+    comparison: Comparison
+    curves: Figure
+    heading: str
+    biased: Sequence[str]
+
+    @property
+    def chart(self) -> str:
+        """The source of an ``<img>``."""
+        return charts.data_uri(self.curves)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: whom the reference is ahead of, and whom not."""
+        return verdict(self.comparison)
+
+    @property
+    def longest(self) -> float:
+        """The largest AP of the table, to which bars are drawn."""
+        return max((estimate.value for estimate in self.comparison.ap.values()), default=1.0) or 1.0
+
+
+def verdict(comparison: Comparison) -> str:
+    """Whom the reference method is ahead of by AP at the end, with intervals; methods whose interval includes 0 are
+    named as not told apart."""
+    c = comparison
+    head = f"{c.reference} reaches {100 * c.ap[c.reference].value:.1f} AP ({interval(c.ap[c.reference])})"
+    groups = {
+        "ahead of": [m for m, e in c.ahead.items() if e.certain and e.value > 0.0],
+        "behind": [m for m, e in c.ahead.items() if e.certain and e.value < 0.0],
+    }
+    parts = []
+    for word, methods in groups.items():
+        if methods:
+            parts.append(f"{word} " + listed([f"{m} by {abs(100 * c.ahead[m].value):.1f}" for m in methods]))
+    untold = [m for m, e in c.ahead.items() if not e.certain]
+    if untold:
+        parts.append(f"not told apart from {listed(untold)}")
+    return head + "".join(f", {part}" for part in parts) + "."
+
+
+def write_comparison_page(sections: Sequence[Section], left_out: dict[str, list[str]], folder: Path) -> Path:
+    """Write report.html. ``left_out`` are the runs that were not compared, by the reason."""
+    path = folder / FILE
+    title = "Comparison: " + ", ".join(section.comparison.setting for section in sections)
+    path.write_text(
+        render.page("comparison.html", title=title, sections=sections, left_out=left_out), encoding="utf-8"
+    )
+    return path

@@ -1,0 +1,95 @@
+"""Images with boxes, as the page shows them."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from PIL import Image, ImageDraw
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+from torchvision.ops import box_iou
+
+from neural_sim.report.figures import CLASS_COLOURS
+from neural_sim.types import LabelledImages
+
+SHORTEST = 192
+"""Pixels of a picture's shorter side; boxes on smaller images would be coarse."""
+OVERLAP = 0.5
+"""Intersection over union from which a detection counts as right here."""
+SHOWN = 0.3
+"""Score from which a detection is shown, and counts on an image without objects."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image as the source of an ``<img>``, and the line below it."""
+
+    source: str
+    caption: str
+
+
+def labelled(images: LabelledImages, rows: Sequence[int], names: Sequence[str]) -> list[Picture]:
+    """Images with their true boxes."""
+    pictures = []
+    for row in rows:
+        own = images.labels[row] >= 0
+        boxes, labels = images.boxes[row][own], images.labels[row][own]
+        shown = [str(names[label]) for label in labels.tolist()]
+        pictures.append(Picture(_drawn(images.images[row], boxes, labels), ", ".join(shown) or "no box"))
+    return pictures
+
+
+def detected(
+    images: LabelledImages,
+    rows: Sequence[int],
+    detections: Sequence[Mapping[str, Tensor]],
+    names: Sequence[str],
+) -> list[Picture]:
+    """Images with their true boxes, thin and white, below the best detections, as many as there are objects."""
+    pictures = []
+    for row in rows:
+        truth = images.boxes[row][images.labels[row] >= 0]
+        best = _best(detections[row], len(truth))
+        parts = zip(best["labels"].tolist(), best["scores"].tolist(), strict=True)
+        caption = ", ".join(f"{names[label]} {score:.2f}" for label, score in parts) or "nothing"
+        picture = _drawn(images.images[row], best["boxes"], best["labels"], truth)
+        pictures.append(Picture(picture, caption))
+    return pictures
+
+
+def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor) -> bool:
+    """Whether an image's best detections, as many as it has objects, are these objects: each of the right class, with
+    an overlap of ``OVERLAP``. Without objects, whether nothing scores ``SHOWN``."""
+    best = _best(detections, len(boxes))
+    if not len(boxes):
+        return not len(best["scores"])
+    if len(best["boxes"]) < len(boxes):
+        return False
+    same = best["labels"][:, None] == labels[None, :]
+    hits = ((box_iou(best["boxes"].float(), boxes.float()) >= OVERLAP) & same).numpy()
+    return bool(hits[linear_sum_assignment(hits, maximize=True)].all())
+
+
+def _best(detections: Mapping[str, Tensor], objects: int) -> dict[str, Tensor]:
+    order = detections["scores"].argsort(descending=True, stable=True)
+    order = order[:objects] if objects else order[detections["scores"][order] >= SHOWN]
+    return {key: detections[key][order] for key in ("boxes", "labels", "scores")}
+
+
+def _drawn(image: Tensor, boxes: Tensor, labels: Tensor, truth: Tensor | None = None) -> str:
+    pixels = image.detach().clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
+    picture = Image.fromarray(pixels)
+    scale = max(1, -(-SHORTEST // min(picture.size)))
+    picture = picture.resize((scale * picture.width, scale * picture.height), Image.Resampling.BICUBIC)
+    pen = ImageDraw.Draw(picture)
+    for box in [] if truth is None else (scale * truth).tolist():
+        pen.rectangle(box, outline="white", width=2)
+    for box, label in zip((scale * boxes).tolist(), labels.tolist(), strict=True):
+        pen.rectangle(box, outline=CLASS_COLOURS[label % len(CLASS_COLOURS)], width=3)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=85)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,212 @@
+"""report.html of a run: whether it worked, what was learned, how far to trust it, what it cost, what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neural_sim.report.page import charts, pictures, render
+from neural_sim.report.page.pictures import Picture
+from neural_sim.report.page.steps import step_rows
+from neural_sim.report.page.verdict import Gain, gain_of, listed, verdict
+from neural_sim.report.page.weak_bins import BinScore, bin_scores, weakest
+from neural_sim.report.run import RunResults
+from neural_sim.types import LabelledImages
+
+FILE = "report.html"
+PER_OBJECT = {True: 6, False: 2}
+"""Training images shown of an object that is biased, and of another."""
+EXAMPLES = 8
+"""Detections shown of a kind."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Images for the page. ``before`` and ``after`` are training images from the initial and the learned distribution,
+    drawn with the same random numbers, an equal number of every object in the order of their labels. ``detections``
+    are those of ns, learned and matched on ``test``; empty without scores."""
+
+    before: LabelledImages
+    after: LabelledImages
+    test: LabelledImages
+    detections: Mapping[str, Sequence[Mapping[str, Tensor]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PsiChart:
+    """One object's distribution of a factor: the chart, and the distances from the target."""
+
+    name: str
+    chart: str
+    initial: float
+    learned: float
+
+
+@dataclass(frozen=True)
+class FactorCharts:
+    """The charts of a factor, with the colours of its bins."""
+
+    factor: str
+    colours: tuple[str, ...]
+    charts: tuple[PsiChart, ...]
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """AP of a class, fractions by which detector (None: the test set lacks the class)."""
+
+    name: str
+    biased: bool
+    ap: Mapping[str, float | None]
+
+
+def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str], folder: Path) -> Path:
+    """Write report.html, without references to other files but links to its neighbours in ``folder``.
+
+    ``commands`` are what to run next, by what it does.
+    """
+    names, scored = list(results.names), bool(shown.detections)
+    aim = list(results.biased) or names
+    gains = _gains(results, aim, shown) if scored else {}
+    scores = bin_scores(names, shown.detections, shown.test) if scored else []
+    path = folder / FILE
+    path.write_text(
+        render.page(
+            "run.html",
+            title=f"{results.experiment}: {results.method}, seed {results.seed}",
+            results=results,
+            verdict=verdict(gains.get("aim")),
+            outcome=gains["aim"].outcome if gains else "not scored",
+            others=gains.get("others"),
+            lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
+            psi=_psi(results),
+            rows=_score_rows(results),
+            curve=_curve(results, aim),
+            aim=listed(aim),
+            before=_training(shown.before, results),
+            after=_training(shown.after, results),
+            examples=_examples(shown, names) if scored else {},
+            steps=step_rows(results.records, names),
+            trust=results.document()["certificates"],
+            bins=_by_object(scores),
+            weak=weakest([s for s in scores if s.name in aim]),
+            commands=commands,
+            files=_files(folder),
+        ),
+        encoding="utf-8",
+    )
+    return path
+
+
+def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, Gain]:
+    """Of the objects that the run is about, of all others, and of each of these that certainly lost."""
+    names = list(results.names)
+    same = {name: _same(results, label) for label, name in enumerate(names)}
+
+    def gain(of: Sequence[str]) -> Gain:
+        labels = [names.index(name) for name in of if _present(shown.test, names.index(name))]
+        present = [names[label] for label in labels]
+        return gain_of(present, labels, shown.detections, shown.test, all(same[name] for name in names))
+
+    present = [name for name in names if _present(shown.test, names.index(name))]
+    gains = {"aim": gain([name for name in aim if name in present] or present)}
+    others = [name for name in present if name not in aim]
+    if others:
+        gains["others"] = gain(others)
+        each = {name: gain([name]) for name in others}
+        gains |= {f"lost:{name}": g for name, g in each.items() if g.outcome == "worse"}
+    return gains
+
+
+def _present(test: LabelledImages, label: int) -> bool:
+    return bool((test.labels == label).any())
+
+
+def _same(results: RunResults, label: int) -> bool:
+    """Whether an object's initial distribution is its target's."""
+    p = results.probabilities
+    return all(torch.equal(p["initial"][f][label], p["target"][f][label]) for f in results.factors)
+
+
+def _psi(results: RunResults) -> list[FactorCharts]:
+    """The biased objects' charts first; none where nothing was learned."""
+    distances = results.total_variations()
+    order = sorted(range(len(results.names)), key=lambda label: results.names[label] not in results.biased)
+    drawn = []
+    for factor in results.factors if results.records else ():
+        learned, target = (results.probabilities[which][factor] for which in ("learned", "target"))
+        panels = []
+        for label in order:
+            name = results.names[label]
+            history = [*(record["probabilities"][factor][label] for record in results.records)]
+            history.append(learned[label].tolist())
+            chart = charts.psi_chart(history, target[label].tolist(), results.groups(name, factor), factor)
+            panels.append(PsiChart(name, chart, **distances[name][factor]))
+        drawn.append(FactorCharts(factor, tuple(charts.bin_colours(factor, target.shape[-1])), tuple(panels)))
+    return drawn
+
+
+def _score_rows(results: RunResults) -> list[ScoreRow]:
+    """Biased objects first, the mean last."""
+
+    def row(name: str, values: Mapping[str, float]) -> ScoreRow:
+        known = {which: value if value == value else None for which, value in values.items()}
+        return ScoreRow(name, name in results.biased, known)
+
+    order = sorted(results.names, key=lambda name: name not in results.biased)
+    rows = [row(name, {w: s["per_class"][name] for w, s in results.ap.items()}) for name in order]
+    return [*rows, row("mean", {w: s["ap"] for w, s in results.ap.items()})] if results.ap else []
+
+
+def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
+    if len(results.curve) < 2:
+        return None
+    bounds = {}
+    if "matched" in results.ap:
+        per_class = results.ap["matched"]["per_class"]
+        bounds = {"matched": sum(per_class[name] for name in aim) / len(aim)}
+    return charts.curve_chart(results.curve, list(aim), bounds)
+
+
+def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
+    """The first few images of every object."""
+    each = len(images) // len(results.names)
+    rows = []
+    for label, name in enumerate(results.names):
+        count = min(each, PER_OBJECT[name in results.biased or not results.biased])
+        rows += range(label * each, label * each + count)
+    return pictures.labelled(images, rows, results.names)
+
+
+def _examples(shown: Shown, names: Sequence[str]) -> dict[str, list[Picture]]:
+    """Test images by what the training on the learned distribution changed, a few of each kind spread over the set."""
+    test, kinds = shown.test, {"won": [], "lost": [], "still wrong": [], "right": []}
+    for row in range(len(test)):
+        own = test.labels[row] >= 0
+        truth = test.boxes[row][own], test.labels[row][own]
+        before, after = (pictures.right(shown.detections[which][row], *truth) for which in ("ns", "learned"))
+        kind = ("right" if before else "won") if after else ("lost" if before else "still wrong")
+        kinds[kind].append(row)
+    found = {}
+    for kind, rows in kinds.items():
+        chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(EXAMPLES, len(rows))).round().long()]
+        title = f"{kind} ({len(rows)} of {len(test)})"
+        found[title] = pictures.detected(test, chosen, shown.detections["learned"], names)
+    return found
+
+
+def _by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
+    grouped: dict[str, list[BinScore]] = {}
+    for score in scores:
+        grouped.setdefault(score.name, []).append(score)
+    return grouped
+
+
+def _files(folder: Path) -> list[str]:
+    """What a reader may open next, of what the run has left."""
+    wanted = ("results.json", "detections.json", "training_set/annotations.json", "model.json", "model.onnx")
+    return [name for name in wanted if (folder / name).exists()]

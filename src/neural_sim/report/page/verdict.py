@@ -1,0 +1,110 @@
+"""Whether a run worked, as numbers with intervals and in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from neural_sim.report.bootstrap import match
+from neural_sim.report.statistics import Estimate, estimates, mean_ap, resampled
+from neural_sim.types import LabelledImages
+
+Outcome = Literal["better", "worse", "no difference", "not scored"]
+WHICH: tuple[str, ...] = ("ns", "learned", "matched")
+PERCENT = 100.0
+
+
+@dataclass(frozen=True)
+class Gain:
+    """AP of a set of classes, as fractions.
+
+    ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % bootstrap intervals over test images.
+    ``room`` is None where matched and ns are one distribution.
+    """
+
+    names: tuple[str, ...]
+    ap: Mapping[str, float]
+    gain: Estimate
+    room: Estimate | None
+
+    @property
+    def outcome(self) -> Outcome:
+        """What the interval of the gain allows to say."""
+        if not self.gain.certain:
+            return "no difference"
+        return "better" if self.gain.value > 0.0 else "worse"
+
+    @property
+    def closed(self) -> float | None:
+        """Fraction of the room that the gain fills; None where the room's interval includes 0."""
+        if self.room is None or not self.room.certain or self.room.value <= 0.0:
+            return None
+        return self.gain.value / self.room.value
+
+
+def gain_of(
+    names: Sequence[str],
+    labels: Sequence[int],
+    detections: Mapping[str, Sequence[Mapping[str, Tensor]]],
+    test: LabelledImages,
+    same_target: bool,
+    draws: int = 200,
+) -> Gain:
+    """The gain of the classes ``labels``, called ``names``, by detections of ns, learned and matched on the test set.
+
+    ``same_target``: the target's distribution is the initial one.
+    """
+    matches = [[match(detections[which], test, label) for label in labels] for which in WHICH]
+    point = np.asarray([mean_ap(classes) for classes in matches])
+    spread = resampled([matches], draws, seed=0)
+    gain, room = estimates(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
+    ap = dict(zip(WHICH, point.tolist(), strict=True))
+    return Gain(tuple(names), ap, gain, None if same_target else room)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a sentence has them: ``a, b and c``."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def interval(estimate: Estimate) -> str:
+    """Bounds in points of AP: ``20.1 to 27.3``."""
+    if estimate.low is None or estimate.high is None:
+        return "no interval"
+    return f"{PERCENT * estimate.low:.1f} to {PERCENT * estimate.high:.1f}"
+
+
+def negated(estimate: Estimate) -> Estimate:
+    """Minus the value, with its interval."""
+    low, high = (None if bound is None else -bound for bound in (estimate.high, estimate.low))
+    return Estimate(-estimate.value, low, high)
+
+
+def verdict(gain: Gain | None) -> str:
+    """One sentence for the top of the page."""
+    if gain is None:
+        return "The detectors were not scored on test images, so whether it worked is not known."
+    points, bounds, who = PERCENT * gain.gain.value, interval(gain.gain), listed(gain.names)
+    reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
+    if gain.outcome == "better":
+        text = (
+            f"It worked: training on the learned distribution gives {points:.1f} AP more on {who} ({bounds})"
+        )
+        return f"{text}, from {reached}{_of_the_room(gain)}."
+    if gain.outcome == "worse":
+        bounds = interval(negated(gain.gain))
+        return f"It made things worse: training on the learned distribution costs {-points:.1f} AP on {who} ({bounds})."
+    text = f"No difference can be told: the learned distribution changes the AP of {who} by {points:+.1f} ({bounds})"
+    return f"{text}{_of_the_room(gain)}."
+
+
+def _of_the_room(gain: Gain) -> str:
+    if gain.room is None:
+        return ""
+    if gain.closed is None:
+        return f"; the target's own distribution would give {PERCENT * gain.room.value:+.1f} ({interval(gain.room)})"
+    return f", {gain.closed:.0%} of what the target's own distribution would give"

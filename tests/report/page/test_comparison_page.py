@@ -1,0 +1,45 @@
+"""The page of a comparison, on estimates that are given."""
+
+import re
+
+import pytest
+from matplotlib.figure import Figure
+
+from neural_sim.report.page.comparison_page import Section, verdict, write_comparison_page
+from neural_sim.report.statistics import Comparison, Estimate
+
+
+@pytest.fixture
+def comparison():
+    methods = ("ours", "first", "second", "third")
+    ahead = {
+        "first": Estimate(0.2, 0.1, 0.3),
+        "second": Estimate(-0.1, -0.2, -0.05),
+        "third": Estimate(0.01, -0.1, 0.1),
+    }
+    return Comparison(
+        "gap", (0, 1), methods, "ours", {m: Estimate(0.5, 0.4, 0.6) for m in (*methods, "ns", "matched")},
+        {m: Estimate(0.9, 0.8, 1.0) for m in methods}, ahead, {"first": Estimate(0.2, 0.1, 0.3)},
+        {m: {"images": 10.0, "detector_steps": 5.0, "products": 1.0, "seconds": 7.0} for m in methods},
+        {m: Estimate(0.45) for m in methods}, 6.0,
+    )  # fmt: skip
+
+
+def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
+    assert verdict(comparison) == (
+        "ours reaches 50.0 AP (40.0 to 60.0), ahead of first by 20.0, behind second by 10.0, "
+        "not told apart from third."
+    )
+
+
+def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
+    page = write_comparison_page(
+        [Section(comparison, Figure(figsize=(2, 2)), "size=<1>", ["mug"])],
+        {"older & smaller": ["a run"]},
+        tmp_path,
+    ).read_text()
+    assert "size=&lt;1&gt;" in page and "older &amp; smaller" in page  # escaped
+    assert all(f"<th>{method}</th>" in page for method in comparison.methods)
+    assert "data:image/svg+xml;base64," in page and not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert '<td class="accepted">\n20.0' in page or re.search(r'class="accepted">\s*20\.0', page)
+    assert re.search(r'class="rejected">\s*-10\.0', page)

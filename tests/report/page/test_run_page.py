@@ -1,0 +1,133 @@
+"""report.html: self-contained, with every part that the run has, and readable by a browser."""
+
+import dataclasses
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+from neural_sim.report.page.run_page import Shown, write_run_page
+from neural_sim.report.run import RunResults
+from neural_sim.types import LabelledImages
+
+IMAGES = 24
+COMMANDS = {"To compare": "python -m src.main +experiment=compare 'compare.experiments=[gap]'"}
+
+
+def images(count, each):
+    """Squares of two classes, ``each`` of a class in turn."""
+    boxes = torch.tensor([[4.0, 4.0, 20.0, 20.0]]).expand(count, 1, 4)
+    labels = (torch.arange(count) // each % 2)[:, None]
+    return LabelledImages(torch.rand(count, 3, 24, 24), boxes, labels, torch.arange(count) % 2)
+
+
+def detections(test, hits):
+    return [
+        {
+            "boxes": test.boxes[i] + (0.0 if i % 4 < hits else 18.0),
+            "labels": test.labels[i],
+            "scores": torch.ones(1),
+        }
+        for i in range(len(test))
+    ]
+
+
+@pytest.fixture
+def shown():
+    torch.manual_seed(0)
+    test = images(IMAGES, 12)
+    found = {which: detections(test, hits) for which, hits in {"ns": 1, "learned": 3, "matched": 4}.items()}
+    return Shown(images(12, 6), images(12, 6), test, found)
+
+
+@pytest.fixture
+def results():
+    uniform = torch.full((2, 4), 0.25, dtype=torch.float64)
+    peaked = torch.tensor([[0.85, 0.05, 0.05, 0.05], [0.25] * 4], dtype=torch.float64)
+    certificate = {"p_values": {"mug": {"pose": 0.01}, "can": {"pose": 0.4}}, "doubts": [], "cosine": float("nan"),
+                   "actions": {"mug": {"pose": "kept"}, "can": {"pose": "skipped"}}}  # fmt: skip
+    record = {"probabilities": {"pose": uniform.tolist()}, "certificate": certificate, "verdicts": {},
+              "images_without_box": 0}  # fmt: skip
+    judged = {"mug": {"accepted": True, "expected_gain": 0.1, "measured_gain": 0.2, "error": 0.01}}
+    last = {**record, "certificate": None, "verdicts": judged}
+    scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"mug": 0.6, "can": 0.4}, "per_class_ap50": {}}
+    points = [
+        {"iteration": i, "images": 9 * i, "detector_steps": i, "seconds": 2.0 * i, "ap": scores}
+        for i in (0, 2)
+    ]
+    return RunResults(
+        "gap", "neural_sim", 3, ("mug", "can"), ("mug",),
+        {"initial": {"pose": uniform}, "learned": {"pose": peaked}, "target": {"pose": peaked}}, [record, last],
+        {"ns": scores, "learned": scores, "matched": scores}, {}, {"psi": 1.5, "evaluate": 2.5},
+        {"peak_memory_mb": 512.0},
+        [{"stage": "psi", "what": "the <renderer>", "why": "not needed", "fraction": 0.5, "seconds": None}],
+        {"seed": 3}, 0.25, points,
+    )  # fmt: skip
+
+
+class Headings(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.found, self.inside = [], False
+
+    def handle_starttag(self, tag, attrs):
+        self.inside = tag == "h2"
+
+    def handle_data(self, data):
+        if self.inside and data.strip():
+            self.found.append(data.strip())
+
+
+def headings(page):
+    parser = Headings()
+    parser.feed(page)
+    return parser.found
+
+
+def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, shown, tmp_path):
+    (tmp_path / "results.json").write_text("{}")
+    page = write_run_page(results, shown, COMMANDS, tmp_path).read_text()
+    assert headings(page) == [
+        "Detectors", "What was learned", "Training images", "Detections on test images", "What is still weak",
+        "How far to trust it", "What it cost", "Next",
+    ]  # fmt: skip
+    assert "It worked: training on the learned distribution gives" in page and "on mug" in page
+    assert re.findall(r'href="([^"]*)"', page) == ["results.json"]
+    assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
+    assert "compare.experiments=[gap]" in page and "the &lt;renderer&gt;" in page
+    # 6 of 24 images were right before, 18 are now.
+    assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
+    assert "Lost (" not in page and 'title="pose: p = 0.01; expected gain 10.0, measured 20.0' in page
+
+
+def test_a_run_without_scores_and_without_steps_says_so(results, shown, tmp_path):
+    bare = dataclasses.replace(results, ap={}, curve=(), records=[])
+    page = write_run_page(bare, dataclasses.replace(shown, detections={}), {}, tmp_path).read_text()
+    assert headings(page) == ["Training images", "What it cost", "Next"]
+    assert "whether it worked is not known" in page
+
+
+def test_a_class_that_the_test_set_lacks_has_no_verdict(results, shown, tmp_path):
+    one = dataclasses.replace(shown.test, labels=torch.zeros_like(shown.test.labels))
+    page = write_run_page(results, dataclasses.replace(shown, test=one), {}, tmp_path).read_text()
+    assert "The other objects" not in page and "on mug" in page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1200, 390])
+def test_a_browser_shows_the_page_without_a_sideways_scroll(results, shown, tmp_path, width):
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium")
+    page = write_run_page(results, shown, COMMANDS, tmp_path)
+    probe = "<script>document.title = [innerWidth, document.documentElement.scrollWidth, document.images.length, " \
+        "[...document.images].filter(i => i.naturalWidth).length].join()</script></body>"  # fmt: skip
+    page.write_text(page.read_text().replace("</body>", probe).replace('loading="lazy"', ""))
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--dump-dom",
+               "--virtual-time-budget=3000", page.as_uri()]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    inner, scroll, count, _ = map(int, re.search(r"<title>([\d,]+)</title>", done.stdout).group(1).split(","))
+    assert scroll <= inner and count > 20
