@@ -93,7 +93,9 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
     printed = capsys.readouterr().out
     assert text.strip() in printed and logged.where_runs(database, "gap") in printed
     page = tmp_path / "report.html"
-    assert printed.strip().endswith(f"open {page}") and "neural_sim reaches 74.3 AP" in page.read_text()
+    assert (
+        printed.strip().endswith(f"open {page}") and "neural_sim reaches 75.2 AP" in page.read_text()
+    )  # 76 of 101 recalls
     (own,) = logged.runs(database, "compare")
     assert own.status == "FINISHED" and {"compare.md", "compare.json", "figures"} <= own.files
 

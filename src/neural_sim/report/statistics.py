@@ -199,6 +199,8 @@ def estimates(
     point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
 ) -> list[Estimate]:
     """Values with the 2.5 % and 97.5 % quantiles of their bootstrap draws, of those that have a value."""
+    if not len(point):  # of which nanquantile has no bounds
+        return []
     low, high = np.nanquantile(spread, [0.025, 0.975], axis=0)
     return [Estimate(float(p), float(a), float(b)) for p, a, b in zip(point, low, high, strict=True)]
 
