@@ -85,8 +85,8 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
-        predicts = config["stages"] == ["predict"]
-        check = _predict if predicts else kinds.get(next((key for key in kinds if key in config), ""), _run)
+        alone = {"predict": _predict, "preflight": _preflight}.get(config["stages"][0])
+        check = alone or kinds.get(next((key for key in kinds if key in config), ""), _run)
         check(job, config)
 
 
@@ -128,6 +128,8 @@ def _run(folder, config):
         for image in made["images"]
     )
 
+    page = (folder / "report.html").read_text()
+    assert "What was learned" in page or not results["iterations"]
     _model(folder, config, list(results["psi"]))
 
 
@@ -148,6 +150,15 @@ def _predict(folder, config):
     assert all((folder / "pictures" / image["file_name"]).is_file() for image in images)
     scored = config["predict"]["annotations"] is not None
     assert (folder / "scores.json").exists() == scored
+
+
+def _preflight(folder, config):
+    """usage.md, Before an optimisation."""
+    report = json.loads((folder / "preflight.json").read_text())
+    assert {one["name"] for one in report["foreseen"]} == set(report["names"])
+    bins = config["parameter"]["pose"]["bins"]
+    assert all(len(one["by_bin"]) == len(one["by_bin_error"]) == bins for one in report["foreseen"])
+    assert report["verdict"] in (folder / "preflight.html").read_text()
 
 
 def _comparison(folder, config):

@@ -113,8 +113,9 @@ def context_of(config: DictConfig, folder: Path) -> tuple[Context, dict[str, Ste
             known = [*STEPS, *(key for key, value in plain.items() if _is_step(value))]
             raise UserError(f"stages: unknown stage {name!r}, want some of {', '.join(known)}")
         others[name] = _instantiate(node, name)
-    context = Context(plain, folder, lambda: _build(plain), tuple(plain["stages"]))
-    if set(plain["stages"]) & set(STEPS):
+    wanted = {*plain["stages"], *(name for step in others.values() for name in getattr(step, "needs", ()))}
+    context = Context(plain, folder, lambda: _build(plain), (*(n for n in STEPS if n in wanted), *others))
+    if wanted & set(STEPS):
         _ = context.experiment
     return context, others
 

@@ -100,7 +100,7 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
     assert "compare.experiments=[gap]" in page and "the &lt;renderer&gt;" in page
     # 6 of 24 images were right before, 18 are now.
     assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
-    assert "Lost (" not in page and 'title="pose: p = 0.01; expected gain 10.0, measured 20.0' in page
+    assert "Lost (" not in page and 'title="pose: p = 0.01; expected fall of the outer loss 0.100; ' in page
 
 
 def test_a_run_without_scores_and_without_steps_says_so(results, shown, tmp_path):

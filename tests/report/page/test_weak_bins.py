@@ -32,8 +32,9 @@ def test_a_bin_scores_on_its_own_images():
     scores = bin_scores(["a", "b"], found, images(bins, labels))
     # Bin 4 of b has three images only.
     assert [(s.name, s.bin, s.images) for s in scores] == [("a", 1, 10), ("a", 2, 10), ("b", 1, 5)]
-    assert [s.start for s in scores] == [0.0] * 3
-    assert [s.learned for s in scores] == pytest.approx([1.0, 0.5, 0.6], abs=0.02)
+    assert [s.ap["ns"] for s in scores] == [0.0] * 3
+    assert [s.last for s in scores] == pytest.approx([1.0, 0.5, 0.6], abs=0.02)
+    assert [s.change for s in scores] == [s.last for s in scores]
     assert [s.fraction for s in scores] == [0.5, 0.5, 5 / 8]
     # 5 of b's 8 images lack 0.4, 10 of a's 20 lack 0.5.
     assert weakest(scores, 2) == [scores[2], scores[1]]

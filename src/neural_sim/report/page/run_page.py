@@ -13,7 +13,7 @@ from neural_sim.report.page import charts, pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
 from neural_sim.report.page.verdict import Gain, gain_of, listed, verdict
-from neural_sim.report.page.weak_bins import BinScore, bin_scores, weakest
+from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
 from neural_sim.report.run import RunResults
 from neural_sim.types import LabelledImages
 
@@ -72,7 +72,8 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
     names, scored = list(results.names), bool(shown.detections)
     aim = list(results.biased) or names
     gains = _gains(results, aim, shown) if scored else {}
-    scores = bin_scores(names, shown.detections, shown.test) if scored else []
+    both = {which: shown.detections[which] for which in ("ns", "learned")} if scored else {}
+    scores = bin_scores(names, both, shown.test) if scored else []
     path = folder / FILE
     path.write_text(
         render.page(
@@ -92,7 +93,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
             examples=_examples(shown, names) if scored else {},
             steps=step_rows(results.records, names),
             trust=results.document()["certificates"],
-            bins=_by_object(scores),
+            bins=by_object(scores),
             weak=weakest([s for s in scores if s.name in aim]),
             commands=commands,
             files=_files(folder),
@@ -197,13 +198,6 @@ def _examples(shown: Shown, names: Sequence[str]) -> dict[str, list[Picture]]:
         title = f"{kind} ({len(rows)} of {len(test)})"
         found[title] = pictures.detected(test, chosen, shown.detections["learned"], names)
     return found
-
-
-def _by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
-    grouped: dict[str, list[BinScore]] = {}
-    for score in scores:
-        grouped.setdefault(score.name, []).append(score)
-    return grouped
 
 
 def _files(folder: Path) -> list[str]:

@@ -70,9 +70,8 @@ def _cell(certificate: Mapping[str, Any], verdict: Mapping[str, Any] | None, nam
         kinds = set(actions.values())
         shown: list[Kind] = [kind for action, kind in _UNJUDGED.items() if action in kinds]
         return StepCell(shown[0] if shown else "none", "; ".join(parts))
-    gains = (
-        f"expected gain {100 * verdict['expected_gain']:.1f}, measured {100 * verdict['measured_gain']:.1f}"
-    )
-    parts.append(f"{gains} ± {100 * verdict['error']:.1f} points of the objective")
+    expected = f"expected fall of the outer loss {verdict['expected_gain']:.3f}"
+    measured = f"measured rise of the object's score {verdict['measured_gain']:.3f} ± {verdict['error']:.3f}"
+    parts += [expected, measured]
     judged: Kind = "accepted" if verdict["accepted"] else "rejected"
     return StepCell(judged, "; ".join(parts))

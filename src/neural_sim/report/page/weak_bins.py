@@ -15,22 +15,32 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class BinScore:
-    """AP (a fraction) of an object on the test images that show it from one bin (from 1), for two detectors.
+    """AP (a fraction) of an object on the images that show it from one bin (from 1), by detector, the one in question
+    last.
 
-    ``fraction`` is the part of the object's test images that are from this bin.
+    ``fraction`` is the part of the object's images that are from this bin.
     """
 
     name: str
     bin: int
     images: int
     fraction: float
-    start: float
-    learned: float
+    ap: Mapping[str, float]
+
+    @property
+    def last(self) -> float:
+        """AP of the detector in question."""
+        return [*self.ap.values()][-1]
+
+    @property
+    def change(self) -> float:
+        """From the first detector to the last."""
+        return self.last - next(iter(self.ap.values()))
 
     @property
     def missing(self) -> float:
         """What this bin takes from the object's AP: its part of the images times the AP that it lacks."""
-        return self.fraction * (1.0 - self.learned)
+        return self.fraction * (1.0 - self.last)
 
 
 def bin_scores(
@@ -39,25 +49,34 @@ def bin_scores(
     test: LabelledImages,
     at_least: int = 5,
 ) -> list[BinScore]:
-    """Every object's bins with ``at_least`` test images or more, by detections of ns and learned. Images of unknown
-    bins are left out."""
+    """Every object's bins with ``at_least`` images or more, by the detections of each detector. Images of unknown bins
+    are left out."""
     scores = []
     for label, name in enumerate(names):
-        matches = {which: match(detections[which], test, label) for which in ("ns", "learned")}
+        matches = {which: match(found, test, label) for which, found in detections.items()}
         shown = _bins_shown(test, label)
         total = int(shown.any(-1).sum())
         for column in range(shown.shape[1]):
             rows = shown[:, column]
             count = int(rows.sum())
             if count >= at_least:
-                start, learned = (average_precision(m, rows.double().numpy()) for m in matches.values())
-                scores.append(BinScore(name, column + 1, count, count / total, start, learned))
+                weights = rows.double().numpy()
+                ap = {which: average_precision(m, weights) for which, m in matches.items()}
+                scores.append(BinScore(name, column + 1, count, count / total, ap))
     return scores
 
 
 def weakest(scores: Sequence[BinScore], count: int = 3) -> list[BinScore]:
     """The bins that take most from their objects' AP, the worst first."""
     return sorted(scores, key=lambda score: -score.missing)[:count]
+
+
+def by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
+    """The bins of each object."""
+    grouped: dict[str, list[BinScore]] = {}
+    for score in scores:
+        grouped.setdefault(score.name, []).append(score)
+    return grouped
 
 
 def _bins_shown(test: LabelledImages, label: int) -> Bool[Tensor, "images bins"]:

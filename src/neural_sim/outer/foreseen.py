@@ -1,0 +1,99 @@
+"""What steps of psi would bring, to first order, before any is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.outer.checked import Average, within
+from neural_sim.outer.descent import GradientLoop
+from neural_sim.outer.steps import stacked
+from neural_sim.parameter.product import SceneDistribution
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """The expected fall of L_val by one object and factor, to first order, with standard errors.
+
+    ``by_bin``: when the fraction ``moved`` of the object's images moves to each bin (or light), all others losing it
+    in proportion; ``step``: by the step of a trust region of this radius along the derivative. ``p_value`` is that of
+    the null that the derivative is zero.
+    """
+
+    name: str
+    factor: str
+    p_value: float
+    moved: float
+    by_bin: tuple[float, ...]
+    by_bin_error: tuple[float, ...]
+    step: float
+    step_error: float
+
+
+def foresee(loop: GradientLoop, trials: int, moved: float, radius: float) -> list[Foreseen]:
+    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move.
+
+    Raises:
+        ValueError: no trial, or a fraction or radius outside (0, 1].
+    """
+    if trials < 1 or not 0.0 < moved <= 1.0 or not 0.0 < radius <= 1.0:
+        raise ValueError(f"want trials >= 1, moved and radius in (0, 1], got {trials}, {moved}, {radius}")
+    results = []
+    for _ in range(trials):
+        results.append(loop.derivative())
+        loop.inner.renew()
+    return expected(
+        results,
+        loop.scene.distribution,
+        loop.psi.detach(),
+        loop.scene.names,
+        moved,
+        radius,
+        loop.settings.checks.max_step,
+    )
+
+
+def expected(
+    results: list[Hypergradient],
+    distribution: SceneDistribution,
+    psi: Float[Tensor, "objects K"],
+    names: tuple[str, ...],
+    moved: float,
+    radius: float,
+    max_step: float,
+) -> list[Foreseen]:
+    """The averages of derivatives at one psi; arguments as for :func:`foresee`."""
+    parts, found = distribution.split(psi), []
+    for factor in distribution.factors:
+        own = parts[factor.name]
+        p, scale = factor.p_of(own), factor.log_probabilities(own).exp()
+        average = Average.zeros(own)
+        for result in results:
+            gradient, error = (distribution.split(v)[factor.name] for v in stacked(result, names, psi))
+            # By p, as in CheckedSteps: the derivative by logits is p times it.
+            direction = -gradient / scale
+            direction = direction - direction.mean(-1, keepdim=True)
+            average = average.joined(direction, (error / scale).square(), 1.0)
+        variance = average.noise / average.weight.square().clamp_min(torch.finfo(own.dtype).tiny)
+        bins = torch.eye(p.shape[-1], dtype=p.dtype)
+        toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]
+        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius), max_step)) - p
+        gains, spread = _along(toward, average.value[:, None], variance[:, None])
+        step_gain, step_spread = _along(step, average.value, variance)
+        for i, name in enumerate(names):
+            found.append(
+                Foreseen(
+                    name, factor.name, float(average.p_values[i]), moved, tuple(gains[i].tolist()),
+                    tuple(spread[i].tolist()), float(step_gain[i]), float(step_spread[i]),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _along(change: Tensor, direction: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """The first-order gain of a change of p, and its standard error; components' errors are taken as independent."""
+    return (change * direction).sum(-1), (change.square() * variance).sum(-1).sqrt()

@@ -1,0 +1,86 @@
+"""What is known before an optimisation, and whether it is worth it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from neural_sim.outer.foreseen import Foreseen
+from neural_sim.report.page.verdict import listed
+from neural_sim.report.page.weak_bins import BinScore, weakest
+from neural_sim.target.mismatch import Mismatch
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """``foreseen``: gains of every object and factor, of which those count that are significant at ``level`` over all
+    of them. ``bins``: AP of the initial distribution's detector by bin of the validation images. ``settings`` would
+    match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None: they agree)."""
+
+    experiment: str
+    names: tuple[str, ...]
+    foreseen: tuple[Foreseen, ...]
+    level: float
+    bins: tuple[BinScore, ...]
+    mismatches: tuple[Mismatch, ...]
+    settings: Mapping[str, str]
+    distance_factor: float | None
+
+    @property
+    def promising(self) -> list[Foreseen]:
+        """Objects and factors of a significant derivative, by Holm's step-down procedure (1979), most gain first."""
+        ordered = sorted(self.foreseen, key=lambda f: f.p_value)
+        kept: list[Foreseen] = []
+        for place, one in enumerate(ordered):
+            if one.p_value > self.level / (len(ordered) - place):
+                break
+            kept.append(one)
+        return sorted(kept, key=lambda f: -f.step)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        if not self.promising:
+            return (
+                "Not worth optimising as it is configured: no object's derivative can be told from zero, so the loop "
+                "would not know where to go."
+            )
+        names = list(dict.fromkeys(f.name for f in self.promising))
+        gain = sum(f.step for f in self.promising)
+        return (
+            f"Worth optimising: {listed(names)} would gain. A first step of the trust region lowers the outer loss by "
+            f"{gain:.3f} to first order."
+        )
+
+    def summary(self) -> str:
+        """What is printed."""
+        lines = [self.verdict, f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin"]
+        for f in self.foreseen:
+            best = max(range(len(f.by_bin)), key=lambda b: f.by_bin[b])
+            gain = f"{best + 1} ({f.by_bin[best]:+.4f} ± {f.by_bin_error[best]:.4f} for {f.moved:.0%} of its images)"
+            lines.append(
+                f"{f.name[:13]:<14}{f.factor[:13]:<14}{f.p_value:>9.2g}{f.step:>9.4f}{f.step_error:>9.4f}  {gain}"
+            )
+        for score in weakest(self.bins):
+            lines.append(
+                f"weak: {score.name} from bin {score.bin}, AP {100 * score.last:.1f} on {score.images} images"
+            )
+        for m in self.differing:
+            lines.append(f"differs: {m.name}, target {m.target:.3g}, synthesised {m.synthesised:.3g}")
+        for advice in self.advice:
+            lines.append(f"would match: {advice}")
+        return "\n".join(lines)
+
+    @property
+    def differing(self) -> list[Mismatch]:
+        """The statistics that differ."""
+        return [m for m in self.mismatches if m.counts]
+
+    @property
+    def advice(self) -> list[str]:
+        """Settings that would match."""
+        lines = [f"'{key}={value}'" for key, value in self.settings.items()]
+        if self.distance_factor is not None:
+            keys = "unlearned.distance, or parameter=[zoom] to learn it"
+            lines.append(f"camera distances times {self.distance_factor:.2f} ({keys})")
+        return lines

@@ -1,0 +1,82 @@
+"""Stage ``preflight``: before any optimisation, whether it is worth it, and what else keeps images from the target."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neural_sim.outer.descent import GradientLoop
+from neural_sim.outer.foreseen import foresee
+from neural_sim.report.page.preflight_page import write_preflight_page
+from neural_sim.report.page.weak_bins import bin_scores
+from neural_sim.report.preflight import Preflight
+from neural_sim.stages.context import Context
+from neural_sim.target.mismatch import distance_factor, matching, mismatches
+
+
+@dataclass(frozen=True)
+class PreflightStep:
+    """The detector of the initial distribution by bin of the validation images, the expected gain of every object and
+    bin to first order, and how renders differ from the target. Views, fields, target sets and the warm start are
+    computed, or read from the store, where a later run finds them.
+
+    Args:
+        trials: trainings whose derivatives are averaged.
+        moved: fraction of an object's images that is moved to a bin for the gains by bin.
+
+    Raises:
+        ValueError: no trial, or a fraction outside (0, 1].
+    """
+
+    trials: int = 2
+    moved: float = 0.15
+
+    needs = ("views", "field", "target_sets", "warm_start")
+
+    def __post_init__(self) -> None:
+        if self.trials < 1:
+            raise ValueError(f"preflight.trials must be at least 1, got {self.trials}")
+        if not 0.0 < self.moved <= 1.0:
+            raise ValueError(f"preflight.moved must lie in (0, 1], got {self.moved}")
+
+    def run(self, context: Context) -> None:
+        """preflight.json and preflight.html to the run's folder, a summary to the screen.
+
+        Raises:
+            ValueError: a method without a derivative.
+        """
+        graph, results, x = context.graph, context.results, context.experiment
+        names, validation = list(graph.names), results(graph.targets).val
+        loop = graph.learned.loop(results)
+        if not isinstance(loop, GradientLoop):
+            raise ValueError(
+                f"preflight wants a method that follows the hypergradient, got baseline={x.loop.method.name}"
+            )
+        outer = x.loop.outer
+        foreseen = foresee(loop, self.trials, self.moved, outer.checks.radius)
+        detections = graph.warm_start.build().predict(results(graph.warm_start).params, validation.images)
+        images = graph.warm_start.images(results(graph.scene)).images.to("cpu")
+        differ = mismatches(validation, images)
+        level = 0.05 if outer.trust is None or outer.trust.level is None else outer.trust.level
+        report = Preflight(
+            experiment=x.run.name,
+            names=tuple(names),
+            foreseen=tuple(foreseen),
+            level=level,
+            bins=tuple(bin_scores(names, {"ns": detections}, validation)),
+            mismatches=tuple(differ),
+            settings=matching(validation, images, differ),
+            distance_factor=distance_factor(differ),
+        )
+        _write(context.folder / "preflight.json", report)
+        page = write_preflight_page(report, validation, images, context.folder)
+        print(report.summary())
+        print(f"is it worth it? open {page}")
+
+
+def _write(path: Path, report: Preflight) -> None:
+    document: dict[str, Any] = dataclasses.asdict(report) | {"verdict": report.verdict}
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")

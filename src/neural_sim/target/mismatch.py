@@ -1,0 +1,157 @@
+"""How synthesised images differ from a target's in size, place, number, light and sharpness, and what would match."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from scipy.stats import mannwhitneyu
+from torch import Tensor
+
+from neural_sim.synthesis.sensor import SensorDraw, seen_by
+from neural_sim.types import LabelledImages
+
+LEVEL = 0.01
+"""Family-wise level over all statistics."""
+LARGE = 0.2
+"""Distance of the probability below from one half from which a difference counts, beside its significance."""
+_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
+_BLURS = 25
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """One statistic of the target's images and of the synthesised ones, as medians.
+
+    ``larger`` is the probability that a random target image (or box) has a larger value than a random synthesised one,
+    0.5 without a difference (the Mann-Whitney statistic over its largest value), and ``p_value`` that of equality.
+    """
+
+    name: str
+    target: float
+    synthesised: float
+    larger: float
+    p_value: float
+    tests: int
+
+    @property
+    def counts(self) -> bool:
+        """Whether the difference is significant at the family-wise level (Bonferroni) and large."""
+        return self.p_value * self.tests <= LEVEL and abs(self.larger - 0.5) >= LARGE
+
+
+def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "values"]]:
+    """What is compared, a value for each image, or for each box where the name says so.
+
+    Sizes and offsets are in fractions of the image's size (of its area's root, and of its half diagonal), brightness
+    and contrast of sRGB values in [0, 1], noise and sharpness of luma.
+    """
+    height, width = images.images.shape[-2:]
+    present = images.present
+    boxes = images.boxes[present]
+    sides = boxes[:, 2:] - boxes[:, :2]
+    offset = 0.5 * (boxes[:, 2:] + boxes[:, :2]) - boxes.new_tensor([width / 2, height / 2])
+    luma = luma_of(images.images)
+    return {
+        "box size": sides.prod(-1).sqrt() / math.sqrt(width * height),
+        "box aspect": sides[:, 0] / sides[:, 1].clamp_min(1e-6),
+        "box offset": offset.norm(dim=-1) / (0.5 * math.hypot(width, height)),
+        "objects": present.sum(-1).double(),
+        "brightness": luma.mean((-2, -1)),
+        "contrast": luma.std((-2, -1)),
+        "saturation": (images.images.amax(1) - images.images.amin(1)).mean((-2, -1)),
+        "sharpness": sharpness(luma),
+        "noise": noise(luma),
+    }
+
+
+def mismatches(target: LabelledImages, synthesised: LabelledImages) -> list[Mismatch]:
+    """Every statistic that both have values of."""
+    pairs = [(name, mine, statistics(synthesised)[name]) for name, mine in statistics(target).items()]
+    pairs = [(name, mine, other) for name, mine, other in pairs if len(mine) and len(other)]
+    found = []
+    for name, mine, other in pairs:
+        test = mannwhitneyu(mine.double().numpy(), other.double().numpy())
+        larger = float(test.statistic) / (len(mine) * len(other))
+        found.append(
+            Mismatch(
+                name, float(mine.median()), float(other.median()), larger, float(test.pvalue), len(pairs)
+            )
+        )
+    return found
+
+
+def luma_of(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
+    """Weighted sum of the sRGB channels."""
+    return torch.einsum("nchw,c->nhw", images, images.new_tensor(_LUMA))
+
+
+def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
+    """Standard deviation of white noise, by Immerkaer's difference of two Laplacians (Fast Noise Variance Estimation,
+    1996), which does not see edges that are straight over three pixels. The median replaces the mean, so that texture
+    counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has the norm 6."""
+    mask = luma.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+    filtered = torch.nn.functional.conv2d(luma[:, None], mask[None, None])
+    return filtered.abs().flatten(1).median(1).values / (0.6745 * 6.0)
+
+
+def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
+    """Mean gradient of the steepest hundredth of pixels, which are edges, between neighbouring pixels."""
+    steps = torch.stack([luma[:, 1:, :-1] - luma[:, :-1, :-1], luma[:, :-1, 1:] - luma[:, :-1, :-1]]).norm(
+        dim=0
+    )
+    flat = steps.flatten(1)
+    count = max(1, flat.shape[1] // 100)
+    return flat.topk(count, dim=1).values.mean(1)
+
+
+def matching(
+    target: LabelledImages, synthesised: LabelledImages, found: list[Mismatch], largest_blur: float = 3.0
+) -> dict[str, str]:
+    """Settings that would match what differs, by key; those of ``synthesis`` whose effect is known."""
+    differs = {m.name: m for m in found if m.counts}
+    settings: dict[str, str] = {}
+    mine, other = statistics(target), statistics(synthesised)
+    level = 0.0
+    if "noise" in differs and differs["noise"].larger > 0.5:
+        own = other["noise"].median().square()
+        # Noise of channels that are independent: that of luma over the norm of its weights.
+        scale = math.hypot(*_LUMA)
+        low, high = (
+            float((mine["noise"].quantile(q).square() - own).clamp_min(0).sqrt() / scale) for q in (0.1, 0.9)
+        )
+        level = 0.5 * (low + high)
+        settings["synthesis.sensor.noise"] = f"[{low:.2g},{high:.2g}]"
+    if "sharpness" in differs and differs["sharpness"].larger < 0.5:
+        # One blur: the sharpness of images also varies with what they show.
+        blur = _blur_to(mine["sharpness"].median(), synthesised, largest_blur, level)
+        settings["synthesis.sensor.blur"] = f"[{blur:.2g},{blur:.2g}]"
+    if "objects" in differs:
+        low, high = (int(mine["objects"].quantile(q)) for q in (0.05, 0.95))
+        settings["synthesis.objects_per_image"] = f"[{low},{high}]"
+    return settings
+
+
+def distance_factor(found: list[Mismatch]) -> float | None:
+    """By what the distances of the camera would have to be multiplied for boxes of the target's size; None where sizes
+    agree. Sizes are inversely proportional to distance where objects are small against it."""
+    size: Mapping[str, Mismatch] = {m.name: m for m in found}
+    if "box size" not in size or not size["box size"].counts:
+        return None
+    return size["box size"].synthesised / size["box size"].target
+
+
+def _blur_to(wanted: Tensor, synthesised: LabelledImages, largest: float, level: float) -> float:
+    """The blur at which the synthesised images' median sharpness is ``wanted``, on a grid up to ``largest``. Noise of
+    the target's ``level``, which adds to the steps between pixels, is added after each."""
+    deviations, images = torch.linspace(0.0, largest, _BLURS), synthesised.images
+    grain = level * torch.randn(images.shape, generator=torch.Generator().manual_seed(0)).to(images)
+    reached = []
+    for deviation in deviations:
+        seen = SensorDraw(deviation.expand(len(images)), grain)
+        reached.append(float(sharpness(luma_of(seen_by(images, seen))).median()))
+    nearest = (torch.tensor(reached) - float(wanted)).abs().argmin()
+    return float(deviations[nearest])

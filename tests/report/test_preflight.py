@@ -1,0 +1,51 @@
+"""The verdict before an optimisation: what is significant over all objects, what is advised, and the page."""
+
+import re
+
+import torch
+
+from neural_sim.outer.foreseen import Foreseen
+from neural_sim.report.page.preflight_page import write_preflight_page
+from neural_sim.report.page.weak_bins import BinScore
+from neural_sim.report.preflight import Preflight
+from neural_sim.target.mismatch import Mismatch
+from neural_sim.types import LabelledImages
+
+
+def foreseen(name, p_value, step=0.1):
+    return Foreseen(name, "pose", p_value, 0.15, (step, -step), (0.01, 0.01), step, 0.02)
+
+
+def preflight(*p_values):
+    rows = tuple(foreseen(f"object {i}", p, 0.1 * (i + 1)) for i, p in enumerate(p_values))
+    bins = (BinScore("object 0", 1, 10, 0.5, {"ns": 0.8}), BinScore("object 0", 2, 10, 0.5, {"ns": 0.2}))
+    size = Mismatch("box size", 0.4, 0.2, 0.9, 1e-9, 2)
+    same = Mismatch("contrast", 0.2, 0.2, 0.5, 0.9, 2)
+    return Preflight(
+        "gap", ("object 0",), rows, 0.05, bins, (size, same), {"synthesis.sensor.blur": "[1,1]"}, 0.5
+    )
+
+
+def test_derivatives_count_by_the_level_over_all_of_them():
+    # Holm: 0.01 <= 0.05 / 4, 0.016 <= 0.05 / 3, 0.03 > 0.05 / 2; the last, smaller than 0.05, does not count either.
+    report = preflight(0.016, 0.01, 0.04, 0.03)
+    assert [f.name for f in report.promising] == ["object 1", "object 0"]
+    assert report.verdict.startswith("Worth optimising: object 1 and object 0") and "0.300" in report.verdict
+    assert preflight(0.02, 0.03, 0.04).verdict.startswith("Not worth optimising")
+
+
+def test_the_summary_has_gains_weak_bins_and_advice():
+    text = preflight(0.001, 0.5).summary()
+    assert "1 (+0.1000 ± 0.0100 for 15% of its images)" in text
+    assert "weak: object 0 from bin 2, AP 20.0 on 10 images" in text
+    assert "differs: box size" in text and "differs: contrast" not in text
+    assert "'synthesis.sensor.blur=[1,1]'" in text and "distances times 0.50" in text
+
+
+def test_the_page_is_self_contained(tmp_path):
+    images = LabelledImages(
+        torch.rand(4, 3, 24, 24), torch.zeros(4, 1, 4), torch.full((4, 1), -1), torch.zeros(4).long()
+    )
+    page = write_preflight_page(preflight(0.001, 0.5), images, images, tmp_path).read_text()
+    assert "Worth optimising: object 0" in page and "Box size differs" in page
+    assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
