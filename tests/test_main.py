@@ -30,11 +30,14 @@ def _run(folder, *arguments):
 def test_one_run_from_objects_to_a_report(tmp_path):
     done = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false")
     assert done.returncode == 0, done.stderr[-3000:]
-    command, address = done.stdout.splitlines()[-2:]
+    command, address, compare, _, page = done.stdout.splitlines()[-5:]
     assert command.startswith("mlflow ui --backend-store-uri sqlite:///")
     assert re.fullmatch(
         r"http://127\.0\.0\.1:5000/#/experiments/1/runs/\w{32}\?workflowType=machine_learning", address
     )
+    assert compare.endswith("python -m src.main +experiment=compare 'compare.experiments=[pose_gap]'")
+    assert page == f"did it work? open {tmp_path / 'run' / 'report.html'}"
+    assert "AP" in (tmp_path / "run" / "report.html").read_text()
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert {"experiment", "method", "seed", "psi", "ap", "seconds", "peak_memory_mb", "left_out"} <= set(
         results
