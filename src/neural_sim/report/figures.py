@@ -18,7 +18,9 @@ from neural_sim.types import LabelledImages
 matplotlib.use("Agg")
 
 INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
-METHOD_COLOURS = {"ns": "#c2c8cf", "learned": "#2f6db5", "matched": "#4c9f70"}
+METHOD_COLOURS = {
+    "ns": "#c2c8cf", "learned": "#2f6db5", "matched": "#4c9f70", "synthetic_only": "#9db8d9", "real_only": "#e08a1e",
+}  # fmt: skip
 CLASS_COLOURS = ("#2f6db5", "#e08a1e", "#4c9f70", "#b5417a", "#7b5cc4", "#b08d3c", "#3aa6b9", "#8c564b")
 
 
