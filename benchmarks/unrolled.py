@@ -27,9 +27,10 @@ from worlds import SMALL
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Parameters
+from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
-from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, probe_columns, step_weights
+from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
 from neural_sim.main import build, conf_directory
@@ -226,7 +227,7 @@ def few(
     scored: Float[Tensor, "steps k per_bin"], count: int, every: int, generator: torch.Generator
 ) -> Float[Tensor, "k"]:
     """The same from the few probes that the walk would have scored."""
-    turns, total = probe_columns(PER_BIN, count, generator), torch.zeros(scored.shape[1])
+    turns, total = shuffled_passes(PER_BIN, count, generator), torch.zeros(scored.shape[1])
     for step, weight in zip(scored, step_weights(len(scored), every, generator), strict=True):
         if weight:
             total += weight * centred(step[:, next(turns)].mean(1))

@@ -1,5 +1,8 @@
 """A parameter, an estimator and a detector from outside the package: each one file and one YAML, in tests/outside."""
 
+import importlib.util
+import json
+import re
 import sys
 from pathlib import Path
 
@@ -7,8 +10,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
+from neural_sim.detector.saved import SavedDetector
 from neural_sim.main import UserError, build, conf_directory, context_of
 from neural_sim.stages.walk import walk
+from neural_sim.synthesis.export import write_coco
 
 OUTSIDE = Path(__file__).parent / "outside"
 MINE = {
@@ -57,6 +63,26 @@ def test_its_settings_are_checked_like_all_others(override, message):
         build(composed(*MINE.values(), override))
 
 
+def test_the_pages_example_is_the_detector_that_is_run_here():
+    page = (OUTSIDE.parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
+    for kind, path in (("python", "my_detector.py"), ("yaml", "conf/detector/my_cells.yaml")):
+        (shown,) = re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)
+        assert shown == (OUTSIDE / path).read_text(encoding="utf-8")
+    assert len((OUTSIDE / "my_detector.py").read_text(encoding="utf-8").splitlines()) <= 60
+
+
+def test_the_detector_s_boxes_are_those_that_it_was_assigned():
+    detector = build(composed(MINE["detector"])).detector(num_classes=2, image_size=(32, 48))
+    boxes = torch.tensor([[[4.0, 3, 22, 25], [20, 8, 44, 30]]])
+    targets = detector.assign(boxes, torch.tensor([[1, 0]]))
+    found = targets.labels[0] >= 0
+    decoded = detector.decode(targets.deltas)[0, found]
+    assert found.any()
+    torch.testing.assert_close(decoded, boxes[0, 1 - targets.labels[0, found]])
+    anchors = found.nonzero()[:, 0]
+    torch.testing.assert_close(detector.decode(targets.deltas[0, anchors], anchors), decoded)
+
+
 @pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
 def test_they_run_together(adjoint, tmp_path):
     config = composed(
@@ -71,3 +97,25 @@ def test_they_run_together(adjoint, tmp_path):
     assert bool((learned.last != learned.trajectory[0]).any(-1).all())
     assert validation_ap is not None and 0.0 <= validation_ap <= 1.0
     assert set(learned.records[-1].certificate.actions) == {"can", "mug"}
+
+    # Saved, read back and run on pictures, it gives the detections that were scored.
+    graph, test = context.graph, context.results(context.graph.targets).test
+    trained = graph.trained_on(learned.last, "learned")
+    params = context.results(trained).params
+    saved = SavedDetector(trained.detector, params, graph.names, (graph.camera.height, graph.camera.width))
+    again = SavedDetector.load(saved.save(tmp_path / "model"))
+    scored = context.results(graph.scores(learned.last, "learned")).detections
+    assert type(again.detector) is type(saved.detector)
+    for ours, theirs in zip(again.detector.predict(again.params, test.images), scored, strict=True):
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+    if importlib.util.find_spec("onnx") and importlib.util.find_spec("onnxruntime"):
+        path = export(saved, tmp_path / "model.onnx")
+        assert largest_difference(saved, path, test.images) <= TOLERANCE
+    pictures = write_coco(test, list(graph.names), tmp_path / "pictures")
+    words = [
+        f"predict.model={tmp_path}/model",
+        f"predict.images={tmp_path}/pictures",
+        f"predict.annotations={pictures}",
+    ]
+    walk(*context_of(composed("stages=[predict]", "progress=false", *words), tmp_path / "predicted"))
+    assert 0.0 <= json.loads((tmp_path / "predicted" / "scores.json").read_text())["ap"] <= 1.0

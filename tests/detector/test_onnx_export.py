@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neural_sim.detector import onnx_export
+from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.onnx_export import TOLERANCE, Decoded, export, largest_difference
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.saved import SavedDetector
@@ -83,11 +84,13 @@ def test_any_number_of_images_and_the_class_names_in_the_file(plain):
     assert not list(path.parent.glob(".*"))
 
 
-@pytest.mark.parametrize(("limit", "candidates"), [(8, 1000), (100, 6)])
-def test_with_the_suppression_inside_it_gives_what_predict_gives(limit, candidates, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "limit", "candidates"), [(RetinaNet, 8, 1000), (RetinaNet, 100, 6), (Fcos, 8, 1000)]
+)
+def test_with_the_suppression_inside_it_gives_what_predict_gives(kind, limit, candidates, tmp_path):
     """Once the limit of an image cuts, once the candidates of a level do; the threshold and the overlap always."""
     settings = Detections(score_threshold=0.1, nms_iou=0.4, limit=limit, candidates=candidates)
-    held = saved(functools.partial(RetinaNet, detections=settings))
+    held = saved(functools.partial(kind, detections=settings))
     path = export(held, tmp_path / "model.onnx", nms=True)
     given = images(6)
     given[2] = 0.0
@@ -99,7 +102,7 @@ def test_with_the_suppression_inside_it_gives_what_predict_gives(limit, candidat
         assert len(image["scores"]) > 0 and own["labels"].tolist() == image["labels"].tolist()
         torch.testing.assert_close(own["scores"], image["scores"], atol=1e-4, rtol=0)
         torch.testing.assert_close(own["boxes"], image["boxes"], atol=1e-4 * max(SIZE), rtol=0)
-    uncut = RetinaNet(3, SIZE, detections=Detections(0.1, 0.4)).predict(held.params, given)
+    uncut = kind(3, SIZE, detections=Detections(0.1, 0.4)).predict(held.params, given)
     assert all(len(few["scores"]) < len(all_["scores"]) for few, all_ in zip(wanted, uncut, strict=True))
     assert all(len(few["scores"]) <= min(limit, 2 * candidates) for few in wanted)
 

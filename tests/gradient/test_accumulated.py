@@ -10,9 +10,10 @@ import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
 from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
-from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, probe_columns, step_weights
+from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
@@ -76,7 +77,7 @@ def test_a_few_probes_a_step_are_unbiased(micro, per_step, every):
     expected = up_to_a_constant(scores.sum(0).view(4, 2).mean(1))
     generator, drawn = torch.Generator().manual_seed(11), []
     for _ in range(1500):
-        total, turns = torch.zeros(4, dtype=DOUBLE), probe_columns(2, per_step, generator)
+        total, turns = torch.zeros(4, dtype=DOUBLE), shuffled_passes(2, per_step, generator)
         for row, weight in zip(scores, step_weights(6, every, generator), strict=True):
             if weight:
                 total += weight * up_to_a_constant(row.view(4, 2)[:, next(turns)].mean(1))
@@ -97,7 +98,7 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
         ProbeGroups(micro.cached.losses, groups),
     )  # fmt: skip
     generator, total = torch.Generator().manual_seed(seed), torch.zeros(8, dtype=DOUBLE)
-    turns, levels = probe_columns(2, 1, generator), None
+    turns, levels = shuffled_passes(2, 1, generator), None
     for row, weight in zip(scores, step_weights(6, 2, generator), strict=True):
         if weight:
             rows = [table[:, chosen].reshape(-1) for chosen in [next(turns)] for table in groups]
@@ -110,7 +111,7 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
 
 
 def test_every_place_has_its_turn(generator):
-    turns = list(itertools.islice(probe_columns(5, 2, generator), 10))
+    turns = list(itertools.islice(shuffled_passes(5, 2, generator), 10))
     assert torch.bincount(torch.cat(turns), minlength=5).tolist() == [4] * 5
     assert sum(step_weights(11, 3, generator)) == 11
     assert list(step_weights(4, 1, generator)) == [1, 1, 1, 1]

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.training import Training
@@ -157,3 +158,27 @@ def test_unrolling_wants_a_training_in_every_iteration(settings):
         Outer(Mirror(), **({"adjoint": "unrolled", "train_first": True, "steps": "free"} | settings))
     with pytest.raises(ValueError, match=r"outer\.adjoint must be one of"):
         Outer(Mirror(), adjoint="explicit")
+
+
+@pytest.mark.parametrize("adjoint", ["unrolled", "implicit"])
+def test_an_anchor_free_detector_goes_through_the_same_loop(scene, adjoint):
+    """With the smooth AP as the objective, whose ranks count its centre-ness, and checked steps."""
+    estimator, generator = StratifiedEstimator(probes_per_bin=2), torch.Generator().manual_seed(0)
+    detector, psi = Fcos(2, 32, Backbone("micro"), Head(8, 1)), torch.zeros(2, 4)
+    settings = Outer(
+        Mirror(),
+        iterations=2,
+        images_per_object=6,
+        epochs=2,
+        pool_per_bin=2,
+        adjoint=adjoint,
+        on_untrusted="keep",
+    )
+    inner = InnerLoop(
+        scene, detector, detector.init(generator), scene.training_set(psi, 3, generator).images, settings,
+        Training(batch_size=4), generator, estimator.draws,
+    )  # fmt: skip
+    module = SimulatorModule(inner, psi, estimator, AdjointSolver())
+    learned = learn_psi(module, progress=False)
+    assert len(learned.records) == 2 and all(norm > 0.0 for norm in learned.records[0].gradient_norms)
+    assert bool(module.psi.isfinite().all()) and learned.records[1].verdicts

@@ -2,14 +2,13 @@
 
 import torch
 from torch.nn import functional as F
-from torchvision.models.detection._utils import BoxCoder
 
 from neural_sim.detector.losses import box_loss, focal_loss
-from neural_sim.detector.protocol import Best
+from neural_sim.detector.protocol import Detector
 from neural_sim.detector.targets import IGNORED, assign_anchors
 
 
-class Cells:
+class Cells(Detector):
     def __init__(self, num_classes: int, image_size: tuple[int, int], cell: int = 8, proximal: float = 0.0):
         if any(side % cell for side in image_size):
             raise ValueError(f"detector.cell must divide the image's {image_size} pixels, got {cell}")
@@ -24,13 +23,6 @@ class Cells:
             "head.bias": torch.tensor([-3.0] * self.num_classes + [0.0] * 4),
         }
 
-    def split(self, params):
-        backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
-        return backbone, {name: value for name, value in params.items() if name not in backbone}
-
-    def learnable(self, params):
-        return list(params)
-
     def features(self, backbone, images):
         weight = backbone["backbone.weight"]
         return (F.silu(F.conv2d(images.to(weight.dtype), weight, stride=self.cell)),)
@@ -44,32 +36,18 @@ class Cells:
         return assign_anchors(self.anchors.to(boxes), boxes, labels, 0.5, 0.4)
 
     def losses_of(self, outputs, targets):
-        logits, deltas = outputs
-        wanted = (targets.labels[..., None] == torch.arange(self.num_classes)).to(logits.dtype)
-        counted = (targets.labels != IGNORED).to(logits.dtype)
-        found = (targets.labels >= 0).to(logits.dtype)
-        classes = focal_loss(logits, wanted, 0.25, 2.0).sum(-1) * counted
-        boxes = box_loss(deltas - targets.deltas.to(deltas.dtype), "pseudo_huber", 0.1).sum(-1) * found
+        logits, code = outputs
+        wanted = F.one_hot(targets.labels.clamp(min=0), self.num_classes) * (targets.labels >= 0)[..., None]
+        counted, found = (targets.labels != IGNORED).to(logits), (targets.labels >= 0).to(logits)
+        classes = focal_loss(logits, wanted.to(logits), 0.25, 2.0).sum(-1) * counted
+        boxes = box_loss(code - targets.deltas.to(code), "pseudo_huber", 0.1).sum(-1) * found
         return (classes + boxes).sum(-1) / found.sum(-1).clamp(min=1)
 
-    def per_image_loss(self, trainable, features, targets):
-        return self.losses_of(self.outputs(trainable, features), targets)
-
-    def best(self, outputs, per_class):
-        logits, deltas = outputs
-        anchor = logits.detach().topk(1, dim=1).indices[:, 0]  # one of each class in each image
-        image, label = (index.flatten() for index in torch.where(torch.ones_like(anchor, dtype=torch.bool)))
-        anchor = anchor.flatten()
-        boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(deltas[image, anchor], self.anchors[anchor])
-        return Best(image, label, logits[image, anchor, label], boxes)
-
-    @torch.no_grad()
-    def predict(self, params, images, batch_size=64):
-        backbone, trainable = self.split(params)
-        logits, deltas = self.outputs(trainable, self.features(backbone, images))
-        found = []
-        for scores, moves in zip(logits.sigmoid(), deltas, strict=True):
-            best, anchor = scores.max(-1).values.topk(5)
-            boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(moves[anchor], self.anchors[anchor])
-            found.append({"boxes": boxes, "scores": best, "labels": scores[anchor].argmax(-1)})
-        return found
+    def decode(self, code, anchor=None):
+        x0, y0, x1, y1 = self.anchors.to(code)[slice(None) if anchor is None else anchor].unbind(-1)
+        width, height = x1 - x0, y1 - y0
+        x, y = 0.5 * (x0 + x1) + code[..., 0] * width, 0.5 * (y0 + y1) + code[..., 1] * height
+        half = 0.5 * width * code[..., 2].exp(), 0.5 * height * code[..., 3].exp()
+        sides = torch.stack([x - half[0], y - half[1], x + half[0], y + half[1]], -1)
+        rows, columns = self.image_size
+        return sides.clamp(min=0.0).minimum(sides.new_tensor([columns, rows, columns, rows]))

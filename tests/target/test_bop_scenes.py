@@ -206,3 +206,10 @@ def test_a_class_without_an_object_is_refused_by_its_image(root, made, caplog):
     with caplog.at_level(logging.INFO):
         left = of(root, unmatched="leave_out").load([name_of(made[0])], ["obj_000002"], SIZE[1], SIZE[0])
     assert left.labels.tolist() == [[0]] and "obj_000003" in caplog.text
+
+
+def test_scenes_for_training_are_taken_from_those_that_are_not_scored(root):
+    without = of(root, val_fraction=0.6).parts(1)
+    parts = of(root, val_fraction=0.6, train_fraction=0.5).parts(1)
+    assert parts["test"] == without["test"] and sorted(parts["train"] + parts["val"]) == without["val"]
+    assert not {name.scene for name in parts["train"]} & {name.scene for name in parts["val"]}

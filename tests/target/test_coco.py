@@ -264,3 +264,38 @@ def test_what_is_no_json_and_bad_settings(tmp_path: Path) -> None:
         CocoTarget(broken, val_fraction=1.0)
     with pytest.raises(ValueError, match="limit must be at least 1 or null, got 0"):
         CocoTarget(broken, limit=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_part_for_training_is_taken_from_what_is_not_scored_in_whole_groups(
+    tmp_path: Path, seed: int
+) -> None:
+    """Which photographs are scored does not depend on it."""
+    settings = {"val_fraction": 0.7, "split_by": "attribute:scene"}
+    path = videos(tmp_path)
+    without, made = (sets_of(CocoTarget(path, train_fraction=part, **settings), seed) for part in (None, 0.5))
+    assert set(without) == {"val", "test"} and set(made) == {"train", "val", "test"}
+    assert torch.equal(made["test"].images, without["test"].images)
+    scenes = {part: set(scenes_in(images)) for part, images in made.items()}
+    assert all(len(own) == 1 for own in scenes.values()) and set.union(*scenes.values()) == {0, 1, 2}
+    assert len(made["train"]) + len(made["val"]) == len(without["val"])
+
+
+def test_photographs_for_training_that_look_like_scored_ones_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    target = CocoTarget(videos(tmp_path), val_fraction=0.5, train_fraction=0.5)
+    with caplog.at_level(logging.WARNING):
+        made = sets_of(target)
+    assert {name: len(part) for name, part in made.items()} == {"train": 3, "val": 3, "test": 6}
+    for first, second in (("train", "val"), ("train", "test"), ("val", "test")):
+        if set(scenes_in(made[first])) & set(scenes_in(made[second])):
+            assert f"{second} images look like one of {first} (" in caplog.text
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -0.5])
+def test_a_part_for_training_is_neither_all_nor_nothing(tmp_path: Path, fraction: float) -> None:
+    with pytest.raises(
+        ValueError, match=rf"target\.train_fraction must lie in \(0, 1\) or be null, got {fraction}"
+    ):
+        CocoTarget(videos(tmp_path), train_fraction=fraction)

@@ -3,7 +3,7 @@ import itertools
 import pytest
 import torch
 
-from neural_sim.target.split import joined, nearest, split
+from neural_sim.target.split import for_training, joined, nearest, split
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -82,3 +82,14 @@ def test_equal_images_stay_together() -> None:
         val, test = split(joined(range(20), pixels), 0.3, seeded(seed))
         assert (len(val), len(test)) == (6, 14)
         assert not {pixels[i] for i in val} & {pixels[i] for i in test}
+
+
+def test_what_is_not_scored_is_divided_into_whole_groups() -> None:
+    groups = [row // 3 for row in range(30)]
+    val = [row for row in range(30) if groups[row] % 2 == 0]
+    parts = for_training(val, groups, 0.4, seeded(2))
+    assert sorted(parts["train"] + parts["val"]) == val and len(parts["train"]) == 6
+    assert not {groups[row] for row in parts["train"]} & {groups[row] for row in parts["val"]}
+    assert for_training(val, groups, None, seeded(2)) == {"val": val}
+    with pytest.raises(ValueError, match="got 1 for training and validation"):
+        for_training([0, 1, 2], groups, 0.4, seeded(2))

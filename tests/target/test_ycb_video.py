@@ -119,6 +119,20 @@ def test_scenes_are_split_whole(shared_root, caplog):
     assert made["val"].images.shape[-2:] == (45, 60)
 
 
+def test_scenes_for_training_are_none_of_the_others(shared_root):
+    """Of three scenes one each; those that are scored are the same with and without."""
+    for seed in range(4):
+        settings = {"val_fraction": 0.6}
+        without = of(shared_root, **settings).parts(seed)
+        parts = of(shared_root, train_fraction=0.5, **settings).parts(seed)
+        scenes = {part: {name.scene for name in names} for part, names in parts.items()}
+        assert set(parts) == {"train", "val", "test"} and parts["test"] == without["test"]
+        assert sorted(parts["train"] + parts["val"]) == without["val"]
+        assert all(len(own) == 1 for own in scenes.values()) and len(set.union(*scenes.values())) == 3
+    made = sets_of(of(shared_root, train_fraction=0.5, val_fraction=0.6))
+    assert {name: len(part) for name, part in made.items()} == {"train": 3, "val": 3, "test": 3}
+
+
 def lists(root, **named):
     (root / "image_sets").mkdir()
     for name, lines in named.items():

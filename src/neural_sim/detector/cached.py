@@ -84,6 +84,15 @@ class CachedSet:
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
+    def joined(self, others: CachedSet) -> CachedSet:
+        """The set of these images and then ``others``, of the same detector and size."""
+        pairs = zip(self.features, others.features, strict=True)
+        targets = Targets(
+            torch.cat([self.targets.labels, others.targets.labels]),
+            torch.cat([self.targets.deltas, others.targets.deltas]),
+        )
+        return CachedSet(self.detector, tuple(torch.cat(pair) for pair in pairs), targets)
+
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
         """The set with the images ``index`` replaced by ``others``."""
         place = index.to(self.device)

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
-from torchvision.models.detection.retinanet import RetinaNetHead
 from torchvision.ops import FeaturePyramidNetwork
 from torchvision.ops.feature_pyramid_network import ExtraFPNBlock
 
@@ -59,7 +58,7 @@ class CoarserLevels(ExtraFPNBlock):
 class Predictor(nn.Module):
     """The feature pyramid and the head shared by its levels; parameters ``fpn.*`` and ``head.*``."""
 
-    def __init__(self, fpn: FeaturePyramidNetwork, head: RetinaNetHead) -> None:
+    def __init__(self, fpn: FeaturePyramidNetwork, head: nn.Module) -> None:
         super().__init__()
         self.fpn = fpn
         self.head = head
@@ -70,17 +69,13 @@ class Predictor(nn.Module):
 
 
 def build_predictor(
-    in_channels: list[int], levels: int, anchors: int, num_classes: int, settings: Head, activation: str
+    in_channels: list[int], levels: int, head: nn.Module, settings: Head, activation: str
 ) -> Predictor:
-    """The pyramid of ``levels``, those past the last of ``in_channels`` included, and the head, which has ``anchors``
-    at each location."""
+    """The pyramid of ``levels``, those past the last of ``in_channels`` included, and the head."""
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
     fpn = FeaturePyramidNetwork(in_channels, channels, extra, norm)
-    head = RetinaNetHead(channels, anchors, num_classes, norm_layer=norm)
-    for branch in (head.classification_head, head.regression_head):
-        branch.conv = branch.conv[: settings.convs]
     predictor = Predictor(fpn, head)
     set_activation(predictor, activation)
     return predictor

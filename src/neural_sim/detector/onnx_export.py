@@ -46,8 +46,8 @@ class Decoded(nn.Module):
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
         params = {name: getattr(self, f"p{index}") for index, name in enumerate(self.names)}
         backbone, trainable = self.detector.split(params)
-        logits, deltas = self.detector.outputs(trainable, self.detector.features(backbone, images))
-        return self.detector.decode(deltas), logits.sigmoid()
+        outputs = self.detector.outputs(trainable, self.detector.features(backbone, images))
+        return self.detector.decode(outputs[1]), self.detector.ranking(outputs).sigmoid()
 
 
 def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:

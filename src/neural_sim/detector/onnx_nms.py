@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+
 from neural_sim.detector.saved import SavedDetector
 
 INPUTS = ("anchor_boxes", "anchor_scores")
@@ -11,7 +13,7 @@ INPUTS = ("anchor_boxes", "anchor_scores")
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
-    """``model`` (an ``onnx.ModelProto`` with the outputs ``INPUTS``), continued as :meth:`RetinaNet.predict` goes on:
+    """``model`` (an ``onnx.ModelProto`` with the outputs ``INPUTS``), continued as :meth:`Detector.predict` goes on:
     the best candidates of each level, suppression within each class, the best ``limit`` of each image."""
     import onnx
 
@@ -23,7 +25,7 @@ def with_nms(model: Any, saved: SavedDetector) -> Any:
 def _graph(saved: SavedDetector, opset: int, ir_version: int) -> str:
     """In ONNX's textual syntax; names of the nodes' results begin with ``nms_``."""
     detector: Any = saved.detector
-    settings, per_level = detector.detections, detector.anchors_per_level
+    settings, per_level = detector.detections, detector.anchors_per_level or [_anchors(saved)]
     anchors, classes = sum(per_level), len(saved.class_names)
     nodes, levels, first = [], [], 0
     for number, count in enumerate(per_level):
@@ -73,6 +75,14 @@ suppression (float[n, {anchors}, 4] anchor_boxes, float[n, {anchors}, {classes}]
     boxes = GatherND(anchor_boxes, nms_where)
 }}
 """
+
+
+def _anchors(saved: SavedDetector) -> int:
+    """How many anchors the detector has."""
+    backbone, trainable = saved.detector.split(saved.params)
+    blank = torch.zeros(1, 3, *saved.image_size)
+    with torch.no_grad():
+        return saved.detector.outputs(trainable, saved.detector.features(backbone, blank))[0].shape[1]
 
 
 def _level(number: int, first: int, last: int, candidates: int) -> str:

@@ -1,19 +1,22 @@
-"""What the psi loop needs of a detector: pure functions of a parameter dictionary."""
+"""The base class of detectors: what the psi loop, reports and model files need of one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torchvision.ops import batched_nms
 
+from neural_sim.detector.settings import Detections
 from neural_sim.detector.targets import Targets
 
 Parameters = dict[str, Tensor]
-Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors 4"]]
+Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
 
 
 @dataclass(frozen=True)
@@ -30,58 +33,129 @@ class Best:
     boxes: Float[Tensor, "m 4"]
 
 
-class Detector(Protocol):
+class Detector(ABC):
     """A detector for images of one size. It holds a shape and settings, never its parameters, which come in as an
     argument, so that losses can be differentiated any number of times, in forward and in reverse mode.
 
-    Its parameters are those of a backbone, which the psi loop freezes, and of what stands on its features.
-    ``proximal`` is lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm
-    start. A class is constructed with ``num_classes`` and ``image_size``, (height, width) in pixels, by name; other
-    arguments come from its file in ``conf/detector``.
+    A class is constructed with ``num_classes`` and ``image_size``, (height, width) in pixels, by name; other arguments
+    come from its file in ``conf/detector``. It sets both attributes, and may set the others:
+
+    - ``proximal``: lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm
+      start;
+    - ``detections``: which predictions are detections;
+    - ``anchors_per_level``: how many anchors each level has, of which the best candidates are taken level by level;
+      None: one level;
+    - ``normalisation``: what features do first to the channels of images, for model files.
+
+    "Anchors" are the places that outputs belong to, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
+    defines the abstract methods; docs/extending.md has an example.
     """
 
-    proximal: float
+    normalisation: ClassVar[Mapping[str, tuple[float, ...]] | None] = None
+    num_classes: int
+    image_size: tuple[int, int]
+    proximal: float = 0.0
+    detections: Detections = Detections()
+    anchors_per_level: Sequence[int] | None = None
 
+    # --- what a detector defines ---
+
+    @abstractmethod
     def init(self, generator: torch.Generator) -> Parameters:
-        """Fresh parameters in float32 on the CPU, all of them."""
-        ...
+        """Fresh parameters in float32 on the CPU, all of them; names of the backbone's begin with ``backbone.``."""
 
-    def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """Parameters of the backbone, and of the rest."""
-        ...
-
-    def learnable(self, params: Parameters) -> list[str]:
-        """Names of everything that a training outside the psi loop changes."""
-        ...
-
+    @abstractmethod
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         """The predictor's inputs for images in [0, 1]: tensors with a row for each image."""
-        ...
 
+    @abstractmethod
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
-        """Class logits and encoded boxes of every anchor."""
-        ...
+        """Class logits and the code of the box of every anchor, differentiable in both arguments."""
 
+    @abstractmethod
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
         """What every anchor should give; rows of label -1 are no boxes. Differentiable in the boxes."""
-        ...
 
+    @abstractmethod
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """The loss of each image."""
-        ...
+        """The loss of each image, of no other image's outputs."""
+
+    @abstractmethod
+    def decode(
+        self, code: Float[Tensor, "*n code"], anchor: Int[Tensor, "m"] | None = None
+    ) -> Float[Tensor, "*n 4"]:
+        """Boxes (x0, y0, x1, y1) in pixels, within the image: of all anchors, from a code [n, anchors, code], or of
+        those that ``anchor`` lists, from theirs [m, code]. Differentiable in the code."""
+
+    # --- what follows from it ---
+
+    def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
+        """Parameters of the backbone, which the psi loop freezes, and of what stands on its features."""
+        backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
+        return backbone, {name: value for name, value in params.items() if name not in backbone}
+
+    def learnable(self, params: Parameters) -> list[str]:
+        """Names of everything that a training outside the psi loop changes: all."""
+        return list(params)
 
     def per_image_loss(
         self, trainable: Parameters, features: Sequence[Tensor], targets: Targets
     ) -> Float[Tensor, "n"]:
-        """:meth:`losses_of` the :meth:`outputs`."""
-        ...
+        """:meth:`losses_of` the :meth:`outputs`. A jvp along v gives every image's score <dl_i / dtheta, v> in one
+        pass."""
+        return self.losses_of(self.outputs(trainable, features), targets)
 
-    def best(self, outputs: Outputs, per_class: int) -> Best:
-        """At most ``per_class`` detections of each class in each image, after non-maximum suppression, however low."""
-        ...
+    def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
+        """Logits of the scores by which detections are ranked: those of the classes."""
+        return outputs[0]
 
+    def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
+        """At most ``per_class`` detections of each class in each image, of its ``candidates`` best logits after
+        non-maximum suppression. No score is too low: a box that is missed today should be able to rise."""
+        logits, code = self.ranking(outputs), outputs[1]
+        top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
+        image = torch.arange(len(top), device=top.device)[:, None].expand_as(index).flatten()
+        anchor, label = (index // self.num_classes).flatten(), (index % self.num_classes).flatten()
+        group = image * self.num_classes + label
+        boxes = self.decode(code.detach()[image, anchor], anchor)
+        kept = batched_nms(boxes, top.flatten(), group, self.detections.nms_iou)
+        kept = kept[group[kept].argsort(stable=True)]
+        place = torch.arange(len(kept), device=kept.device) - torch.searchsorted(group[kept], group[kept])
+        image, anchor, label = (part[kept[place < per_class]] for part in (image, anchor, label))
+        return Best(image, label, logits[image, anchor, label], self.decode(code[image, anchor], anchor))
+
+    @torch.no_grad()
     def predict(
         self, params: Parameters, images: Float[Tensor, "n 3 h w"], batch_size: int = 64
     ) -> list[dict[str, Tensor]]:
-        """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]."""
-        ...
+        """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
+        :class:`Detections`."""
+        backbone, trainable = self.split(params)
+        detections, device = [], next(iter(trainable.values())).device
+        for chunk in images.split(batch_size) if len(images) else ():
+            outputs = self.outputs(trainable, self.features(backbone, chunk.to(device)))
+            detections += self._chosen(self.ranking(outputs).sigmoid(), outputs[1])
+        return detections
+
+    def _chosen(
+        self, scores: Float[Tensor, "n anchors classes"], code: Float[Tensor, "n anchors code"]
+    ) -> list[dict[str, Tensor]]:
+        """The candidates of all images are chosen together and taken to the CPU, where each image has its own few."""
+        levels, first = [], 0
+        for level in scores.split(list(self.anchors_per_level or [scores.shape[1]]), 1):
+            best, index = level.flatten(1).topk(min(self.detections.candidates, level[0].numel()))
+            levels.append((best, index + first * self.num_classes))
+            first += level.shape[1]
+        best, index = (torch.cat(part, 1) for part in zip(*levels, strict=True))
+        anchor, labels = index // self.num_classes, index % self.num_classes
+        moves = code.gather(1, anchor[..., None].expand(-1, -1, code.shape[-1]))
+        chosen = (part.cpu() for part in (best, anchor, labels, moves))
+        return [self._suppressed(*image) for image in zip(*chosen, strict=True)]
+
+    def _suppressed(self, best: Tensor, anchor: Tensor, labels: Tensor, moves: Tensor) -> dict[str, Tensor]:
+        """One image's detections of its candidates."""
+        keep = best > self.detections.score_threshold
+        best, anchor, labels, moves = (part[keep] for part in (best, anchor, labels, moves))
+        boxes = self.decode(moves, anchor)
+        keep = batched_nms(boxes, best, labels, self.detections.nms_iou)[: self.detections.limit]
+        return {"boxes": boxes[keep], "scores": best[keep], "labels": labels[keep]}

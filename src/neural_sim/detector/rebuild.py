@@ -42,7 +42,7 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
 
 
 def rebuilt(description: Mapping[str, Any], file: Path) -> Callable[..., Detector]:
-    """Inverse of :func:`described`. Runs no code but the named class's own, which must have a detector's methods.
+    """Inverse of :func:`described`. Runs no code but the named class's own, which must derive from :class:`Detector`.
 
     Raises:
         ValueError: a class that cannot be imported or is no detector, a setting that it does not have or refuses;
@@ -84,10 +84,10 @@ def _detector_class(name: Any, where: str) -> type:
         found: Any = functools.reduce(getattr, qualified.split("."), importlib.import_module(module))
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{where}: {name} cannot be imported ({error}); is it on PYTHONPATH?") from error
-    wanted = [member for member in vars(Detector) if not member.startswith("_")]
-    missing = [member for member in wanted if not callable(getattr(found, member, None))]
-    if not isinstance(found, type) or missing:
-        raise ValueError(f"{where}: {name} is no detector, it has no {', '.join(missing) or 'constructor'}")
+    if not isinstance(found, type) or not issubclass(found, Detector):
+        raise ValueError(
+            f"{where}: {name} is no detector, want a class that derives from neural_sim.detector.protocol.Detector"
+        )
     return found
 
 

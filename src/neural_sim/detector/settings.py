@@ -1,7 +1,8 @@
-"""The settings of a RetinaNet, by component."""
+"""The settings of detectors, by component."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -115,6 +116,45 @@ class Anchors:
             ),
             foreground_iou=(self.foreground_iou, low <= self.foreground_iou <= 1, "background_iou up to 1"),
         )
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of an FCOS, and which of them should find which object.
+
+    Args:
+        strides: of the pyramid's levels, as of :class:`Anchors`; a level has a point in every stride.
+        limits: of all levels but the last, the largest distance from a point to a side of its box, in pixels of an
+            image whose shorter side is ``reference``; larger ones are for the next level.
+        reference: that side in pixels; None: limits are pixels of any image.
+        radius: distance in strides, along each axis, within which a point may be of its box's centre.
+    """
+
+    strides: Sequence[int] = (8, 16)
+    limits: Sequence[float] = (28,)
+    reference: float | None = 96
+    radius: float = 1.5
+
+    def __post_init__(self) -> None:
+        limits = list(self.limits)
+        check(
+            "detector.points",
+            reference=(self.reference, self.reference is None or self.reference > 0, "above 0, or null"),
+            limits=(
+                limits,
+                len(limits) == len(self.strides) - 1
+                and limits == sorted(set(limits))
+                and min([1.0, *limits]) > 0,
+                "ascending, above 0, one for each stride but the last",
+            ),
+            radius=(self.radius, self.radius > 0, "above 0"),
+        )
+
+    def ranges(self, shorter_side: float) -> list[tuple[float, float]]:
+        """Each level's distances to the farthest side, in pixels of an image of this size."""
+        scale = 1.0 if self.reference is None else shorter_side / self.reference
+        bounds = [0.0, *(scale * limit for limit in self.limits), float("inf")]
+        return list(itertools.pairwise(bounds))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Which anchor should find which box: done once per image, for all images at a time."""
+"""Which anchor, or which point, should find which box: done once per image, for all images at a time."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ IGNORED = -2
 
 @dataclass(frozen=True)
 class Targets:
-    """What each anchor of each image should predict.
+    """What each anchor of each image should predict; the anchors of an anchor-free detector are its points.
 
     ``labels`` is the class index of the anchor's box, ``BACKGROUND`` or ``IGNORED`` (overlap between the two
-    thresholds). ``deltas`` is the box in the anchor's code (centre shift in anchor sizes, log size ratio), zero
-    where there is none; it carries gradients with respect to the boxes.
+    thresholds). ``deltas`` is the box in the detector's code (of an anchor: centre shift in anchor sizes, log size
+    ratio; of a point: distances to the sides in strides), any finite value where there is none; it carries gradients
+    with respect to the boxes.
     """
 
     labels: Int[Tensor, "images anchors"]
@@ -49,11 +50,7 @@ def assign_anchors(
     Raises:
         ValueError: where a box that is no padding has no area.
     """
-    present = labels >= 0
-    sides = boxes[..., 2:] - boxes[..., :2]
-    if bool((present & (sides <= 0).any(-1)).any()):
-        worst = boxes[present & (sides <= 0).any(-1)][0].tolist()
-        raise ValueError(f"assign: boxes want x0 < x1 and y0 < y1, got {worst}")
+    present = _present(boxes, labels)
     images, count = labels.shape
     if count == 0:
         shape = (images, anchors.shape[0])
@@ -75,3 +72,52 @@ def assign_anchors(
     tiled = anchors.expand(images, -1, 4).reshape(-1, 4)
     deltas = encode_boxes(matched.reshape(-1, 4), tiled, boxes.new_ones(4)).view(images, -1, 4)
     return Targets(anchor_labels, deltas)
+
+
+def assign_points(
+    points: Float[Tensor, "points 2"],
+    strides: Float[Tensor, "points"],
+    ranges: Float[Tensor, "points 2"],
+    boxes: Float[Tensor, "images boxes 4"],
+    labels: Int[Tensor, "images boxes"],
+    radius: float,
+) -> Targets:
+    """Match points to boxes as torchvision's FCOS does: a point takes the smallest box that it is inside of, whose
+    centre is within ``radius`` strides of it along both axes, and whose farthest side is at a distance within the
+    point's range (low, high), in pixels.
+
+    Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding.
+
+    Raises:
+        ValueError: where a box that is no padding has no area.
+    """
+    present = _present(boxes, labels)
+    images, count = labels.shape
+    if count == 0:
+        shape = (images, len(points))
+        return Targets(labels.new_full(shape, BACKGROUND), boxes.new_ones((*shape, 4)))
+    with torch.no_grad():
+        corners = boxes[:, :, None]
+        distances = torch.cat([points - corners[..., :2], corners[..., 2:] - points], -1)
+        centres = 0.5 * (corners[..., :2] + corners[..., 2:])
+        near = (points - centres).abs().amax(-1) < radius * strides
+        farthest = distances.amax(-1)
+        found = near & (distances.amin(-1) > 0) & (farthest > ranges[:, 0]) & (farthest < ranges[:, 1])
+        areas = (corners[..., 2:] - corners[..., :2]).prod(-1)
+        smallest, match = torch.where(found & present[..., None], areas, torch.inf).min(1)
+        foreground = smallest < torch.inf
+    matched = boxes.gather(1, match[..., None].expand(-1, -1, 4))
+    reach = torch.cat([points - matched[..., :2], matched[..., 2:] - points], -1) / strides[:, None]
+    return Targets(
+        torch.where(foreground, labels.gather(1, match), BACKGROUND),
+        torch.where(foreground[..., None], reach, 1.0),
+    )
+
+
+def _present(boxes: Tensor, labels: Tensor) -> Tensor:
+    """Which rows are no padding. Raises ``ValueError`` where one of these has no area."""
+    present = labels >= 0
+    empty = present & (boxes[..., 2:] - boxes[..., :2] <= 0).any(-1)
+    if bool(empty.any()):
+        raise ValueError(f"assign: boxes want x0 < x1 and y0 < y1, got {boxes[empty][0].tolist()}")
+    return present

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from neural_sim.checks import at_least
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Batch, DetectorModule, Optimisation
 from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.detector.real import Real, Sampling
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import trainer_on
@@ -25,7 +28,8 @@ class Training:
     """Training settings of every detector, whatever the method that chose its images.
 
     ``image_size`` is the side of the square images in pixels; ``warm_epochs`` are those of the warm start,
-    ``cold_epochs`` those of the detectors that are scored. For the rest see :class:`Optimisation`."""
+    ``cold_epochs`` those of the detectors that are scored; ``real`` says whether labelled photographs train too. For
+    the rest see :class:`Optimisation`."""
 
     image_size: int = 96
     images_per_object: int = 100
@@ -34,12 +38,15 @@ class Training:
     batch_size: int = 32
     learning_rate: float = 3e-3
     weight_decay: float = 1e-4
+    real: Real = field(default_factory=Real)
 
     def __post_init__(self) -> None:
         at_least("training", 1, images_per_object=self.images_per_object, batch_size=self.batch_size)
         at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
         at_least("training", 16, image_size=self.image_size)
         at_least("training", 0, learning_rate=self.learning_rate, weight_decay=self.weight_decay)
+        if self.real.combined and self.real.batch_fraction is not None:
+            at_least("training", 2, batch_size=self.batch_size)  # a photograph and a synthetic image
 
     def of(self, epochs: int) -> Optimisation:
         """A training of this many epochs."""
@@ -57,22 +64,43 @@ class TrainingHistory:
 
 
 class Batches:
-    """Inputs and targets in batches, in an order that the generator shuffles each epoch; ``drawn`` are their rows."""
+    """Inputs and targets in batches, in an order that the generator shuffles each epoch, or as ``sampling`` says;
+    ``drawn`` are their rows.
+
+    Raises:
+        ValueError: a sampling of another number of images.
+    """
 
     def __init__(
-        self, inputs: tuple[Tensor, ...], targets: Targets, batch_size: int, generator: torch.Generator
+        self,
+        inputs: tuple[Tensor, ...],
+        targets: Targets,
+        batch_size: int,
+        generator: torch.Generator,
+        sampling: Sampling | None = None,
     ) -> None:
+        if sampling is not None and sum(sampling.pools) != len(targets):
+            raise ValueError(f"batches: want {sum(sampling.pools)} images, got {len(targets)}")
         self.inputs, self.targets, self.batch_size, self.generator = inputs, targets, batch_size, generator
+        self._steps = sampling.steps if sampling else -(-len(targets) // batch_size)
+        self._sampled = None if sampling is None else sampling.batches(generator)
         self.drawn: list[Tensor] = []
 
     def __len__(self) -> int:
-        return -(-len(self.targets) // self.batch_size)
+        return self._steps
 
     def __iter__(self) -> Iterator[Batch]:
-        order = torch.randperm(len(self.targets), generator=self.generator, device=self.generator.device)
-        for index in order.to(self.targets.labels.device).split(self.batch_size):
+        for index in self._epoch():
             self.drawn.append(index)
             yield tuple(x[index] for x in self.inputs), self.targets.select(index)
+
+    def _epoch(self) -> Iterable[Int[Tensor, "batch"]]:
+        # Rows are moved to the images' device once an epoch.
+        device = self.targets.labels.device
+        if self._sampled is not None:
+            return torch.stack(list(itertools.islice(self._sampled, self._steps))).to(device)
+        order = torch.randperm(len(self.targets), generator=self.generator, device=self.generator.device)
+        return order.to(device).split(self.batch_size)
 
 
 def train_detector(
@@ -83,6 +111,7 @@ def train_detector(
     how: Optimisation,
     anchor: Parameters | None = None,
     recording: Recording | None = None,
+    sampling: Sampling | None = None,
 ) -> tuple[Parameters, TrainingHistory]:
     """Train from ``params``, which stay as they are.
 
@@ -91,6 +120,7 @@ def train_detector(
             pyramid and the head alone are trained.
         anchor: theta_0, which adds the detector's proximal term over what is trained to the loss; None: without it.
         recording: what the history keeps of the steps (None: nothing).
+        sampling: how batches are drawn of ``images`` (None: each image once in every epoch).
 
     Returns:
         New parameters, detached, all of them (the frozen ones are the given tensors), and the history, whose losses
@@ -111,7 +141,7 @@ def train_detector(
         learned = {name: value for name, value in params.items() if name in names}
         fixed = {name: value for name, value in params.items() if name not in names}
         inputs, targets = (images.images,), detector.assign(images.boxes, images.labels)
-    batches = Batches(inputs, targets, how.batch_size, generator)
+    batches = Batches(inputs, targets, how.batch_size, generator, sampling)
     module = DetectorModule(detector, learned, fixed, how, how.epochs * len(batches), anchor, recording)
     _fit(module, batches, next(iter(learned.values())).device)
     values = {**fixed, **module.parameters_by_name()}

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.gradient.base import IndexedLoss, Params
 from neural_sim.gradient.mixed import scores
@@ -23,7 +24,8 @@ class Accumulated:
     ``images`` [N]: derivatives of L_val by the training images' weights (1 in the means of its batches).
     ``inputs``: derivatives by the training images' inputs, which ``inputs_of`` computes. Both are empty unless wanted.
     ``probes`` [m]: every probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
-    unbiased for ``sum_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group.
+    unbiased for ``sum_t f_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group; f_t is the
+    fraction of step t's batch that was drawn from p_psi.
     ``scored`` counts the scored pairs of a probe and a step.
     """
 
@@ -142,7 +144,7 @@ class Unrolled:
         steps = reversed_steps(trajectory, examples, like, slope, self.product, wanted)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
-        columns = probe_columns(per_bin, self.probes_per_step or per_bin, generator)
+        columns = shuffled_passes(per_bin, self.probes_per_step or per_bin, generator)
         weights = step_weights(len(trajectory) - trajectory.first, self.score_every, generator)
         images = slope.new_zeros(0 if wanted == "probes" else len(examples.inputs[0]))
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if wanted == "inputs" else ()
@@ -152,7 +154,7 @@ class Unrolled:
             for into, part in zip(inputs, step.inputs, strict=True):
                 into.index_add_(0, step.rows, part)
             if scoring is not None and (weight := next(weights)):
-                scoring.add(step, next(columns), weight)
+                scoring.add(step, next(columns), weight * examples.drawn_part(step.rows))
         total, scored = (slope.new_zeros(0), 0) if scoring is None else (scoring.total, scoring.scored)
         return Accumulated(images, inputs, total, scored, examples.inputs_of)
 
@@ -166,7 +168,7 @@ class _Scoring:
         self.total, self.scored = like.new_zeros(probes.count), 0
         self._levels: list[Tensor] = []
 
-    def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: int) -> None:
+    def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: Tensor | float) -> None:
         """Add one step's scores of the probes in some columns, scaled to all columns and ``weight`` steps."""
         columns = chosen.to(self.total.device)
         rows = [table[:, columns].reshape(-1) for table in self.tables]
@@ -181,18 +183,6 @@ class _Scoring:
         for into, part, level in zip(rows, parts, self._levels or means, strict=True):
             self.total.index_add_(0, into, scale * (part - level))
         self._levels, self.scored = means, self.scored + len(along)
-
-
-def probe_columns(
-    columns: int, per_step: int, generator: torch.Generator
-) -> Iterator[Int[Tensor, "per_step"]]:
-    """``per_step`` columns at a time from shuffled passes over all: each is equally likely in every batch."""
-    remaining = torch.zeros(0, dtype=torch.long)
-    while True:
-        while len(remaining) < per_step:
-            remaining = torch.cat([remaining, torch.randperm(columns, generator=generator)])
-        yield remaining[:per_step]
-        remaining = remaining[per_step:]
 
 
 def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.detector.losses import proximal_loss
@@ -39,7 +39,7 @@ class InnerProblem:
     ``weights`` [N] are those of rows 0..N-1 of ``losses``; 1 / N each for independent draws. At most ``chunk_size``
     images are in memory at a time. ``anchor`` is the fixed theta_0 of the proximal term: with it ``(H + proximal
     I)^-1`` is the problem's exact derivative. ``subset`` limits Hessian products (not the stationarity) to these rows,
-    their weights scaled up to the same sum.
+    of ``subset_weights``; None: of their own weights, scaled up to the same sum.
     """
 
     params: Params
@@ -48,7 +48,8 @@ class InnerProblem:
     chunk_size: int = 64
     proximal: float = 0.0
     anchor: Params | None = None
-    subset: Tensor | None = None
+    subset: Int[Tensor, "n"] | None = None
+    subset_weights: Float[Tensor, "n"] | None = None
 
     def __post_init__(self) -> None:
         if self.weights.ndim != 1 or self.weights.numel() == 0:
@@ -62,11 +63,14 @@ class InnerProblem:
         if self.proximal > 0.0 and self.anchor is None:
             raise ValueError("inner problem: a proximal term needs its anchor theta_0")
 
-    def terms(self, subset: Tensor | None = None) -> list[Term]:
-        """The loss as a sum over chunks (and the proximal term), of all rows or of a subset scaled up to all."""
+    def terms(
+        self, subset: Int[Tensor, "n"] | None = None, subset_weights: Float[Tensor, "n"] | None = None
+    ) -> list[Term]:
+        """The loss as a sum over chunks (and the proximal term), of all rows or of a subset that stands for them, see
+        ``subset``."""
         index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
-        weights = self.weights[index]
-        if subset is not None:
+        weights = self.weights[index] if subset_weights is None else subset_weights
+        if subset is not None and subset_weights is None:
             weights = weights * (self.weights.sum() / weights.sum())
         chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
         terms: list[Term] = [
@@ -123,7 +127,7 @@ def hypergradient(
     stationarity = norm(gradient(inner.terms(), inner.params))
     validated = time.perf_counter()
     adjoint: Adjoint = solver.solve(
-        inner.terms(inner.subset), inner.params, right_hand_side, previous, generator
+        inner.terms(inner.subset, inner.subset_weights), inner.params, right_hand_side, previous, generator
     )
     solved = time.perf_counter()
     vector = unflatten(adjoint.vector, inner.params)

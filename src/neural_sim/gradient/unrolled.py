@@ -48,7 +48,8 @@ class Examples:
 
     ``inputs`` [N, ...] are those by which losses are differentiated where images move. Each step's objective was its
     batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images (and
-    from boxes where they move) and their rows.
+    from boxes where they move) and their rows. The first ``drawn`` rows were drawn from p_psi, the others (photographs)
+    do not depend on it; None: all were drawn.
     """
 
     inputs: tuple[Tensor, ...]
@@ -56,6 +57,7 @@ class Examples:
     proximal: float = 0.0
     anchor: Params | None = None
     inputs_of: InputsOf | None = None
+    drawn: int | None = None
 
     def __post_init__(self) -> None:
         if self.proximal < 0.0 or (self.proximal > 0.0 and self.anchor is None):
@@ -67,6 +69,10 @@ class Examples:
     def of(self, rows: Int[Tensor, "n"]) -> tuple[Tensor, ...]:
         """These rows of the inputs."""
         return tuple(values[rows] for values in self.inputs)
+
+    def drawn_part(self, rows: Int[Tensor, "batch"]) -> Tensor | float:
+        """The fraction of a batch that was drawn from p_psi."""
+        return 1.0 if self.drawn is None else (rows < self.drawn).double().mean()
 
     def gradient(
         self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]

@@ -52,7 +52,7 @@ class GradientLoop(OuterLoop, ABC):
             with timed(seconds, "probes", self.inner.device):
                 self._prepare()
         with timed(seconds, "features", self.inner.device):
-            cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+            cached = self.inner.training_set(images)
         with timed(seconds, "train", self.inner.device):
             # The warm start has trained at this psi, on more images and for more steps than an iteration.
             recording = None if last else self._recording
@@ -90,7 +90,7 @@ class GradientLoop(OuterLoop, ABC):
         """The derivative at psi as an iteration takes it, by new images and a training on them; psi does not move."""
         self._prepare()
         rendered = self.inner.draw(self.psi)
-        cached = CachedSet.of(self.inner.detector, self.inner.backbone, rendered.images)
+        cached = self.inner.training_set(rendered.images)
         self.inner.train(cached, self._recording)
         return self._derivative(rendered, cached)
 

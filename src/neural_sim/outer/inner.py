@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Outputs, Parameters
+from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
@@ -56,6 +57,7 @@ class InnerLoop:
         training: batch size and weight decay.
         generator: of all draws.
         draws: how the method draws images.
+        photographs: labelled ones that every training has beside the drawn images, as ``training.real`` says.
 
     With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
     ``images`` and ``steps`` count labelled images and optimiser steps; ``cpu_begun`` is the processor time before the
@@ -72,12 +74,16 @@ class InnerLoop:
         training: Training,
         generator: torch.Generator,
         draws: Draws = HARD,
+        photographs: LabelledImages | None = None,
     ) -> None:
         self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
         self.training, self.generator = training, generator
         self.backbone, self.warm_start = detector.split(params)
         self.validation = CachedSet.of(detector, self.backbone, validation)
         self.draws, self.device = draws, self.validation.device
+        self.photographs = None
+        if photographs is not None:
+            self.photographs = CachedSet.of(detector, self.backbone, photographs)
         self.pool: ImagePool | None = None
         began, self.cpu_begun = time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
@@ -106,6 +112,26 @@ class InnerLoop:
         self.images += len(rendered)
         return rendered
 
+    def training_set(self, images: LabelledImages) -> CachedSet:
+        """The drawn images, and after them the photographs that train with them, under the backbone."""
+        drawn = CachedSet.of(self.detector, self.backbone, images)
+        return drawn if self.photographs is None else drawn.joined(self.photographs)
+
+    def drawn(self, images: CachedSet) -> int:
+        """How many of a training set's images were drawn from p_psi."""
+        return len(images) - (0 if self.photographs is None else len(self.photographs))
+
+    def weights(self, images: CachedSet) -> Float[Tensor, "N"]:
+        """The images' weights in the training loss, on the CPU: 1 / N, or as photographs and drawn images are mixed."""
+        sampling = self._sampling(images)
+        return torch.full((len(images),), 1.0 / len(images)) if sampling is None else sampling.weights
+
+    def _sampling(self, images: CachedSet) -> Sampling | None:
+        if self.photographs is None:
+            return None
+        real, batch_size = self.training.real, self.training.batch_size
+        return real.sampling(self.drawn(images), len(self.photographs), batch_size)
+
     def _common(self, purpose: int) -> torch.Generator:
         """A generator of the same random numbers until :meth:`renew`, or of new ones without ``common_numbers``."""
         if not self.common_numbers:
@@ -118,7 +144,7 @@ class InnerLoop:
         self._numbers += 1
 
     def train(self, images: CachedSet, recording: Recording | None = None) -> float:
-        """Train theta on the images; returns the last epoch's loss, nan for no epochs.
+        """Train theta on a :meth:`training_set`; returns the last epoch's loss, nan for no epochs.
 
         With ``recording``, the steps are in ``trajectory``.
         """
@@ -130,7 +156,14 @@ class InnerLoop:
             how = replace(how, weight_decay=0.0)
         start = self.theta if self.settings.start == "previous" else self._start
         self.theta, history = train_detector(
-            self.detector, start, images, self._common(1), how, self.warm_start, recording
+            self.detector,
+            start,
+            images,
+            self._common(1),
+            how,
+            self.warm_start,
+            recording,
+            self._sampling(images),
         )
         self.steps += history.steps
         self.trajectory = history.trajectory
@@ -138,8 +171,10 @@ class InnerLoop:
 
     @torch.no_grad()
     def loss(self, images: CachedSet) -> float:
-        """Mean loss of images at theta."""
-        return float(sum(term(self.trainable) for term in images.mean_terms()))
+        """The training loss of a :meth:`training_set` at theta."""
+        weights = self.weights(images).to(self.device)
+        rows = torch.arange(len(images), device=self.device).split(32)
+        return float(sum(images.losses(self.trainable, part) @ weights[part] for part in rows))
 
     def validation_loss(self) -> float:
         """L_val at theta."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
@@ -42,22 +42,21 @@ class SimulatorModule(GradientLoop):
 
     def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
         trainable, labels = self.inner.trainable, rendered.images.labels
-        count = len(rendered)
-        weights = torch.full((count,), 1.0 / count)
-        wanted = self.settings.curvature_images
-        subset = (
-            torch.randperm(count, generator=self.inner.generator)[:wanted] if 0 < wanted < count else None
+        drawn, weights, device = len(rendered), self.inner.weights(cached), self.inner.device
+        subset, subset_weights = curvature_rows(
+            drawn, weights, self.settings.curvature_images, self.inner.generator
         )
-        device = self.inner.device
         inner = InnerProblem(
             trainable, cached.losses, weights.to(device),
             proximal=self.inner.detector.proximal, anchor=self.inner.warm_start,
-            subset=None if subset is None else subset.to(device),
+            subset=subset.to(device), subset_weights=subset_weights.to(device),
         )  # fmt: skip
-        probed = self._probes
-        by_object = object_images(self.scene, rendered, self.psi, weights)
+        probed, unrolled = self._probes, self.settings.adjoint == "unrolled"
+        # Through a training, the fraction of photographs is that of each step's batch, see Examples.drawn.
+        own = torch.full((drawn,), 1.0 / drawn) if unrolled else weights[:drawn]
+        by_object = object_images(self.scene, rendered, self.psi, own)
         learned = {name: by_object[name] for name in self._names}
-        if self.settings.adjoint == "unrolled":
+        if unrolled:
             return self._with_fixed(
                 through_training(self.inner, inner, self.estimator, cached, labels, learned, probed)
             )
@@ -138,3 +137,23 @@ class SimulatorModule(GradientLoop):
         psi = distribution.split(self.psi.detach())[factor.name]
         gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
         return retrained_cosine(problem, validation, psi, label, as_double(trainable), gradient)
+
+
+def curvature_rows(
+    drawn: int, weights: Float[Tensor, "N"], wanted: int, generator: torch.Generator
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Rows of the training set for Hessian products, and their weights in them: ``wanted`` random ones (0: all), of the
+    first ``drawn``, which were drawn from p_psi, and of the others, which are photographs, in proportion to the weight
+    of each part, which its rows keep."""
+    count, parts = len(weights), []
+    if not 0 < wanted < count:
+        return torch.arange(count), weights
+    for first, last in ((0, drawn), (drawn, count)):
+        size, mass = last - first, float(weights[first:last].sum())
+        if size == 0:
+            continue
+        few = min(size, max(1, round(wanted * mass))) if size < count else wanted
+        rows = first + torch.randperm(size, generator=generator)[:few]
+        parts.append((rows, torch.full((few,), mass / few)))
+    rows, scaled = (torch.cat(column) for column in zip(*parts, strict=True))
+    return rows, scaled

@@ -123,5 +123,5 @@ def _moved(
 
 def _scores(inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "classes"]:
     """Scores of a detector trained on images of ``psi``."""
-    inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
+    inner.train(inner.training_set(inner.draw(psi).images))
     return inner.scores().sum(1)

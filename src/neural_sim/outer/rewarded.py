@@ -6,7 +6,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.baseline.base import RewardMethod
-from neural_sim.detector.cached import CachedSet
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
 
@@ -25,7 +24,7 @@ class RewardLoop(OuterLoop):
             rendered = self.inner.draw(psi)
             images = rendered.images
         with timed(seconds, "features", self.inner.device):
-            cached = CachedSet.of(self.inner.detector, self.inner.backbone, images)
+            cached = self.inner.training_set(images)
         with timed(seconds, "train", self.inner.device):
             training_loss = self.inner.train(cached)
         with timed(seconds, "reward", self.inner.device):

@@ -33,7 +33,7 @@ def through_training(
         loop: with the recorded training.
         problem: its objective.
         estimator: of the derivative by psi.
-        cached, labels: its training images and the labels of their boxes.
+        cached, labels: its training set, and the labels of the boxes of those images that were drawn from p_psi.
         images: those of each learned object.
         probed: the probes of all objects.
 
@@ -43,8 +43,9 @@ def through_training(
     if loop.trajectory is None:
         raise ValueError("unrolled: the last training was not recorded; want train(images, recording)")
     examples = Examples(
-        cached.inputs, cached.losses_from, problem.proximal, problem.anchor, inputs_of(loop, cached, labels)
-    )
+        cached.inputs, cached.losses_from, problem.proximal, problem.anchor, inputs_of(loop, cached, labels),
+        None if loop.photographs is None else loop.drawn(cached),
+    )  # fmt: skip
     probes: dict[str, Mapping[str, Probes]] = {name: {} for name in images}
     groups = None
     if probed is not None:
@@ -69,7 +70,8 @@ def through_training(
 
 
 def inputs_of(loop: InnerLoop, cached: CachedSet, labels: Int[Tensor, "images boxes"]) -> InputsOf:
-    """The function that computes a cached set's inputs from images, and from their boxes where those are given too."""
+    """The function that computes a cached set's inputs from drawn images, and from their boxes where those are given
+    too."""
 
     def inputs(leaves: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
         pixels, *boxes = leaves

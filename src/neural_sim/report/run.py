@@ -34,6 +34,8 @@ class RunResults:
 
     ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
     (from 1), by object and angle, whose views an object's symmetry makes the same; they are scored and drawn as one.
+    ``real`` says how photographs trained (``mode``) and how many (``photographs``); empty without. ``ap`` then also has
+    the scores of synthetic_only and real_only.
     ``identity`` says which runs this one can be compared with, see :func:`identity.identity`.
     """
 
@@ -54,6 +56,7 @@ class RunResults:
     curve: Sequence[Mapping[str, Any]] = ()
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
+    real: Mapping[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
@@ -76,6 +79,7 @@ class RunResults:
                 "symmetric_bins": dict(self.symmetric_bins),
                 "ap": dict(self.ap),
                 "validation_ap": self.validation_ap,
+                "real": dict(self.real),
                 "curve": list(self.curve),
                 "certificates": untrusted(self.records),
                 "images_without_box": self.images_without_box(),
@@ -121,6 +125,10 @@ class RunResults:
         for method, scores in self.ap.items():
             values = [*(scores["per_class"][name] for name in self.names), scores["ap"]]
             lines.append(f"{method:<20}" + "".join(f"{100 * value:>13.1f}" for value in values))
+        if self.real:
+            lines.append(
+                "trained on {photographs} photographs too (training.real.mode={mode})".format(**self.real)
+            )
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
             lines.append(f"AP on the validation images, learned: {score} (to choose settings by)")

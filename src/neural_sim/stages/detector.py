@@ -1,11 +1,13 @@
-"""Stages ``warm_start`` and ``evaluate``: detectors trained from scratch on images of one distribution."""
+"""Stages ``warm_start`` and ``evaluate``: detectors trained on images of one distribution, with or without photographs,
+or on photographs."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -13,13 +15,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.cost import Cost
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.scene import Scene
+from neural_sim.types import LabelledImages, PinholeCamera
 
 CPU = torch.device("cpu")
 
@@ -32,15 +37,44 @@ class TrainedDetector:
     cost: Cost
 
 
+class TrainedStage(Stage[TrainedDetector]):
+    """A trained detector of the classes ``names``, for images of ``camera``."""
+
+    kind: ClassVar[str] = "detector"
+
+    detector: Callable[..., Detector]
+    device: torch.device
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Of the classes, in the order of labels."""
+
+    @property
+    @abstractmethod
+    def camera(self) -> PinholeCamera:
+        """Of the images."""
+
+    def build(self) -> Detector:
+        """The detector's shape, without parameters."""
+        camera = self.camera
+        return self.detector(num_classes=len(self.names), image_size=(camera.height, camera.width))
+
+    def pack(self, value: TrainedDetector) -> dict[str, Any]:
+        return {"params": placed(value.params, CPU), "cost": dataclasses.asdict(value.cost)}
+
+    def unpack(self, stored: Mapping[str, Any]) -> TrainedDetector:
+        return TrainedDetector(placed(stored["params"], self.device), Cost(**stored["cost"]))
+
+
 @dataclass(frozen=True)
-class DetectorStage(Stage[TrainedDetector]):
+class DetectorStage(TrainedStage):
     """A detector trained from scratch on images drawn from psi, with the same budget for every method.
 
     ``probabilities`` is the digest of p, see :meth:`SceneDistribution.digest_of`; ``name`` is that of the stage that
-    needs the detector, ``called`` describes psi in messages.
+    needs the detector, ``called`` describes psi in messages. ``targets`` are the sets whose photographs train too,
+    where ``training.real`` combines both (None: it does not).
     """
-
-    kind: ClassVar[str] = "detector"
 
     scene: SceneStage
     detector: Callable[..., Detector]
@@ -52,15 +86,25 @@ class DetectorStage(Stage[TrainedDetector]):
     name: str = field(metadata=UNKEYED)
     called: str = field(metadata=UNKEYED)
     device: torch.device = field(default=CPU, metadata=UNKEYED)
+    targets: TargetSetsStage | None = None
 
     @property
     def title(self) -> str:
-        return f"detector trained on {self.called}"
+        return f"detector trained on {self.called}" + ("" if self.targets is None else " and photographs")
 
-    def build(self) -> Detector:
-        """The detector's shape, without parameters."""
-        camera = self.scene.camera
-        return self.detector(num_classes=len(self.scene.names), image_size=(camera.height, camera.width))
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.scene.names
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.scene.camera
+
+    def photographs(self, results: Results) -> LabelledImages | None:
+        """Those that train beside the drawn images."""
+        if self.targets is None:
+            return None
+        return self.training.real.chosen(results(self.targets).train, self.seed)
 
     def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
         """The training images, equal in every call."""
@@ -79,25 +123,84 @@ class DetectorStage(Stage[TrainedDetector]):
             self.generator(),
         )
         begun, cpu_begun = time.perf_counter(), time.process_time()
-        images = self.images(scene, generator).images
+        images, sampling = self.images(scene, generator).images, None
+        drawn, photographs = len(images), self.photographs(results)
+        if photographs is not None:
+            images = LabelledImages.concatenate([images, photographs.to(images.images.device)])
+            sampling = training.real.sampling(drawn, len(photographs), training.batch_size)
         params, history = train_detector(
             detector,
             placed(detector.init(generator), self.device),
             images,
             generator,
             training.of(self.epochs),
+            sampling=sampling,
         )
         synchronise(self.device)
         cost = Cost(
-            images=len(images),
+            images=drawn,
             detector_steps=history.steps,
             seconds=time.perf_counter() - begun,
             cpu_seconds=time.process_time() - cpu_begun,
         )
         return TrainedDetector(params, cost)
 
-    def pack(self, value: TrainedDetector) -> dict[str, Any]:
-        return {"params": placed(value.params, CPU), "cost": dataclasses.asdict(value.cost)}
 
-    def unpack(self, stored: Mapping[str, Any]) -> TrainedDetector:
-        return TrainedDetector(placed(stored["params"], self.device), Cost(**stored["cost"]))
+@dataclass(frozen=True)
+class PhotographsStage(TrainedStage):
+    """A detector trained on photographs of the target: from scratch (``start`` None), or a fine-tuned one.
+
+    ``epochs`` of ``steps`` steps each are at most so many photographs a batch as ``training`` says, in shuffled passes
+    over them.
+    """
+
+    name: ClassVar[str] = "evaluate"
+
+    start: DetectorStage | None
+    targets: TargetSetsStage
+    image_camera: PinholeCamera
+    class_names: tuple[str, ...]
+    detector: Callable[..., Detector]
+    training: Training
+    epochs: int
+    steps: int
+    seed: int
+    device: torch.device = field(default=CPU, metadata=UNKEYED)
+
+    @property
+    def title(self) -> str:
+        if self.start is None:
+            return "detector trained on photographs only"
+        return f"{self.start.title}, fine-tuned on photographs"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.class_names
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.image_camera
+
+    def make(self, results: Results) -> TrainedDetector:
+        detector, training = self.build(), self.training
+        generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 4)
+        photographs = training.real.chosen(results(self.targets).train, self.seed).to(self.device)
+        begun, cpu_begun = time.perf_counter(), time.process_time()
+        start = (
+            placed(detector.init(generator), self.device)
+            if self.start is None
+            else results(self.start).params
+        )
+        how = training.of(self.epochs)
+        if self.start is not None:
+            how = replace(how, learning_rate=training.real.finetune_learning_rate)
+        count = len(photographs)
+        sampling = Sampling((count,), (min(training.batch_size, count),), self.steps)
+        params, history = train_detector(detector, start, photographs, generator, how, sampling=sampling)
+        synchronise(self.device)
+        cost = Cost(
+            detector_steps=history.steps,
+            seconds=time.perf_counter() - begun,
+            cpu_seconds=time.process_time() - cpu_begun,
+        )
+        return TrainedDetector(params, cost if self.start is None else cost + results(self.start).cost)

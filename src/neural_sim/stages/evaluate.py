@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 
 from neural_sim.detector.metrics import AveragePrecision, evaluate
-from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.detector import TrainedStage
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 
@@ -30,7 +30,7 @@ class ScoresStage(Stage[Scores]):
     name: ClassVar[str] = "evaluate"
     kind: ClassVar[str] = "evaluate"
 
-    trained: DetectorStage
+    trained: TrainedStage
     targets: TargetSetsStage
     part: Literal["val", "test"] = "test"
 
@@ -41,7 +41,7 @@ class ScoresStage(Stage[Scores]):
     def make(self, results: Results) -> Scores:
         params, images = results(self.trained).params, getattr(results(self.targets), self.part)
         detections = self.trained.build().predict(params, images.images)
-        return Scores(evaluate(detections, images, list(self.trained.scene.names)), detections)
+        return Scores(evaluate(detections, images, list(self.trained.names)), detections)
 
     def pack(self, value: Scores) -> dict[str, Any]:
         return {"ap": dataclasses.asdict(value.ap), "detections": value.detections}

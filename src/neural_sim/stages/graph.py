@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -13,11 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.baseline.base import HypergradientLoop
+from neural_sim.detector.real import Real
 from neural_sim.devices import device_of
 from neural_sim.objects.photos import Photos
 from neural_sim.outer.records import IterationRecord, LearnedPsi
 from neural_sim.stages.captures import Captures, PhotoViewsStage
-from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
@@ -49,6 +50,17 @@ class Graph:
         if unknown:
             raise ValueError(
                 f"biased or outer.learned names {sorted(unknown)}, objects are {list(self.names)}"
+            )
+        real = self.experiment.training.real
+        if real.used and not getattr(imaging.target, "trains", False):
+            raise ValueError(
+                f"training.real.mode={real.mode} wants labelled photographs: set target.train_fraction (of a target of "
+                "photographs) or target.train_per_object (of a rendered one)"
+            )
+        if real.combined and loop.outer.certify_every and loop.outer.certify == "retrained":
+            raise ValueError(
+                "outer.certify=retrained has a problem of synthesised images only; with training.real.mode=combined "
+                "want outer.certify=response"
             )
 
     @cached_property
@@ -131,15 +143,36 @@ class Graph:
 
     @cached_property
     def warm_start(self) -> DetectorStage:
-        """The detector that the psi loop begins with; with equal epochs it is also the one scored as ``ns``."""
+        """The detector that the psi loop begins with; with equal epochs, and unless scored detectors are fine-tuned, it
+        is also the one scored as ``ns``."""
         epochs = self.experiment.training.warm_epochs
         return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
 
-    def _detector(self, psi: Psi, epochs: int, name: str, called: str) -> DetectorStage:
-        x = self.experiment
+    def _detector(
+        self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True
+    ) -> DetectorStage:
+        """A detector trained on a distribution, and on photographs where the training combines both."""
+        x, training = self.experiment, self.experiment.training
+        combined = photographs and training.real.combined
+        if not combined:  # so that its key is that of a run without photographs
+            training = replace(training, real=Real())
         probabilities = x.imaging.distribution.digest_of(psi)
         return DetectorStage(
-            self.scene, x.detector, x.training, epochs, probabilities, x.run.seed, psi, name, called, self.device
+            self.scene, x.detector, training, epochs, probabilities, x.run.seed, psi, name, called, self.device,
+            self.targets if combined else None,
+        )  # fmt: skip
+
+    def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
+        """A detector trained on photographs, in as many steps as one on images, or fine-tuned on them."""
+        x, training, real = self.experiment, self.experiment.training, self.experiment.training.real
+        steps = -(-training.images_per_object * len(self.names) // training.batch_size)
+        epochs = training.cold_epochs
+        if start is None:  # the same for all modes
+            training = replace(training, real=Real("combined", real.count, real.fraction))
+        else:
+            epochs, steps = 1, max(1, round(real.finetune * steps * epochs))
+        return PhotographsStage(
+            start, self.targets, self.camera, self.names, x.detector, training, epochs, steps, x.run.seed, self.device
         )  # fmt: skip
 
     @cached_property
@@ -155,17 +188,34 @@ class Graph:
 
     # --- scores ---
 
-    def trained_on(self, psi: Psi, called: str) -> DetectorStage:
-        """The detector that is scored for a distribution."""
+    def synthetic(self, psi: Psi, called: str) -> DetectorStage:
+        """The detector of a distribution, trained without photographs."""
+        return self._detector(
+            psi, self.experiment.training.cold_epochs, "evaluate", called, photographs=False
+        )
+
+    def trained_on(self, psi: Psi, called: str) -> TrainedStage:
+        """The detector that is scored for a distribution, trained or fine-tuned on photographs as ``training.real``
+        says."""
+        real = self.experiment.training.real
+        if real.used and real.mode == "pretrain":
+            return self._on_photographs(self.synthetic(psi, called))
         return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
 
     def scores(self, psi: Psi, called: str, part: Literal["val", "test"] = "test") -> ScoresStage:
         """Of the detector trained on a distribution."""
         return ScoresStage(self.trained_on(psi, called), self.targets, part)
 
-    def compared(self, learned: LearnedPsi) -> dict[str, Psi]:
-        """The distributions whose detectors are compared: initial (NS), learned, and the target's own (matched)."""
-        return {"ns": self.psi("initial"), "learned": learned.last, "matched": self.psi("target")}
+    def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
+        """The scores that a run reports: of the initial distribution (``ns``), the learned one, and the target's own
+        (``matched``); where photographs train too, also without them (``synthetic_only``, of the learned distribution)
+        and on them alone (``real_only``)."""
+        psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.psi("target")}
+        rows = {called: self.scores(psi, called) for called, psi in psis.items()}
+        if self.experiment.training.real.used:
+            rows["synthetic_only"] = ScoresStage(self.synthetic(learned.last, "learned"), self.targets)
+            rows["real_only"] = ScoresStage(self._on_photographs(None), self.targets)
+        return rows
 
     def on_the_way(self, learned: LearnedPsi) -> dict[int, Psi]:
         """psi by iterations done: at the start, after the parts of all iterations in ``score_at``, at the end."""

@@ -89,7 +89,7 @@ class PsiStage(Stage[LearnedPsi]):
         generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 2)
         inner = InnerLoop(
             scene, self.warm_start.build(), results(self.warm_start).params, results(self.targets).val, self.outer,
-            training, generator, self.draws,
+            training, generator, self.draws, self.warm_start.photographs(results),
         )  # fmt: skip
         if self.parts is not None:
             return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver)

@@ -38,9 +38,9 @@ def write_report(context: Context) -> None:
     scores: dict[str, Scores] = {}
     if "evaluate" in context.stages:
         compared = graph.compared(learned).items()
-        scores = {called: results(graph.scores(psi, called)) for called, psi in compared}
+        scores = {called: results(stage) for called, stage in compared}
     report = _results(context, scores)
-    rendered = graph.trained_on(learned.last, "learned").images(results(graph.scene))
+    rendered = graph.synthetic(learned.last, "learned").images(results(graph.scene))
     drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
     detections = scores["learned"].detections if scores else []
     write_figures(report, drawn.images, test, detections, folder / "figures")
@@ -122,7 +122,18 @@ def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:
             name: {angle: results(graph.symmetry(name, angle)) for angle in angles} for name in graph.names
         },
         identity=_identity(context),
+        real=_real(context),
     )
+
+
+def _real(context: Context) -> dict[str, Any]:
+    """How photographs trained; empty where none did."""
+    real = context.experiment.training.real
+    if not real.used:
+        return {}
+    train = context.results(context.graph.targets).train
+    chosen = real.chosen(train, context.experiment.run.seed)
+    return {"mode": real.mode, "photographs": len(chosen), "available": 0 if train is None else len(train)}
 
 
 def _curve(context: Context) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Stage ``target_sets``: the labelled target images, in a part that steers psi and a part that is scored."""
+"""Stage ``target_sets``: the labelled target images, in parts that steer psi, are scored, and train detectors."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 @dataclass(frozen=True)
 class TargetSets:
-    """``val`` steers psi, ``test`` is scored; they share no image."""
+    """``val`` steers psi, ``test`` is scored, ``train`` trains detectors where ``training.real`` asks for it (None:
+    there is no such part); they share no image."""
 
     val: LabelledImages
     test: LabelledImages
+    train: LabelledImages | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class TargetSetsStage(Stage[TargetSets]):
         return TargetSets(**self.target.sets(objects, *how))
 
     def pack(self, value: TargetSets) -> dict[str, dict[str, Tensor]]:
-        return {part.name: _packed(getattr(value, part.name)) for part in fields(TargetSets)}
+        parts = {part.name: getattr(value, part.name) for part in fields(TargetSets)}
+        return {name: _packed(images) for name, images in parts.items() if images is not None}
 
     def unpack(self, stored: Mapping[str, Mapping[str, Tensor]]) -> TargetSets:
         return TargetSets(**{part: _unpacked(images) for part, images in stored.items()})

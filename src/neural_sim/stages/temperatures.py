@@ -22,11 +22,15 @@ class TemperaturesStep(Temperatures):
         """Measure at the initial psi and the warm-started detector; to the run's folder and MLflow.
 
         Raises:
-            ValueError: an estimator that does not relax its draws.
+            ValueError: an estimator that does not relax its draws, or photographs among the training images.
         """
         x, begun = context.experiment, time.time()
         if not isinstance(x.loop.gradient, PathwiseEstimator):
             raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
+        if x.training.real.combined:
+            raise ValueError(
+                "temperatures: want training.real.mode=none, their problem has synthesised images only"
+            )
         loop, images = frozen_loop(context, x.run.seed), x.loop.outer.images_per_object
         rows, truths = self.measure(loop, x.loop.gradient, images, x.run.seed)
         named = x.run.name, x.run.seed, x.config

@@ -42,9 +42,11 @@ def psi(context: Context) -> None:
 def evaluate(context: Context) -> None:
     graph, results = context.graph, context.results
     learned = results(graph.learned)
-    on_the_way = {f"psi after {i} iterations": at for i, at in graph.on_the_way(learned).items()}
-    for called, at in context.shown([*graph.compared(learned).items(), *on_the_way.items()], "evaluate"):
-        results(graph.scores(at, called))
+    on_the_way = [
+        graph.scores(at, f"psi after {i} iterations") for i, at in graph.on_the_way(learned).items()
+    ]
+    for scores in context.shown([*graph.compared(learned).values(), *on_the_way], "evaluate"):
+        results(scores)
     # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
     context.returned = results(graph.scores(learned.last, "learned", "val")).ap.ap
 

@@ -10,14 +10,13 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Head
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.hvp import gradient
 from neural_sim.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, not_finite, worst
+from neural_sim.stress.detectors import small_detector
 from neural_sim.stress.rendering import (
     EXACT,
     along_x,
@@ -155,7 +154,7 @@ def extreme_boxes(scope: Scope) -> Checks:
     finite; also without any box, where every anchor is background.
     """
     side = 32.0
-    network = RetinaNet(3, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
+    network = small_detector(3)
     params = {name: value.double() for name, value in network.init(scope.generator()).items()}
     backbone, head = network.split(params)
     pixels = torch.rand(1, 3, 32, 32, generator=scope.generator(), dtype=DOUBLE)

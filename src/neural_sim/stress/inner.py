@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.base import MixedDerivative, Params
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.solver.adjoint import AdjointSolver
@@ -24,6 +22,7 @@ from neural_sim.solver.hvp import gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.solution import Status
 from neural_sim.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite, worst
+from neural_sim.stress.detectors import small_detector
 from neural_sim.stress.linear import UNTRUSTED, ended, logarithmic, relative, system
 from neural_sim.types import LabelledImages
 
@@ -195,7 +194,7 @@ def untrained_detector(scope: Scope) -> Checks:
     derivative of the loss along the gradient itself, extrapolated from two central differences (Richardson). The
     tolerance is that reference's own error: what the extrapolation changed, and eps L / step.
     """
-    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
+    detector = small_detector(2)
     start = {name: value.double() for name, value in detector.init(scope.generator()).items()}
     backbone, head = detector.split(start)
     pixels = torch.rand(3, 3, 32, 32, generator=scope.generator(), dtype=DOUBLE)

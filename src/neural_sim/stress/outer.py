@@ -10,8 +10,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.outer.inner import InnerLoop
@@ -25,6 +23,7 @@ from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
+from neural_sim.stress.detectors import small_detector
 from neural_sim.stress.rendering import block
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.draws import HardDraws
@@ -196,7 +195,7 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
         synthesizer,
         SceneDistribution.of([Pose(bins=4)]),
     )
-    network = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
+    network = small_detector(1)
     psi = torch.zeros(1, 4)
     validation = scene.training_set(psi, 2, generator).images
     settings = Outer(

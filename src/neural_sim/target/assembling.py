@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,3 +45,12 @@ def assemble(photos: Sequence[Photo]) -> LabelledImages:
 def large_enough(boxes: Float[Tensor, "b 4"], minimum_side: float) -> Tensor:
     """Which boxes have both sides of at least so many pixels."""
     return ((boxes[:, 2:] - boxes[:, :2]) >= minimum_side).all(-1)
+
+
+def boxes_by_bin(images: LabelledImages, names: Sequence[str]) -> str:
+    """How many boxes of each object are in each bin, for the log."""
+    counts = [Counter((images.bins[images.labels == label] + 1).tolist()) for label in range(len(names))]
+    return "; ".join(
+        f"{name} " + ", ".join(f"{b or 'unknown'}: {count}" for b, count in sorted(own.items()))
+        for name, own in zip(names, counts, strict=True) if own
+    )  # fmt: skip

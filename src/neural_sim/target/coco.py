@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from neural_sim.target.coco_file import labels_of_categories, read_coco
 from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.near_duplicates import near_duplicates, thumbnail
-from neural_sim.target.split import joined, split
+from neural_sim.target.split import check_fraction, for_training, joined, split
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -52,8 +53,9 @@ class CocoTarget:
         categories: category name -> object name, null to leave a category out. Names not listed stand for
             themselves.
         val_fraction: fraction of the images for validation, which psi is learned from; the rest is scored once. With
-        ``split_by`` as near to it as
-            whole groups come, see :func:`neural_sim.target.split.split`.
+            ``split_by`` as near to it as whole groups come, see :func:`neural_sim.target.split.split`.
+        train_fraction: of the images that are not scored, for training (``training.real``), whole groups too; the
+            others are for validation. None: all of them are.
         split_by: what images belong together and so lie in one part, as frames of one video must:
             ``attribute:<name>`` of the file's image entries, or a regular expression on ``file_name``, see
             :func:`neural_sim.target.groups.groups_of`. None: every image is its own group, and near-duplicates in both
@@ -74,6 +76,7 @@ class CocoTarget:
     images: str | Path | None = None
     categories: Mapping[str, str | None] | None = None
     val_fraction: float = 0.3
+    train_fraction: float | None = None
     limit: int | None = None
     minimum_side: float = 2.0
     split_by: str | None = None
@@ -84,6 +87,7 @@ class CocoTarget:
             raise ValueError(f"target.annotations: no such file: {self._file}")
         if not 0.0 < self.val_fraction < 1.0:
             raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
+        check_fraction(self.train_fraction)
         if self.limit is not None and self.limit < 1:
             raise ValueError(f"target.limit must be at least 1 or null, got {self.limit}")
         if not self._entries:
@@ -127,6 +131,11 @@ class CocoTarget:
         names = [str(entry["file_name"]) for entry in self._document["images"]]
         return content_digest({"": self._file, **{name: self._folder / name for name in names}})
 
+    @property
+    def trains(self) -> bool:
+        """Whether some of the images are for training."""
+        return self.train_fraction is not None
+
     def camera(self) -> PinholeCamera:
         """Of the file's entry ``camera``, see :func:`neural_sim.target.camera.camera_of_entry`.
 
@@ -158,7 +167,8 @@ class CocoTarget:
         seed: int,
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
-        """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
+        """``val``, ``test`` and any ``train``, with the objects' names as classes; takes the arguments of every target
+        set."""
         first = next(iter(distribution.binned), None)
         if self._bins is not None and first is not None and max(self._bins) >= first.bins:
             raise ValueError(
@@ -169,16 +179,21 @@ class CocoTarget:
         photos = [item.photo for item in read]
         pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
         groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
-        val, test = split(groups, self.val_fraction, torch.Generator().manual_seed(seed))
+        generator = torch.Generator().manual_seed(seed)
+        val, test = (part.tolist() for part in split(groups, self.val_fraction, generator))
+        parts = {**for_training(val, groups, self.train_fraction, generator), "test": test}
         if self.split_by is None:
-            self._warn_of_duplicates(torch.stack([item.thumbnail for item in read]), val, test)
+            thumbnails = torch.stack([item.thumbnail for item in read])
+            for first_part, second_part in itertools.combinations(parts, 2):
+                self._warn_of_duplicates(thumbnails, parts, first_part, second_part)
         else:
             _log.info(
-                "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g)",
-                self._file, self.split_by, len(set(self._groups)), len(val), len(photos), self.val_fraction,
+                "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g), train %d",
+                self._file, self.split_by, len(set(self._groups)), len(parts["val"]), len(photos),
+                self.val_fraction, len(parts.get("train", ())),
             )  # fmt: skip
         images = assemble(photos)
-        return {"val": images.select(val), "test": images.select(test)}
+        return {part: images.select(torch.tensor(rows)) for part, rows in parts.items()}
 
     def load(self, class_names: Sequence[str], height: int, width: int) -> LabelledImages:
         """All images; labels are positions in ``class_names``. Crowd annotations are left out, boxes clipped.
@@ -202,16 +217,18 @@ class CocoTarget:
             _log.warning("%s: %d boxes shorter than %g px dropped", self._file, dropped, self.minimum_side)
         return read
 
-    def _warn_of_duplicates(self, thumbnails: Tensor, val: Tensor, test: Tensor) -> None:
-        """Warn: where psi was learned from one frame of a video, AP on the next frame says little."""
-        duplicates = near_duplicates(thumbnails[val], thumbnails[test])
+    def _warn_of_duplicates(
+        self, thumbnails: Tensor, parts: Mapping[str, list[int]], first: str, second: str
+    ) -> None:
+        """Warn: where one frame of a video trained a detector or steered psi, AP on the next frame says little."""
+        duplicates = near_duplicates(thumbnails[parts[first]], thumbnails[parts[second]])
         if duplicates.test:
-            names = [str(self._entries[int(rows[i[0]])]["file_name"])
-                     for rows, i in ((test, duplicates.test), (val, duplicates.val))]  # fmt: skip
+            names = [str(self._entries[parts[part][i[0]]]["file_name"])
+                     for part, i in ((second, duplicates.test), (first, duplicates.val))]  # fmt: skip
             _log.warning(
-                "%s: %d of %d test images look like one of val (%s like %s); if they are of one video, scene or "
+                "%s: %d of %d %s images look like one of %s (%s like %s); if they are of one video, scene or "
                 "capture, keep them together by target.split_by",
-                self._file, len(duplicates.test), duplicates.compared, *names,
+                self._file, len(duplicates.test), duplicates.compared, second, first, *names,
             )  # fmt: skip
 
     def _photo(

@@ -22,10 +22,10 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
-from neural_sim.target.assembling import Photo, assemble, large_enough
+from neural_sim.target.assembling import Photo, assemble, boxes_by_bin, large_enough
 from neural_sim.target.frames import Frame, FrameName, Listed, opened
 from neural_sim.target.letterbox import letterbox
-from neural_sim.target.split import split
+from neural_sim.target.split import check_fraction, for_training, split
 from neural_sim.target.viewpoint import bins_of_poses
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -47,6 +47,8 @@ class PosedTarget(ABC):
         every: of the frames of a scene one in so many is taken, where no list of the data set says which.
         val_fraction: of the photographs, for the part that steers psi, where the data set has no part of its own for
             that: as near to it as whole scenes come, see :func:`neural_sim.target.split.split`.
+        train_fraction: of the photographs that are not scored, for training (``training.real``), as near to it as whole
+            scenes come; the others steer psi. None: all of them do.
         limit: at most so many photographs in each part, evenly spaced.
         min_visibility: objects of which a smaller fraction is visible have no box.
         minimum_side: boxes with a side shorter than this many pixels after resizing are dropped and counted.
@@ -62,6 +64,7 @@ class PosedTarget(ABC):
     unmatched: Unmatched = "refuse"
     every: int = 50
     val_fraction: float = 0.3
+    train_fraction: float | None = None
     limit: int | None = None
     min_visibility: float = 0.1
     minimum_side: float = 2.0
@@ -74,6 +77,7 @@ class PosedTarget(ABC):
                 raise ValueError(f"target.{key} must be at least 1, got {value}")
         if not 0.0 < self.val_fraction < 1.0:
             raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
+        check_fraction(self.train_fraction)
         if not 0.0 <= self.min_visibility <= 1.0:
             raise ValueError(f"target.min_visibility must lie in [0, 1], got {self.min_visibility}")
         if self.unmatched not in get_args(Unmatched):
@@ -139,15 +143,22 @@ class PosedTarget(ABC):
             )
         return listed
 
+    @property
+    def trains(self) -> bool:
+        """Whether some of the photographs are for training."""
+        return self.train_fraction is not None
+
     def parts(self, seed: int) -> dict[str, list[FrameName]]:
-        """The photographs of ``val``, which steers psi, and of ``test``; they share no scene."""
-        listed = self._chosen
-        val, test = listed.val, listed.test
+        """The photographs of ``val``, which steers psi, ``test`` and any ``train``; they share no scene."""
+        listed, generator = self._chosen, torch.Generator().manual_seed(seed)
+        scenes = [name.scene for name in listed.val]
+        rows, test = list(range(len(scenes))), listed.test
         if test is None:
-            generator = torch.Generator().manual_seed(seed)
-            rows = split([name.scene for name in val], self.val_fraction, generator)
-            val, test = ([listed.val[row] for row in part.tolist()] for part in rows)
-        return {"val": self._limited(sorted(val)), "test": self._limited(sorted(test))}
+            val, scored = (part.tolist() for part in split(scenes, self.val_fraction, generator))
+            rows, test = val, [listed.val[row] for row in scored]
+        unscored = for_training(rows, scenes, self.train_fraction, generator)
+        parts = {part: [listed.val[row] for row in own] for part, own in unscored.items()}
+        return {part: self._limited(sorted(names)) for part, names in {**parts, "test": test}.items()}
 
     def _limited(self, names: list[FrameName]) -> list[FrameName]:
         if self.limit is None or self.limit >= len(names):
@@ -195,14 +206,15 @@ class PosedTarget(ABC):
         seed: int,
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
-        """``val`` and ``test`` with the objects' names as classes; takes the arguments of every target set."""
+        """``val``, ``test`` and any ``train``, with the objects' names as classes; takes the arguments of every target
+        set."""
         radii = {name: item.radius for name, item in objects.items()}
         size, names, made = (camera.height, camera.width), list(objects), {}
         for part, frames in self.parts(seed).items():
             made[part] = self.load(frames, names, *size, distribution, radii)
             _log.info(
                 "%s: %s has %d photographs of scenes %s; boxes in each pose bin, from 1: %s", self._root, part,
-                len(frames), ", ".join(sorted({frame.scene for frame in frames})), _counted(made[part], names),
+                len(frames), ", ".join(sorted({frame.scene for frame in frames})), boxes_by_bin(made[part], names),
             )  # fmt: skip
         return made
 
@@ -286,12 +298,3 @@ class PosedTarget(ABC):
         centre = self._centre(class_name)
         at: Tensor | None = None if centre is None else torch.from_numpy(centre)[None]
         return int(bins_of_poses(distribution, torch.from_numpy(pose)[None], radius, at))
-
-
-def _counted(images: LabelledImages, names: Sequence[str]) -> str:
-    """How many boxes of each object are in each bin, for the log."""
-    counts = [Counter((images.bins[images.labels == label] + 1).tolist()) for label in range(len(names))]
-    return "; ".join(
-        f"{name} " + ", ".join(f"{b or 'unknown'}: {count}" for b, count in sorted(own.items()))
-        for name, own in zip(names, counts, strict=True) if own
-    )  # fmt: skip

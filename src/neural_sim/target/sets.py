@@ -1,4 +1,4 @@
-"""The target set of a controlled experiment: objects rendered at the target distribution, in two disjoint parts."""
+"""The target set of a controlled experiment: objects rendered at the target distribution, in disjoint parts."""
 
 from __future__ import annotations
 
@@ -21,16 +21,25 @@ class RenderedTarget:
     """Images per object in ``val``, from which psi is learned, and in ``test``, which is scored once.
 
     ``test_per_biased_object`` is for objects named in some parameter's ``biased``, whose scores are compared.
+    ``train_per_object`` images stand for labelled photographs in training (``training.real``); 0: none do.
     """
 
     val_per_object: int = 50
     test_per_object: int = 100
     test_per_biased_object: int = 200
+    train_per_object: int = 0
 
     def __post_init__(self) -> None:
         for name in ("val_per_object", "test_per_object", "test_per_biased_object"):
             if getattr(self, name) < 1:
                 raise ValueError(f"target.{name} must be at least 1, got {getattr(self, name)}")
+        if self.train_per_object < 0:
+            raise ValueError(f"target.train_per_object must be at least 0, got {self.train_per_object}")
+
+    @property
+    def trains(self) -> bool:
+        """Whether some of the images are for training."""
+        return self.train_per_object > 0
 
     def sets(
         self,
@@ -41,11 +50,12 @@ class RenderedTarget:
         seed: int,
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
-        """``val`` and ``test``, drawn from generators of their own: no pose, background or image is shared."""
+        """``val``, ``test`` and any ``train``, drawn from generators of their own: no pose, background or image is
+        shared."""
         biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
         radii = distribution.radii({name: item.radius for name, item in objects.items()})
         parts = {}
-        for part, name in enumerate(("val", "test")):
+        for part, name in enumerate(("val", "test", "train") if self.trains else ("val", "test")):
             generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
             counts = [self._count(name, item.name in biased) for item in objects.values()]
             layout = None
@@ -62,6 +72,6 @@ class RenderedTarget:
 
     def _count(self, part: str, biased: bool) -> int:
         """Images of an object; of several objects an image, those whose own object it is."""
-        if part == "val":
-            return self.val_per_object
+        if part != "test":
+            return self.val_per_object if part == "val" else self.train_per_object
         return self.test_per_biased_object if biased else self.test_per_object

@@ -1,4 +1,4 @@
-"""Validation and test parts of one labelled set, whole groups of images in each."""
+"""Parts of one labelled set for validation, test and training, whole groups of images in each."""
 
 from __future__ import annotations
 
@@ -10,37 +10,63 @@ from torch import Tensor
 
 
 def split(
-    groups: Sequence[Hashable], fraction: float, generator: torch.Generator
-) -> tuple[Int[Tensor, "val"], Int[Tensor, "test"]]:
-    """Rows of the images for validation and of those for test, by the group of each image.
+    groups: Sequence[Hashable],
+    fraction: float,
+    generator: torch.Generator,
+    parts: tuple[str, str] = ("validation", "test"),
+) -> tuple[Int[Tensor, "first"], Int[Tensor, "second"]]:
+    """Rows of the images of two ``parts``, such as validation and test, by the group of each image.
 
-    All images of a group land in the same part, and neither part is empty. Groups are put in random order. Validation
-    gets as many images as groups allow that is nearest to ``fraction`` of all, the smaller of two equally near; of
+    All images of a group land in the same part, and neither part is empty. Groups are put in random order. The first
+    part gets as many images as groups allow that is nearest to ``fraction`` of all, the smaller of two equally near; of
     the choices of groups that have that number, the one that needs the fewest groups in that order. Where every image
     is a group of its own, that is a random part of exactly the size asked for.
 
     Raises:
         ValueError: a fraction outside (0, 1), one that leaves a part empty, or fewer than two groups.
     """
+    first, second = parts
     if not 0.0 < fraction < 1.0:
-        raise ValueError(f"target: the validation fraction must lie in (0, 1), got {fraction}")
+        raise ValueError(f"target: the {first} fraction must lie in (0, 1), got {fraction}")
     wanted = round(fraction * len(groups))
     if not 0 < wanted < len(groups):
         raise ValueError(
-            f"target: {fraction} of {len(groups)} images leaves validation or test empty; give more images"
+            f"target: {fraction} of {len(groups)} images leaves {first} or {second} empty; give more images"
         )
     members: dict[Hashable, list[int]] = {}
     for row, group in enumerate(groups):
         members.setdefault(group, []).append(row)
     if len(members) < 2:
-        raise ValueError(f"target: want at least two groups of images for two parts, got {len(members)}")
+        raise ValueError(
+            f"target: want at least two groups of images for two parts, got {len(members)} for {first} and {second}"
+        )
     order, rows = torch.randperm(len(members), generator=generator).tolist(), list(members.values())
     shuffled = [rows[i] for i in order]
     chosen = nearest([len(group) for group in shuffled], wanted)
-    parts = ([], [])
+    taken = ([], [])
     for i, group in enumerate(shuffled):
-        parts[i not in chosen].extend(group)
-    return torch.tensor(parts[0]), torch.tensor(parts[1])
+        taken[i not in chosen].extend(group)
+    return torch.tensor(taken[0]), torch.tensor(taken[1])
+
+
+def for_training(
+    val: Sequence[int], groups: Sequence[Hashable], fraction: float | None, generator: torch.Generator
+) -> dict[str, list[int]]:
+    """The rows ``val``, which are not scored, as parts ``val`` and, with a ``fraction``, ``train``.
+
+    ``groups`` are those of all rows; no group is in both parts, see :func:`split`. Which rows are scored does not
+    depend on the fraction.
+    """
+    if fraction is None:
+        return {"val": list(val)}
+    train, rest = split([groups[row] for row in val], fraction, generator, ("training", "validation"))
+    return {"train": [val[row] for row in train.tolist()], "val": [val[row] for row in rest.tolist()]}
+
+
+def check_fraction(fraction: float | None) -> None:
+    """Raises ``ValueError`` for a ``target.train_fraction`` that is none."""
+    if fraction is not None and not 0.0 < fraction < 1.0:
+        raise ValueError(f"target.train_fraction must lie in (0, 1) or be null, got {fraction}")
 
 
 def nearest(sizes: Sequence[int], wanted: int) -> set[int]:

@@ -1,0 +1,144 @@
+"""FCOS (Tian et al. 2019): every place of every level is a point that predicts its distances to the sides of a box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchvision.models.detection.fcos import FCOSClassificationHead, FCOSRegressionHead
+from torchvision.ops import clip_boxes_to_image
+
+from neural_sim.detector.backbones import group_norm
+from neural_sim.detector.losses import focal_loss
+from neural_sim.detector.network import fixed_anchors
+from neural_sim.detector.protocol import Outputs
+from neural_sim.detector.pyramid import PyramidDetector, check_common
+from neural_sim.detector.settings import Anchors, Backbone, Detections, Head, Points, check
+from neural_sim.detector.targets import Targets, assign_points
+
+
+class FcosHead(nn.Module):
+    """torchvision's two branches; the code is the distances to the left, upper, right and lower side of the box in
+    strides, and the centre-ness logit. Distances are positive by softplus, where torchvision's ReLU has no curvature
+    and at negative values no gradient; ``activation`` relu keeps that."""
+
+    def __init__(self, settings: Head, num_classes: int, activation: str) -> None:
+        super().__init__()
+        norm = group_norm if settings.normalisation == "group" else lambda _: nn.Identity()
+        self.classification_head = FCOSClassificationHead(
+            settings.channels, 1, num_classes, settings.convs, norm_layer=norm
+        )
+        self.regression_head = FCOSRegressionHead(settings.channels, 1, settings.convs, norm_layer=norm)
+        self.positive = F.relu if activation == "relu" else F.softplus
+
+    def forward(self, levels: list[Tensor]) -> dict[str, Tensor]:
+        codes, head = [], self.regression_head
+        for level in levels:
+            shared = head.conv(level)
+            code = torch.cat([self.positive(head.bbox_reg(shared)), head.bbox_ctrness(shared)], 1)
+            codes.append(code.flatten(2).transpose(1, 2))
+        return {"cls_logits": self.classification_head(levels), "bbox_regression": torch.cat(codes, 1)}
+
+
+class Fcos(PyramidDetector):
+    """An FCOS for images of one size; holds its shape, its points and its loss, never its parameters.
+
+    Args:
+        points: which points should find which object.
+        focal_alpha, focal_gamma: of the focal loss (Lin et al. 2017, Eq. 5).
+
+    See :class:`PyramidDetector` for the others, which it checks.
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        image_size: int | tuple[int, int] = 96,
+        backbone: Backbone = Backbone(),
+        head: Head = Head(),
+        points: Points = Points(),
+        focal_alpha: float = 0.25,
+        focal_gamma: float = 2.0,
+        detections: Detections = Detections(),
+        activation: str = "silu",
+        proximal: float = 0.0,
+    ) -> None:
+        check_common(num_classes, activation, proximal)
+        check("detector", focal_alpha=(focal_alpha, 0.0 < focal_alpha < 1.0, "inside (0, 1)"),
+              focal_gamma=(focal_gamma, focal_gamma >= 0.0, "at least 0"))  # fmt: skip
+        super().__init__(
+            num_classes, image_size, backbone, head, points.strides, "detector.points",
+            FcosHead(head, num_classes, activation), detections, activation, proximal,
+        )  # fmt: skip
+        self._focal, self._radius = (focal_alpha, focal_gamma), points.radius
+        # torchvision's points are the centres of anchors of a stride's size.
+        squares = Anchors(points.strides, [[stride] for stride in points.strides], None)
+        cells, self.anchors_per_level = fixed_anchors(squares, self.image_size)
+        self.points, self.strides = 0.5 * (cells[:, :2] + cells[:, 2:]), cells[:, 2] - cells[:, 0]
+        self.ranges = _of_points(points.ranges(min(self.image_size)), self.anchors_per_level)
+
+    def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
+        """Targets of every point, see :func:`targets.assign_points`.
+
+        Raises:
+            ValueError: where a label is not below ``num_classes``, or a box has no area.
+        """
+        self.check_labels(labels)
+        points, strides, ranges = (part.to(boxes) for part in (self.points, self.strides, self.ranges))
+        return assign_points(points, strides, ranges, boxes, labels, self._radius)
+
+    def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
+        """Focal loss, loss of the generalised intersection over union (Rezatofighi et al. 2019) and centre-ness loss of
+        each image, each a sum over points by the number of foreground points."""
+        (logits, code), labels = outputs, targets.labels
+        wanted = (labels[..., None] == torch.arange(self.num_classes, device=labels.device)).to(logits.dtype)
+        foreground = (labels >= 0).to(logits.dtype)
+        focal = focal_loss(logits, wanted, *self._focal).sum(-1)
+        distances = targets.deltas.to(code.dtype)
+        apart = 1.0 - generalised_iou(code[..., :4], distances)
+        centred = centreness(distances)
+        # Cross-entropy of a logit, by softplus, which has derivatives of every order in both modes.
+        off_centre = F.softplus(code[..., 4]) - centred * code[..., 4]
+        return (focal + (apart + off_centre) * foreground).sum(-1) / foreground.sum(-1).clamp(min=1)
+
+    def decode(
+        self, code: Float[Tensor, "*n 5"], anchor: Int[Tensor, "m"] | None = None
+    ) -> Float[Tensor, "*n 4"]:
+        points, strides = self.points.to(code), self.strides.to(code)
+        if anchor is not None:
+            points, strides = points[anchor], strides[anchor]
+        reach = code[..., :4] * strides[:, None]
+        boxes = torch.cat([points - reach[..., :2], points + reach[..., 2:]], -1)
+        return clip_boxes_to_image(boxes.reshape(-1, 4), self.image_size).reshape(boxes.shape)
+
+    def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
+        """Logits of torchvision's scores, the geometric means of class probability and centre-ness."""
+        logits, code = outputs
+        log = 0.5 * (F.logsigmoid(logits) + F.logsigmoid(code[..., 4:]))
+        log = log.clamp_max(-torch.finfo(log.dtype).eps)  # a score of 1 has no logit
+        return log - torch.log(-torch.expm1(log))
+
+
+def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+    """Of boxes about a common point, from its distances to their four sides; ``theirs`` have an area."""
+    least, most = torch.minimum(ours, theirs), torch.maximum(ours, theirs)
+    inside, hull, area, other = (_area(part) for part in (least, most, ours, theirs))
+    union = area + other - inside
+    return inside / union - (hull - union) / hull
+
+
+def centreness(distances: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+    """How near a point is to the centre of its box (Tian et al. 2019, Eq. 3), from its distances to the sides."""
+    before, after = distances[..., :2], distances[..., 2:]
+    return (torch.minimum(before, after) / torch.maximum(before, after)).prod(-1).sqrt()
+
+
+def _area(distances: Tensor) -> Tensor:
+    return (distances[..., :2] + distances[..., 2:]).prod(-1)
+
+
+def _of_points(ranges: Sequence[tuple[float, float]], per_level: Sequence[int]) -> Float[Tensor, "points 2"]:
+    return torch.cat([torch.tensor(r).expand(n, 2) for r, n in zip(ranges, per_level, strict=True)])

@@ -1,0 +1,152 @@
+"""Labelled photographs in a training: which of them, and in what proportion to synthetic images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.types import LabelledImages
+
+Mode = Literal["none", "combined", "pretrain"]
+
+
+@dataclass(frozen=True)
+class Real:
+    """How labelled photographs, of the target's part ``train``, are used in training.
+
+    Args:
+        mode: ``combined``: every training (warm start, psi loop, scored detectors) is on synthetic images and
+            photographs. ``pretrain``: scored detectors are trained on synthetic images and then fine-tuned on
+            photographs; warm start and psi loop see synthetic images only. ``none``: no photographs.
+        count: how many photographs; 0 is ``none``. A smaller number takes some of those that a larger one takes.
+        fraction: of the photographs, instead of ``count``. Neither: all of them.
+        batch_fraction: ``combined``: fraction of every batch that are photographs, drawn again and again. A training
+            has as many steps as without them. None: photographs are images like all others, once in every epoch.
+        finetune: ``pretrain``: steps on photographs, as a fraction of those on synthetic images.
+        finetune_learning_rate: its peak learning rate.
+
+    Raises:
+        ValueError: any of these out of its range, or both numbers of photographs.
+    """
+
+    mode: Mode = "none"
+    count: int | None = None
+    fraction: float | None = None
+    batch_fraction: float | None = 0.5
+    finetune: float = 0.3
+    finetune_learning_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise ValueError(
+                f"training.real.mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}"
+            )
+        if self.count is not None and self.fraction is not None:
+            raise ValueError(
+                f"training.real: want count or fraction, got both, {self.count} and {self.fraction}"
+            )
+        if self.count is not None and self.count < 0:
+            raise ValueError(f"training.real.count must be at least 0, got {self.count}")
+        if self.fraction is not None and not 0.0 < self.fraction <= 1.0:
+            raise ValueError(f"training.real.fraction must lie in (0, 1], got {self.fraction}")
+        if self.batch_fraction is not None and not 0.0 < self.batch_fraction < 1.0:
+            raise ValueError(
+                f"training.real.batch_fraction must lie in (0, 1) or be null, got {self.batch_fraction}"
+            )
+        for key in ("finetune", "finetune_learning_rate"):
+            if not 0.0 < getattr(self, key) < math.inf:
+                raise ValueError(f"training.real.{key} must be positive and finite, got {getattr(self, key)}")
+
+    @property
+    def used(self) -> bool:
+        """Whether any photograph trains."""
+        return self.mode != "none" and self.count != 0
+
+    @property
+    def combined(self) -> bool:
+        """Whether photographs are mixed with synthetic images."""
+        return self.used and self.mode == "combined"
+
+    def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
+        """Those that train: a random subset, the first of an order that depends on ``seed`` alone.
+
+        Raises:
+            ValueError: fewer photographs than ``count``, or none at all.
+        """
+        available = 0 if photographs is None else len(photographs)
+        count = available if self.count is None else self.count
+        if self.fraction is not None:
+            count = max(1, round(self.fraction * available))
+        if photographs is None or not 0 < count <= available:
+            raise ValueError(
+                f"training.real: want {max(1, count)} photographs or more to train on, got {available}"
+            )
+        generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 3)
+        return photographs.select(torch.randperm(available, generator=generator)[:count])
+
+    def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:
+        """How batches are drawn of the ``synthetic`` images and the ``photographs`` after them; None: all alike."""
+        if self.batch_fraction is None:
+            return None
+        real = min(max(1, round(self.batch_fraction * batch_size)), batch_size - 1)
+        steps = -(-synthetic // batch_size)
+        return Sampling((synthetic, photographs), (batch_size - real, real), steps)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Batches with a fixed number of images of each pool, taken from shuffled passes over the pool.
+
+    Args:
+        pools: sizes of the pools, which are consecutive rows of a training set.
+        per_batch: images of each pool in every batch.
+        steps: batches of an epoch.
+
+    Raises:
+        ValueError: any of these below 1, or of different lengths.
+    """
+
+    pools: tuple[int, ...]
+    per_batch: tuple[int, ...]
+    steps: int
+
+    def __post_init__(self) -> None:
+        if len(self.pools) != len(self.per_batch) or min((*self.pools, *self.per_batch, self.steps)) < 1:
+            raise ValueError(
+                "sampling: want at least one image of each pool in a batch and one step, got "
+                f"{self.per_batch} of {self.pools} in {self.steps} steps"
+            )
+
+    def batches(self, generator: torch.Generator) -> Iterator[Int[Tensor, "batch"]]:
+        """Rows of one batch after the other, without end."""
+        starts = [sum(self.pools[:place]) for place in range(len(self.pools))]
+        pools = zip(self.pools, self.per_batch, strict=True)
+        drawn = [shuffled_passes(size, count, generator) for size, count in pools]
+        while True:
+            yield torch.cat([start + next(rows) for start, rows in zip(starts, drawn, strict=True)])
+
+    @property
+    def weights(self) -> Float[Tensor, "N"]:
+        """Every image's weight in the mean loss of a batch, on average over batches; they sum to 1."""
+        total = sum(self.per_batch)
+        pools = zip(self.pools, self.per_batch, strict=True)
+        return torch.cat([torch.full((size,), count / (total * size)) for size, count in pools])
+
+
+def shuffled_passes(
+    size: int, per_batch: int, generator: torch.Generator
+) -> Iterator[Int[Tensor, "per_batch"]]:
+    """``per_batch`` of the numbers below ``size`` at a time from shuffled passes over all: each is equally likely in
+    every batch."""
+    remaining = torch.zeros(0, dtype=torch.long)
+    while True:
+        while len(remaining) < per_batch:
+            remaining = torch.cat([remaining, torch.randperm(size, generator=generator)])
+        yield remaining[:per_batch]
+        remaining = remaining[per_batch:]

@@ -1,0 +1,150 @@
+"""Runs with labelled photographs: which detectors they train and score, and which results they share."""
+
+import json
+import shutil
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.real import Sampling
+from neural_sim.detector.training import train_detector
+from neural_sim.main import build, conf_directory, context_of
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.walk import walk
+
+SMALL = [
+    "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
+    "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64", "training.cold_epochs=4",
+    "training.warm_epochs=4", "training.images_per_object=16", "training.batch_size=8", "target.val_per_object=4",
+    "objects.names=[pitcher,drill]", "target.train_per_object=6",
+]  # fmt: skip
+ROWS = {"ns", "learned", "matched", "synthetic_only", "real_only"}
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return compose("config", [*SMALL, *overrides])
+
+
+def graph_of(*overrides):
+    return Graph(build(composed(*overrides)))
+
+
+def keys(*overrides):
+    graph = graph_of(*overrides)
+    psi = graph.psi("target")
+    return {
+        "warm": graph.warm_start.key, "psi": graph.learned.key, "synthetic": graph.synthetic(psi, "").key,
+        "scored": graph.trained_on(psi, "").key, "real": graph._on_photographs(None).key,
+    }  # fmt: skip
+
+
+def test_what_photographs_do_not_train_is_shared_by_all_modes():
+    none, combined, pretrain = (
+        keys(f"training.real.mode={mode}") for mode in ("none", "combined", "pretrain")
+    )
+    assert none["synthetic"] == none["scored"] == combined["synthetic"] == pretrain["synthetic"]
+    assert none["warm"] == pretrain["warm"] != combined["warm"]
+    assert none["psi"] == pretrain["psi"] != combined["psi"]
+    assert len({none["scored"], combined["scored"], pretrain["scored"]}) == 3
+    assert combined["real"] == pretrain["real"]
+    assert keys("training.real.mode=combined", "training.real.count=0")["psi"] == none["psi"]
+    assert keys("training.real.mode=pretrain", "training.real.finetune=0.5")["psi"] == none["psi"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    ["training.real.count=3", "training.real.batch_fraction=0.25", "target.train_per_object=7", "seed=1"],
+)
+def test_which_photographs_train_and_how_tells_detectors_apart(other):
+    combined = "training.real.mode=combined"
+    assert keys(combined)["scored"] != keys(combined, other)["scored"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["training.real.mode=combined", "target.train_per_object=0"], "combined wants labelled photographs"),
+        (["training.real.mode=pretrain", "target.train_per_object=0"], "pretrain wants labelled photographs"),
+        (
+            ["training.real.mode=combined", "outer.adjoint=implicit", "outer.certify=retrained",
+             "outer.certify_every=1"], "want outer.certify=response",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_before_any_stage(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        graph_of(*overrides)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, empty_store):
+    made = tmp_path_factory.mktemp("photographs")
+    shutil.copy(empty_store, made / "mlflow.db")
+    return made
+
+
+def run(folder, *overrides):
+    paths = [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
+    context, others = context_of(composed(*overrides, *paths), folder / "run")
+    walk(context, others)
+    return context
+
+
+def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
+    context = run(folder, "training.real.mode=combined", "training.real.count=5")
+    results = json.loads((folder / "run" / "results.json").read_text())
+    assert set(results["ap"]) == ROWS
+    assert results["real"] == {"mode": "combined", "photographs": 5, "available": 12}
+    detections = json.loads((folder / "run" / "detections.json").read_text())
+    assert set(detections) == {"images", "truth", *ROWS}
+    printed = capsys.readouterr().out
+    assert "real_only" in printed and "trained on 5 photographs too (training.real.mode=combined)" in printed
+    targets, graph = context.results(context.graph.targets), context.graph
+    parts = [targets.train, targets.val, targets.test]
+    pixels = [{image.numpy().tobytes() for image in part.images} for part in parts]
+    assert not (pixels[0] & pixels[1] or pixels[0] & pixels[2] or pixels[1] & pixels[2])
+    assert graph.learned.warm_start.photographs(context.results) is not None
+
+    # real_only by hand: four epochs of as many batches as the 32 synthetic images have.
+    training, detector = context.experiment.training, graph.warm_start.build()
+    generator = torch.Generator().manual_seed(1_000_003 + 4)
+    photographs = training.real.chosen(targets.train, 0)
+    params, history = train_detector(
+        detector,
+        detector.init(generator),
+        photographs,
+        generator,
+        training.of(4),
+        sampling=Sampling((5,), (5,), 4),
+    )
+    assert history.steps == 16
+    scored = evaluate(detector.predict(params, targets.test.images), targets.test, list(graph.names))
+    assert results["ap"]["real_only"]["ap"] == scored.ap
+    for row in ("ns", "real_only", "synthetic_only"):
+        steps = context.results(
+            graph.compared(context.results(graph.learned))[row].trained
+        ).cost.detector_steps
+        assert steps == 16, row
+
+
+def test_fine_tuning_goes_on_from_the_detector_of_synthetic_images(folder):
+    stages = "stages=[views,field,target_sets,warm_start,psi,evaluate]"
+    context = run(folder, "training.real.mode=pretrain", "training.real.fraction=0.5", stages)
+    graph, made = context.graph, context.results
+    assert set(graph.compared(made(graph.learned))) == ROWS
+    assert graph.learned.warm_start.photographs(made) is None
+    learned = graph.compared(made(graph.learned))["learned"].trained
+    before, after = made(learned.start), made(learned)
+    assert before.cost.detector_steps == 16 and after.cost.detector_steps == 16 + round(0.3 * 16)
+    training, detector = context.experiment.training, graph.warm_start.build()
+    photographs = training.real.chosen(made(graph.targets).train, 0)
+    generator = torch.Generator().manual_seed(1_000_003 + 4)
+    how = training.of(1)
+    how = type(how)(1, how.batch_size, training.real.finetune_learning_rate, how.weight_decay)
+    params, _ = train_detector(
+        detector, before.params, photographs, generator, how, sampling=Sampling((6,), (6,), 5)
+    )
+    assert all(torch.equal(value, params[name]) for name, value in after.params.items())
