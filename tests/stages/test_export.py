@@ -21,7 +21,8 @@ from neural_sim.target.coco import CocoTarget
 ROOT = Path(__file__).parents[2]
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "stages=[export]", "objects.names=[pitcher,drill]",
-    "views.count=8", "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64", "export.width=48", "export.height=36",
+    "views.count=8", "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64",
+    "export.width=48", "export.height=36",
     "export.count=3", "export.workers=0", "export.psi=target", "export.detail=run",
 ]  # fmt: skip
 
@@ -142,7 +143,7 @@ def test_another_configuration_of_a_folder_is_refused_before_fields_are_fitted(
     for change, message in (("seed=9", r"made with seed=0, now it is 9"),
                             ("export.width=64", r"made with camera\.width=48, now it is 64"),
                             ("export.image_format=png", r"made with image_format=\"jpg\", now it is \"png\""),
-                            ("export.psi=initial", r"made with psi\.drill\.pose=")):  # fmt: skip
+                            ("export.psi=initial", r"made with psi\.pitcher\.pose=")):  # fmt: skip
         with pytest.raises(ValueError, match=rf"export\.folder: .*{message}"):
             export(base, tmp_path, f"export.folder={made}", "export.formats=[coco,yolo,bop]", change)
 

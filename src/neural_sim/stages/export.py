@@ -15,7 +15,6 @@ from torch import Tensor
 
 from neural_sim.cameras import reframed
 from neural_sim.checks import at_least
-from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import Quality
 from neural_sim.stages.context import Context
 from neural_sim.stages.describe import describe, modules_of
@@ -126,7 +125,7 @@ class ExportStep:
         workers = self._processes(context)
         # What an export needs beside psi it makes itself.
         results = Results(Store(x.run.store), (*context.stages, "views", "field"), context.account.reused)
-        psi, models = self._psi(context, results), models_of(graph.objects)
+        psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
         renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
         scene = Scene(graph.names, (), renderer, graph.camera, synthesis, distribution, graph.radii)
@@ -140,10 +139,10 @@ class ExportStep:
             self.image_format, self.scene_size, farthest(source), workers,
         )  # fmt: skip
 
-    def _psi(self, context: Context, results: Results) -> Float[Tensor, "objects K"]:
+    def _psi(self, context: Context) -> Float[Tensor, "objects K"]:
         graph, distribution = context.graph, context.experiment.imaging.distribution
         if self.psi == "learned":
-            return results(graph.learned).last
+            return context.results(graph.learned).last
         if self.psi in ("initial", "target"):
             return graph.psi(self.psi)
         return psi_of_file(Path(self.psi).expanduser(), distribution, graph.names)
@@ -204,16 +203,11 @@ def models_of(objects: Objects) -> list[Model]:
     return made
 
 
-def nearest_and_farthest(distribution: SceneDistribution) -> tuple[float, float]:
-    """Of the distances that are drawn, in the distribution's unit."""
-    factor = next((f for f in distribution.binned if f.coordinate == "distance"), None)
-    return distribution.ranges["distance"] if factor is None else (factor.low, factor.high)
-
-
 def farthest(source: ImageSource) -> float:
     """No depth is larger, in millimetres."""
-    scene = source.scene
-    reach = nearest_and_farthest(scene.distribution)[1]
+    scene, distribution = source.scene, source.scene.distribution
+    factor = next((f for f in distribution.binned if f.coordinate == "distance"), None)
+    reach = distribution.ranges["distance"][1] if factor is None else factor.high
     radii = scene.radii or (1.0,) * len(scene.names)
     reaches = [field.reach for field in scene.fields]
     each = zip(radii, source.millimetres, reaches, strict=True)

@@ -93,7 +93,7 @@ class ExportFolder:
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
     """The first key, with dots, at which two JSON trees differ, and both values, shortened; None for equal trees."""
     if isinstance(before, dict) and isinstance(now, dict):
-        for name in sorted({*before, *now}):
+        for name in [*before, *(name for name in now if name not in before)]:
             inner = f"{key}.{name}" if key else name
             found = first_difference(before.get(name), now.get(name), inner)
             if found is not None:
