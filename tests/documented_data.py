@@ -146,7 +146,7 @@ def coco_photographs(root: Path) -> Path:
 
 
 def trained(root: Path) -> Path:
-    """A run's folder with the files of a detector of the embedded objects, which has learned nothing."""
+    """A run's folder with the files of a detector of the embedded objects, which has learned nothing, and a psi."""
     make, names = (
         functools.partial(RetinaNet, backbone=Backbone("micro"), head=Head(8, 1)),
         tuple(Procedural().names()),
@@ -154,6 +154,8 @@ def trained(root: Path) -> Path:
     params = make(num_classes=len(names), image_size=(64, 64)).init(torch.Generator().manual_seed(3))
     params["head.classification_head.cls_logits.bias"] += 4.0  # else no score reaches the threshold
     SavedDetector(make, params, names, (64, 64)).save(root)
+    learned = {"pose": {"learned": [0.3, *[0.1] * 7]}}
+    (root / "results.json").write_text(json.dumps({"psi": dict.fromkeys(names, learned)}))
     return root
 
 

@@ -121,3 +121,44 @@ def test_distances_in_metres_are_distances_in_radii():
 def test_impossible_cameras_are_refused(bad):
     with pytest.raises(ValueError, match="camera"):
         PinholeCamera(*bad)
+
+
+def test_a_reframed_camera_shows_the_same_in_proportion_and_more_beside():
+    camera = cameras.opencv_camera(100, 80, 120.0, 110.0, 40.0, 50.0)
+    for width, height, scale in ((200, 160, 2.0), (300, 160, 2.0), (100, 400, 1.0), (50, 40, 0.5)):
+        other = cameras.reframed(camera, width, height)
+        assert cameras.focal_lengths(other) == pytest.approx((scale * 120.0, scale * 110.0))
+        (x, y), before = cameras.principal_point(other), cameras.principal_point(camera)
+        moved = (x - 0.5 * width, y - 0.5 * height)
+        assert moved == pytest.approx((scale * (before[0] - 50.0), scale * (before[1] - 40.0)))
+        assert (other.width, other.height) == (width, height)
+    wide = cameras.reframed(PinholeCamera(10, 10, 0.7), 40, 20)
+    assert wide.field_of_view == pytest.approx(0.7) and wide.centre is None
+
+
+@pytest.mark.parametrize("left, top", [(0, 0), (7, 3), (-5, 12)])
+def test_a_crop_casts_the_whole_images_rays(left, top):
+    camera, pose = cameras.opencv_camera(20, 16, 24.0, 22.0, 8.0, 9.0), _pose(0.4, 0.3)
+    part = cameras.cropped(camera, left, top, 9, 6)
+    # Far pixels of a camera that is larger by as much on each side have the coordinates of those beyond the image.
+    large = cameras.cropped(camera, -20, -20, 60, 60)
+    wanted = cameras.rays(large, pose).directions[20 + top : 26 + top, 20 + left : 29 + left]
+    torch.testing.assert_close(cameras.rays(part, pose).directions, wanted, atol=1e-12, rtol=0.0)
+    whole = cameras.rays(camera, pose).directions
+    torch.testing.assert_close(
+        cameras.rays(large, pose).directions[20:36, 20:40], whole, atol=1e-12, rtol=0.0
+    )
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (11, -4), (-300, 250)])
+def test_a_turned_camera_sees_its_centre_shifted(shift):
+    camera, pose = cameras.opencv_camera(64, 48, 60.0, 50.0, 30.0, 25.0), _pose(0.9, -0.4)
+    moved = cameras.turned(camera, pose, shift)
+    turn = pose[:3, :3].T @ moved[:3, :3]
+    torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64))
+    assert torch.equal(moved[:, 3], pose[:, 3]) and torch.linalg.det(turn).item() == pytest.approx(1.0)
+    x, y, z = (moved[:3, :3].T @ -moved[:3, 3]).tolist()
+    assert (30.0 + 60.0 * x / -z, 25.0 - 50.0 * y / -z) == pytest.approx((30 + shift[0], 25 + shift[1]))
+    # The smallest such angle is that between the old and the new direction of the centre.
+    angle = math.acos(min(1.0, -z / math.sqrt(x * x + y * y + z * z)))
+    assert math.acos(min(1.0, (turn.trace().item() - 1.0) / 2.0)) == pytest.approx(angle, abs=1e-7)

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -31,6 +32,10 @@ def _compares(command):
     return any(word.startswith("compare.") or word == "+experiment=compare" for word in command.overrides)
 
 
+def _exports(command):
+    return "stages=[export]" in command.overrides
+
+
 class Runs:
     """Runs commands once each, in folders of their own under one root, with one store and one MLflow."""
 
@@ -43,7 +48,10 @@ class Runs:
         """The overrides at smoke scale, with the first of the seeds and made data for paths."""
         written = command.cut(1) if command.multirun else command.overrides
         kept = [self.data.localise(word) for word in written if not word.startswith("scale=")]
-        return [*kept, "scale=smoke"]
+        few = ["export.count=3", "export.width=64", "export.height=48"] if _exports(command) else []
+        if few:  # into folders of the test's own
+            kept = [f"export.folder={self.root / 'exported'}" if "folder=" in word else word for word in kept]
+        return [*kept, *few, "scale=smoke"]
 
     def folder(self, command):
         """Where the command left its files, which it must have done without an error."""
@@ -79,13 +87,15 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
         pytest.skip("no CUDA device")
     if _compares(command):
         _run_what_is_compared(runs, set(configurations[0].compare.experiments))
+    if _exports(command):
+        _run_what_is_exported(runs, command)
     folder = runs.folder(command)
     folders = [path.parent.parent for path in folder.glob("**/.hydra/config.yaml")]
     assert len(folders) == len(jobs)
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
-        alone = {"predict": _predict, "preflight": _preflight}.get(config["stages"][0])
+        alone = {"predict": _predict, "export": _export, "preflight": _preflight}.get(config["stages"][0])
         check = alone or kinds.get(next((key for key in kinds if key in config), ""), _run)
         check(job, config)
 
@@ -100,6 +110,30 @@ def _run_what_is_compared(runs, experiments):
     for command in ALL:
         if command.multirun and experiments & {_configuration(job).name for job in command.jobs(seeds=1)}:
             runs.folder(command)
+
+
+def _run_what_is_exported(runs, command):
+    """A learned psi is that of the same command without an export."""
+    rest = [word for word in command.overrides if not word.startswith(("stages=", "export."))]
+    if not any(word.startswith("export.psi=") for word in command.overrides):
+        runs.folder(next(other for other in ALL if other.overrides == rest and not other.multirun))
+
+
+def _export(folder, config):
+    """usage.md, Exporting a data set."""
+    made = folder / "dataset" if config["export"]["folder"] is None else Path(config["export"]["folder"])
+    manifest = json.loads((made / "manifest.json").read_text())
+    assert len(manifest["images"]) == 3 and all(
+        (made / image["file"]).is_file() for image in manifest["images"]
+    )
+    assert (made / "psi.csv").is_file() and (made / "psi.json").is_file()
+    files = {
+        "coco": "annotations.json",
+        "yolo": "segment/dataset.yaml",
+        "bop": "bop/train/000000/scene_gt.json",
+    }
+    for name, file in files.items():
+        assert (made / file).is_file() == (name in config["export"]["formats"])
 
 
 def _run(folder, config):

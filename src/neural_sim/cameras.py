@@ -76,6 +76,44 @@ def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
     return PinholeCamera(width, height, camera.field_of_view, aspect, centre)
 
 
+def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
+    """The camera of images of another size that show, centred and in the same proportions, all that this one's do: in
+    their direction of more room they show more."""
+    scale = min(width / camera.width, height / camera.height)
+    fy = scale * focal_length(camera)
+    x, y = principal_point(camera)
+    moved = (0.5 * width + scale * (x - 0.5 * camera.width), 0.5 * height + scale * (y - 0.5 * camera.height))
+    centre = None if camera.centre is None else moved
+    return PinholeCamera(width, height, 2.0 * math.atan(0.5 * height / fy), camera.aspect, centre)
+
+
+def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int) -> PinholeCamera:
+    """The camera of a part of this one's images, which may reach beyond them; ``left`` and ``top`` in pixels."""
+    x, y = principal_point(camera)
+    angle = 2.0 * math.atan(0.5 * height / focal_length(camera))
+    return PinholeCamera(width, height, angle, camera.aspect, (x - left, y - top))
+
+
+def turned(
+    camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], shift: tuple[float, float]
+) -> Float[Tensor, "4 4"]:
+    """The pose turned about its own place by the smallest angle after which what projected to the principal point does
+    so ``shift`` pixels (right, down) of it. The direction from the object to the camera stays."""
+    fx, fy = focal_lengths(camera)
+    ahead = camera_to_world.new_tensor([0.0, 0.0, -1.0])
+    aim = camera_to_world.new_tensor([shift[0] / fx, -shift[1] / fy, -1.0])
+    aim = aim / aim.norm()
+    # Rodrigues' formula for the turn of ``ahead`` onto ``aim``, whose axis is their cross product.
+    axis, cosine = torch.linalg.cross(ahead, aim), ahead @ aim
+    x, y, z = axis.unbind()
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    turn = torch.eye(3, dtype=axis.dtype, device=axis.device) + skew + skew @ skew / (1.0 + cosine)
+    moved = camera_to_world.clone()
+    moved[:3, :3] = camera_to_world[:3, :3] @ turn.t()
+    return moved
+
+
 def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
     """The camera with ``magnification`` times its focal length."""
     return replace(

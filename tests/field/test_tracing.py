@@ -1,5 +1,6 @@
 """The fused render against the samples' own way, and what is left out of it: nothing that changes a pixel."""
 
+import itertools
 import math
 
 import pytest
@@ -7,10 +8,13 @@ import torch
 
 from neural_sim import cameras
 from neural_sim.cameras import pixel_rays
+from neural_sim.field.base import RadianceField
+from neural_sim.field.extinction import Surface
 from neural_sim.field.grid import GridField
 from neural_sim.field.mlp import MLPField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.rendering import render_packed, render_views
+from neural_sim.field.samples import sample_points
 from neural_sim.field.screen import coarse_centres, screen_span
 from neural_sim.types import PinholeCamera, Rays
 
@@ -151,3 +155,37 @@ def test_a_longer_step_takes_fewer_samples_of_the_same_field(generator: torch.Ge
     network = MLPField(width=8, depth=2, coarse_samples=8, fine_samples=6)
     assert int(network.with_step(2.0).sample(bundle(torch.float32), 0.0).starts.diff().max()) == 7
     assert field.with_step(1.0) is field and network.with_step(1.0) is network
+
+
+@pytest.mark.parametrize("multiple", [1.0, 0.3])
+def test_a_surface_is_where_half_of_the_light_is_lost(multiple: float, generator: torch.Generator) -> None:
+    """Against each ray's samples one by one: optical depth grows linearly over the length that a sample stands for."""
+    field = shell(generator).with_step(multiple)
+    samples = field.sample(bundle(), 0.0)
+    sigma = field.query(*sample_points(bundle(), samples))[0].tolist()
+    wanted, starts = [], samples.starts.tolist()
+    for first, last in itertools.pairwise(starts):
+        depth, found = 0.0, 0.0
+        for i in range(first, last):
+            width = float(samples.width[i])
+            if depth < math.log(2.0) <= depth + sigma[i] * width:
+                near = float(samples.distance[i]) - 0.5 * width
+                found = near + (math.log(2.0) - depth) / sigma[i]
+            depth += sigma[i] * width
+        wanted.append(found)
+    assert 0.1 < sum(at > 0.0 for at in wanted) / len(wanted) < 0.9
+    fused, plain = (Surface(len(wanted), field.table) for _ in range(2))
+    opacity = field.trace(bundle(), 1e-3, surface=fused)[1]
+    RadianceField.trace(field, bundle(), 0.0, surface=plain)
+    for surface in (fused, plain):
+        torch.testing.assert_close(surface.distance, torch.tensor(wanted, dtype=DOUBLE), atol=1e-10, rtol=0.0)
+    assert torch.equal(fused.distance > 0.0, opacity >= 0.5)
+
+
+def test_no_density_lies_beyond_the_reach(generator: torch.Generator) -> None:
+    field = shell(generator)
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
+    cells = field.occupied.nonzero()[:, None] + corners
+    farthest = float((field.origin + cells.to(DOUBLE) * field.edge).norm(dim=-1).max())
+    assert farthest <= field.reach
+    assert MLPField(width=8, depth=2, coarse_samples=4, fine_samples=4).reach == 1.0

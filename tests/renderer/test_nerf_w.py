@@ -168,3 +168,27 @@ def test_qualities_are_those_of_the_plain_renderer(field: AppearanceField, quali
     expected = NerfRenderer(quality).render(plain.eval(), CAMERA, poses())
     made = NerfWRenderer(quality).render(field, CAMERA, poses())
     torch.testing.assert_close(made, expected, rtol=0, atol=1e-14)
+
+
+def test_depth_is_along_the_view_axis_to_where_half_of_the_light_is_lost(
+    field: AppearanceField, generator: torch.Generator
+) -> None:
+    """Each pixel's ray is cut at its depth: what is before absorbs half. Weights of lights move no depth."""
+    weights, renderer = some_weights(generator, 3), NerfWRenderer(termination=0.0)
+    rgb, opacity, depth = renderer.render_surface(field, CAMERA, poses(), weights)
+    wanted = renderer.render(field, CAMERA, poses(), weights=weights)
+    torch.testing.assert_close((rgb, opacity), wanted, atol=1e-12, rtol=0.0)
+    assert torch.equal(depth > 0.0, opacity >= 0.5) and 0.1 < float((depth > 0.0).double().mean()) < 1.0
+    bundle = cameras.rays(CAMERA, poses())
+    axis = -poses()[:, None, None, :3, 2]
+    along = depth / (bundle.directions * axis).sum(-1)
+    rays = flat(bundle)
+    samples = field.sample(rays, 0.0)
+    positions = rays.origins[samples.ray] + rays.directions[samples.ray] * samples.distance[:, None]
+    sigma = field.query(positions, rays.directions[samples.ray])[0]
+    # Optical depth up to the cut, of the lengths that samples stand for.
+    length = (along.flatten()[samples.ray] - samples.distance + 0.5 * samples.width).clamp_min(0.0)
+    cut = torch.zeros(len(rays.origins), dtype=DOUBLE)
+    cut.index_add_(0, samples.ray, sigma * torch.minimum(length, samples.width))
+    seen = (depth > 0.0).flatten()
+    torch.testing.assert_close(torch.exp(-cut[seen]), torch.full_like(cut[seen], 0.5), atol=1e-9, rtol=0.0)

@@ -14,7 +14,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.coco import CocoTarget
 from neural_sim.types import LabelledImages, PinholeCamera

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neural_sim.field.base import RadianceField
+from neural_sim.field.extinction import Surface
 from neural_sim.field.grid import GridField
 from neural_sim.field.samples import PackedSamples, Span
 from neural_sim.types import PinholeCamera, Rays
@@ -132,6 +133,10 @@ class AppearanceField(RadianceField):
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         return self.grid.sample(rays, termination)
 
+    @property
+    def reach(self) -> float:
+        return self.grid.reach
+
 
 class LitField(RadianceField):
     """An appearance field under one code; shares its tensors. Its colour has derivatives by the code's rates, too."""
@@ -155,12 +160,20 @@ class LitField(RadianceField):
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
         return self.field.grid.span(camera, camera_to_world, rows)
 
-    @torch.no_grad()
     def trace(
-        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
+        self,
+        rays: Rays,
+        termination: float,
+        span: Span | None = None,
+        skip_empty: bool = True,
+        surface: Surface | None = None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         grid = self.field.grid
-        return grid.trace_as(self._decode, self.directed, rays, termination, span, skip_empty)
+        return grid.trace_as(self._decode, self.directed, rays, termination, span, skip_empty, surface)
+
+    @property
+    def reach(self) -> float:
+        return self.field.reach
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neural_sim.field.quadrature import composite
+from neural_sim.field.extinction import Surface
+from neural_sim.field.quadrature import composite, transmittance
 from neural_sim.field.samples import PackedSamples, Span, sample_points
 from neural_sim.types import PinholeCamera, Rays
 
@@ -71,15 +72,30 @@ class RadianceField(nn.Module, ABC):
 
     @torch.no_grad()
     def trace(
-        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
+        self,
+        rays: Rays,
+        termination: float,
+        span: Span | None = None,
+        skip_empty: bool = True,
+        surface: Surface | None = None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the samples of ``sample``.
 
         Without derivatives. ``span`` is that of these rays from :meth:`span`; ``skip_empty``: skip space known to be
-        empty. Neither changes a pixel. A field that knows no empty space ignores both.
+        empty. Neither changes a pixel. A field that knows no empty space ignores both. ``surface``, if given, learns
+        where these rays lose half of their light.
         """
         samples = self.sample(rays, termination)
-        return composite(*self.query(*sample_points(rays, samples)), samples)
+        sigma, rgb = self.query(*sample_points(rays, samples))
+        if surface is not None:
+            before = -transmittance(sigma, samples).log()
+            surface.enter(samples.ray, samples.distance, samples.width, before, sigma * samples.width)
+        return composite(sigma, rgb, samples)
+
+    @property
+    def reach(self) -> float:
+        """No density lies farther from the origin, in object radii."""
+        return 1.0
 
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span | None:
         """Between which distances the rays of an image's ``rows`` may meet anything; None where nothing is known."""

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from neural_sim.field.marching import Wave
 from neural_sim.field.quadrature import OPAQUE_DEPTH
+
+HALF = math.log(2.0)
+"""Optical depth at which half of the light is left."""
 
 
 class Extinction:
@@ -45,6 +48,33 @@ class Extinction:
     def opacity(self) -> Float[Tensor, "rays"]:
         """What all counted samples together absorb: the sum of their weights."""
         return -torch.expm1(-self._depth)
+
+
+class Surface:
+    """Where each of ``rays`` has lost half of its light: the distance, in object radii, at which transmittance is 1/2.
+
+    ``distance`` is 0 for rays that lose less, which are those of an opacity below 1/2. Density is constant over the
+    length of ray that a sample stands for, as in the quadrature.
+    """
+
+    def __init__(self, rays: int, like: Float[Tensor, "*any"]) -> None:
+        self.distance = like.new_zeros(rays)
+
+    def enter(
+        self,
+        ray: Int[Tensor, "k"],
+        middle: Float[Tensor, "k"],
+        width: Float[Tensor, "k"] | float,
+        before: Float[Tensor, "k"],
+        optical: Float[Tensor, "k"],
+    ) -> None:
+        """Look at samples of rays ``ray``: the distances of their middles, the lengths that they stand for, the optical
+        depth before each, and its own."""
+        here = ((before < HALF) & (before + optical >= HALF)).nonzero()[:, 0]
+        fraction = (HALF - before.index_select(0, here)) / optical.index_select(0, here)
+        length = width.index_select(0, here) if isinstance(width, Tensor) else width
+        crossing = middle.index_select(0, here) + (fraction - 0.5) * length
+        self.distance.index_copy_(0, ray.index_select(0, here), crossing)
 
 
 def sum_rows(values: Float[Tensor, "k c"], weights: Float[Tensor, "k"], wave: Wave) -> Float[Tensor, "n c"]:

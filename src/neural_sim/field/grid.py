@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neural_sim.field.base import RadianceField
-from neural_sim.field.extinction import Extinction, sum_rows
+from neural_sim.field.extinction import Extinction, Surface, sum_rows
 from neural_sim.field.interpolation import (
     CORNERS,
     corner_weights,
@@ -77,13 +77,8 @@ class GridField(RadianceField):
         self.reset(torch.ones(1, 1, 1, dtype=torch.bool), torch.full((3,), -1.0), 2.0)
 
     def settings(self) -> dict[str, object]:
-        return {
-            "features": self.features,
-            "head_width": self.head_width,
-            "step_cells": self.step_cells,
-            "initial_density": self.initial_density,
-            "density_gain": self.density_gain,
-        }
+        names = ("features", "head_width", "step_cells", "initial_density", "density_gain")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def occupancy(self) -> Occupancy:
@@ -247,23 +242,18 @@ class GridField(RadianceField):
         march(rays, self.occupancy, self.step, phase, visit)
         return collector.finish(self.step)
 
-    @torch.no_grad()
     def trace(
-        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True
-    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        self, rays: Rays, termination: float, span: Span | None = None, skip_empty: bool = True,
+        surface: Surface | None = None,
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
         """See the base class; each sample is found, interpolated and composited once, wave by wave."""
-        return self.trace_as(self.decode, self.directed, rays, termination, span, skip_empty)
+        return self.trace_as(self.decode, self.directed, rays, termination, span, skip_empty, surface)
 
     @torch.no_grad()
     def trace_as(
-        self,
-        decode: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-        directed: bool,
-        rays: Rays,
-        termination: float,
-        span: Span | None,
-        skip_empty: bool,
-    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+        self, decode: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
+        termination: float, span: Span | None, skip_empty: bool, surface: Surface | None,
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
         """``trace`` with density and colour of table rows by ``decode``; ``directed``: it wants samples' directions."""
         colour = rays.origins.new_zeros(len(rays.origins), 3)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
@@ -275,6 +265,8 @@ class GridField(RadianceField):
             sigma, rgb = decode(self._raw_of(wave), directions)
             optical = sigma * self.step
             depth, reached, alive = extinction.enter(wave, optical)
+            if surface is not None:
+                surface.enter(wave.ray.index_select(0, wave.row), wave.distance, self.step, depth, optical)
             weights = torch.exp(-depth) * -torch.expm1(-optical) * reached
             colour.index_add_(0, wave.ray, sum_rows(rgb, weights, wave))
             return alive
@@ -284,6 +276,10 @@ class GridField(RadianceField):
 
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
         return screen_span(self.coarse, self.coarse_radius, camera, camera_to_world, rows)
+
+    @property
+    def reach(self) -> float:
+        return float(self.coarse.norm(dim=0).amax()) + self.coarse_radius if self.coarse.numel() else 0.0
 
     def _corners_of(self, cells: Int[Tensor, "samples"]) -> Int[Tensor, "samples 8"]:
         return self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))

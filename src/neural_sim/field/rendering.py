@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neural_sim.cameras import pixel_rays
 from neural_sim.field.base import RadianceField
+from neural_sim.field.extinction import Surface
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
 from neural_sim.field.samples import PackedSamples, sample_points
@@ -105,15 +106,19 @@ def render_views(
     rays_per_chunk: int,
     cull: bool = True,
     skip_empty: bool = True,
-) -> Float[Tensor, "views height width 4"]:
+    surfaces: bool = False,
+) -> Float[Tensor, "views height width channels"]:
     """Premultiplied RGBA of whole views; chunks bound the memory and may span views.
 
-    ``cull`` casts rays only for pixels that may see something; for ``skip_empty`` see ``RadianceField.trace``.
+    ``cull`` casts rays only for pixels that may see something; for ``skip_empty`` see ``RadianceField.trace``. With
+    ``surfaces`` a fifth channel has the distance along the ray at which half of the light is lost (0: nowhere).
     """
-    shape = (len(camera_to_world), camera.height, camera.width, 4)
-    image = camera_to_world.new_zeros(shape).view(-1, 4)
+    shape = (len(camera_to_world), camera.height, camera.width, 4 + surfaces)
+    image = camera_to_world.new_zeros(shape).view(-1, shape[-1])
     for seen in seen_pixels(field, camera, camera_to_world, rays_per_chunk, cull):
         rays = pixel_rays(camera, camera_to_world, seen.pixel)
-        rgb, opacity = field.trace(rays, termination, seen.span, skip_empty)
-        image.index_copy_(0, seen.pixel, torch.cat([rgb, opacity[:, None]], -1))
+        surface = Surface(len(seen.pixel), image) if surfaces else None
+        rgb, opacity = field.trace(rays, termination, seen.span, skip_empty, surface)
+        found = [] if surface is None else [surface.distance[:, None]]
+        image.index_copy_(0, seen.pixel, torch.cat([rgb, opacity[:, None], *found], -1))
     return image.view(shape)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.cameras import pixel_rays, ray_rates
+from neural_sim.cameras import focal_lengths, pixel_rays, principal_point, ray_rates
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
@@ -100,6 +100,22 @@ class NerfRenderer:
         return image[..., :3], image[..., 3]
 
     @torch.no_grad()
+    def render_surface(
+        self, field: RadianceField, camera: PinholeCamera, camera_to_world: Float[Tensor, "views 4 4"]
+    ) -> tuple[
+        Float[Tensor, "views height width 3"],
+        Float[Tensor, "views height width"],
+        Float[Tensor, "views height width"],
+    ]:
+        """What ``render`` gives, and the depth along the view axis, in object radii, at which a pixel's ray has lost
+        half of its light; 0 where it loses less, as opacities below 1/2 do."""
+        image = render_views(
+            field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
+            self.cull, self.skip_empty, surfaces=True,
+        )  # fmt: skip
+        return image[..., :3], image[..., 3], image[..., 4] * _view_cosines(camera, image)
+
+    @torch.no_grad()
     def render_with_tangents(
         self,
         field: RadianceField,
@@ -142,6 +158,14 @@ class NerfRenderer:
                 f"got {tuple(rays.origins.shape)} and {tuple(rays.directions.shape)}"
             )
         return render_packed(field.with_step(self.step), rays, self.termination)
+
+
+def _view_cosines(camera: PinholeCamera, like: Tensor) -> Float[Tensor, "height width"]:
+    """Cosines of the angles between the rays of pixels and the view axis."""
+    (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
+    x = (torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5 - cx) / fx
+    y = (torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5 - cy) / fy
+    return (1.0 + x.square() + y.square()[:, None]).rsqrt()
 
 
 def _maps(pixels: Float[Tensor, "n h w 4"]) -> Maps:

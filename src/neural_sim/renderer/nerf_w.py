@@ -44,6 +44,27 @@ class NerfWRenderer(NerfRenderer):
         return rgb, opacity
 
     @torch.no_grad()
+    def render_surface(
+        self,
+        field: RadianceField,
+        camera: PinholeCamera,
+        camera_to_world: Float[Tensor, "views 4 4"],
+        weights: Float[Tensor, "views k"] | None = None,
+    ) -> tuple[
+        Float[Tensor, "views height width 3"],
+        Float[Tensor, "views height width"],
+        Float[Tensor, "views height width"],
+    ]:
+        """What ``render`` gives, and depth, see :meth:`NerfRenderer.render_surface`."""
+        field, weights = _checked(field, weights, len(camera_to_world))
+        maps = camera_to_world.new_empty(len(camera_to_world), camera.height, camera.width, 5)
+        for light, views in _groups(weights, maps.device):
+            lit = field.lit(light @ field.anchors)
+            rgb, opacity, depth = super().render_surface(lit, camera, camera_to_world.index_select(0, views))
+            maps[views] = torch.cat([rgb, opacity[..., None], depth[..., None]], -1)
+        return maps[..., :3], maps[..., 3], maps[..., 4]
+
+    @torch.no_grad()
     def render_with_tangents(
         self,
         field: RadianceField,

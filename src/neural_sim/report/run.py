@@ -18,7 +18,7 @@ from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report import figures
 from neural_sim.synthesis.assembly import RenderedImages
-from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)

@@ -52,7 +52,7 @@ class Store:
         if entry is not None:
             return entry
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(path):
+        with locked(path):
             entry = _read(path)  # another process may have written it meanwhile
             if entry is not None:
                 return entry
@@ -66,7 +66,7 @@ class Store:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Alone with an entry. The operating system frees the lock when its holder ends, however that ends."""
     lock = FileLock(path.with_suffix(".lock"))
     try:

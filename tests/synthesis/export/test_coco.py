@@ -9,7 +9,7 @@ import torch
 from faster_coco_eval import COCO
 from PIL import Image
 
-from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
 

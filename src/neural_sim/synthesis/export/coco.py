@@ -1,9 +1,7 @@
-"""A drawn set as COCO: PNG images and one JSON that also holds every image's pose."""
+"""Drawn sets as COCO: a training set in memory, as PNG images and one JSON, and an exported set, from its records."""
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import torch
 from PIL import Image
 
+from neural_sim.synthesis.export.files import write_json
 from neural_sim.types import LabelledImages
 
 
@@ -51,9 +50,7 @@ def write_coco(
         "annotations": annotations,
     }
     path = folder / "annotations.json"
-    draft = path.with_suffix(".json.part")
-    draft.write_text(json.dumps(document, allow_nan=False), encoding="utf-8")
-    os.replace(draft, path)
+    write_json(path, document)
     return path
 
 
@@ -79,4 +76,50 @@ def _annotation(number: int, image: int, label: int, box: Sequence[float]) -> di
         "area": (x1 - x0) * (y1 - y0),
         "iscrowd": 0,
         "segmentation": [],
+    }
+
+
+def coco_document(
+    records: Sequence[Mapping[str, Any]],
+    class_names: Sequence[str],
+    camera: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """COCO's document of an exported set, from its images' records in the order of their numbers.
+
+    ``bbox``, ``area`` and ``segmentation`` (compressed run lengths) are of what is visible. Further entries of an
+    annotation: ``bbox_full``, round the whole silhouette, also beyond the image; ``segmentation_full``, the silhouette
+    within the image; ``visibility``, the visible fraction of the silhouette's pixels; ``pose``. Objects of which too
+    little is visible have no annotation. ``camera`` is that of all images, where they have one.
+    """
+    entries, annotations = [], []
+    for record in records:
+        size = {key: record["camera"][key] for key in ("height", "width")}
+        image = record["number"] + 1
+        entries.append({"id": image, "file_name": record["file"], **size, "camera": record["camera"]})
+        for item in record["objects"]:
+            if item["labelled"]:
+                annotations.append(_masked(len(annotations) + 1, image, item))
+    return {
+        "info": {"description": "images drawn by Neural-Sim", "version": "1.0"},
+        "licenses": [],
+        "categories": [{"id": i + 1, "name": name} for i, name in enumerate(class_names)],
+        **({} if camera is None else {"camera": dict(camera)}),
+        "images": entries,
+        "annotations": annotations,
+    }
+
+
+def _masked(number: int, image: int, item: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "id": number,
+        "image_id": image,
+        "category_id": item["label"] + 1,
+        "bbox": item["box_visible"],
+        "area": item["pixels"]["visible"],
+        "iscrowd": 0,
+        "segmentation": item["mask_visible"],
+        "bbox_full": item["box_full"],
+        "segmentation_full": item["mask_full"],
+        "visibility": item["visibility"],
+        "pose": item["pose"],
     }

@@ -1,0 +1,136 @@
+"""Images a second and memory of an export, by size, objects an image and format: `python benchmarks/export.py`.
+
+Fits fields to the embedded objects, then writes data sets into a temporary folder. Times are those of the images
+(drawing, rendering, composing, encoding, writing), without fitting and without the final annotations.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import resource
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from field import fit, load_objects, training_views  # the benchmark beside this one
+from machine import machine
+
+from neural_sim.cameras import reframed
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.export.dataset import ImageWriter
+from neural_sim.synthesis.export.images import ImageSource
+from neural_sim.synthesis.export.workers import each
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import PinholeCamera
+
+
+def source_of(fields: dict[str, torch.nn.Module], quality: str) -> ImageSource:
+    """Poses uniform round the objects, at 2.4 to 4 radii, as in a run."""
+    distribution = SceneDistribution.of([Pose()])
+    camera = PinholeCamera(96, 96, math.radians(40.0))
+    scene = Scene(
+        tuple(fields), tuple(fields.values()), NerfRenderer(quality), camera, Synthesizer(ProceduralClutter()),
+        distribution,
+    )  # fmt: skip
+    psi = torch.zeros(len(fields), distribution.size, dtype=torch.float64)
+    return ImageSource(scene, psi, camera, (100.0,) * len(fields), 0)
+
+
+def sized(source: ImageSource, width: int, height: int, objects: int) -> ImageSource:
+    synthesizer = replace(source.scene.synthesizer, objects_per_image=(objects, objects))
+    camera = reframed(source.scene.camera, width, height)
+    return replace(source, camera=camera, scene=replace(source.scene, synthesizer=synthesizer))
+
+
+def measured(source: ImageSource, count: int, workers: int, bop: bool, image_format: str) -> dict[str, float]:
+    """Seconds and processor seconds an image; the first image of each process is not timed: it starts them."""
+    with tempfile.TemporaryDirectory() as folder:
+        writer = ImageWriter(source, Path(folder), image_format, 1000 if bop else None, 0.01)
+        first = max(workers, 1)
+        made = each(writer, list(range(count + first)), workers)
+        for _ in range(first):
+            next(made)
+        begun, used = time.perf_counter(), time.process_time()
+        size = sum(len(json.dumps(record)) for record in made)
+        seconds = time.perf_counter() - begun
+        own = time.process_time() - used
+        files = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
+    row = {"seconds": seconds / count, "images_per_second": count / seconds, "record_kb": size / count / 1e3,
+           "files_kb": files / (count + first) / 1e3}  # fmt: skip
+    return row | ({} if workers else {"cpu_seconds": own / count})
+
+
+def _alone(queue, *arguments) -> None:
+    made = measured(*arguments)
+    queue.put(made | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024})
+
+
+def in_process(*arguments) -> dict[str, float]:
+    """:func:`measured` in a process of its own, with that process's largest memory."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_alone, args=(queue, *arguments))
+    process.start()
+    made = queue.get()
+    process.join()
+    return made
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
+    parser.add_argument("--names", nargs="*")
+    parser.add_argument("--steps", type=int, default=240)
+    parser.add_argument("--views", type=int, default=96, help="pixels a side")
+    parser.add_argument("--count", type=int, default=10)
+    parser.add_argument("--sizes", nargs="*", default=["640x480", "1280x960"])
+    parser.add_argument("--objects", type=int, nargs="*", default=[1, 6])
+    parser.add_argument("--qualities", nargs="*", default=["final", "draft"])
+    parser.add_argument("--workers", type=int, nargs="*", default=[0, 2])
+    parser.add_argument("--image-format", choices=["jpg", "png"], default="jpg")
+    parser.add_argument("--bop", action="store_true", help="with depth and masks")
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/export.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    fields = {
+        item.name: fit(training_views(item, arguments.views, 84), arguments.steps, 0, torch.device("cpu"))[0]
+        for item in load_objects(arguments.root, arguments.names)
+    }
+    rows = []
+    print(
+        f"{'size':>10}{'objects':>8} {'quality':8}{'workers':>8}{'images/s':>10}{'cpu s':>8}{'peak MB':>9}{'kB':>7}"
+    )
+    for quality in arguments.qualities:
+        base = source_of(fields, quality)
+        for size in arguments.sizes:
+            width, height = map(int, size.split("x"))
+            for objects in arguments.objects:
+                source = sized(base, width, height, min(objects, len(fields)))
+                for workers in arguments.workers:
+                    asked = (source, arguments.count, workers, arguments.bop, arguments.image_format)
+                    row = measured(*asked) if workers else in_process(*asked)
+                    rows.append(
+                        {"size": size, "objects": objects, "quality": quality, "workers": workers, **row}
+                    )
+                    print(
+                        f"{size:>10}{objects:8} {quality:8}{workers:8}{row['images_per_second']:10.2f}"
+                        f"{row.get('cpu_seconds', math.nan):8.3f}{row.get('peak_mb', math.nan):9.0f}"
+                        f"{row['files_kb']:7.0f}",
+                        flush=True,
+                    )
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps({"machine": machine(), "bop": arguments.bop, "rows": rows}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

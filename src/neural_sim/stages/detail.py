@@ -1,0 +1,86 @@
+"""Finer fields for larger images: views with as many pixels as the images show, and grids with as many cells."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from neural_sim.cameras import focal_length
+from neural_sim.field.recipe import FieldRecipe
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.views import Views
+from neural_sim.stages.captures import Captures
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.graph import Graph
+from neural_sim.types import PinholeCamera
+
+_log = logging.getLogger(__name__)
+
+ENOUGH = 1.25
+"""Images that show at most so many pixels for one of the views' are served by the run's own fields."""
+
+
+def view_size_for(
+    views: Views, camera: PinholeCamera, distribution: SceneDistribution, largest_radius: float
+) -> int:
+    """Side in pixels of views that resolve at their nearest what ``camera`` does at its nearest and of its longest
+    focal length. ``largest_radius`` is the objects', in the unit of the distribution's distances."""
+    drawn = {factor.coordinate: factor for factor in distribution.binned}
+    nearest = drawn["distance"].low if "distance" in drawn else distribution.ranges["distance"][0]
+    longest = drawn["magnification"].high if "magnification" in drawn else 1.0
+    wanted = focal_length(camera) * longest * largest_radius / nearest  # pixels for a radius
+    held = focal_length(views.camera(1)) / views.distance_range[0]  # by each pixel of the views' side
+    return math.ceil(wanted / held)
+
+
+def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
+    """The recipe for views with ``factor`` times as many pixels along each side: as many times the steps, and as many
+    times the cells of a grid as the nearest power of two. The number of halvings stays."""
+    fitting: Callable[..., Any] = recipe.fitting
+    steps = math.ceil(recipe.steps * factor)
+    if isinstance(fitting, functools.partial) and "resolution" in fitting.keywords:
+        given = dict(fitting.keywords)
+        scaled = {
+            key: tuple(math.ceil(step * factor) for step in given[key])
+            for key in ("refine_steps", "prune_steps")
+            if key in given
+        }
+        cells = given["resolution"] * 2 ** round(
+            math.log2(factor)
+        )  # a power of two, as the visual hull wants
+        fitting = functools.partial(fitting.func, *fitting.args, **{**given, **scaled, "resolution": cells})
+    return replace(recipe, fitting=fitting, steps=steps)
+
+
+def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[FieldStage, ...]:
+    """The run's fields, or finer ones where images of ``camera`` would show the pixels of the run's views; these have
+    at most ``largest`` pixels a side. The log says what the views hold."""
+    views, recipe = graph.experiment.imaging.views, graph.experiment.imaging.field
+    if isinstance(graph.objects, Captures):
+        _log.info(
+            "export: fields are fitted to photographs at views.image_size=%d, as in the run", views.image_size
+        )
+        return graph.fields
+    radius = max(graph.radii) if graph.radii is not None else 1.0
+    wanted = view_size_for(views, camera, graph.experiment.imaging.distribution, radius)
+    size = (
+        max(views.image_size, min(wanted, largest))
+        if wanted > ENOUGH * views.image_size
+        else views.image_size
+    )
+    _log.info(
+        "export: images of %d x %d resolve what views of %d pixels a side do; fields are fitted to views of %d%s",
+        camera.width, camera.height, wanted, size,
+        f" (export.largest_views; a pixel of theirs covers {wanted / size:.1f} of an image's)" if size < wanted else "",
+    )  # fmt: skip
+    if size == views.image_size:
+        return graph.fields
+    finer = replace(views, image_size=size)
+    made = finer_recipe(recipe, size / views.image_size)
+    return tuple(
+        replace(stage, recipe=made, views=replace(stage.views, settings=finer)) for stage in graph.fields
+    )

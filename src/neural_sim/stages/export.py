@@ -1,0 +1,218 @@
+"""Stage ``export``: images drawn from a distribution, with their annotations, as a data set of any size."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.cameras import reframed
+from neural_sim.checks import at_least
+from neural_sim.renderer.nerf import Quality
+from neural_sim.stages.context import Context
+from neural_sim.stages.describe import describe, modules_of
+from neural_sim.stages.detail import finer_fields
+from neural_sim.stages.meshes import Meshes, Objects
+from neural_sim.stages.psi_file import psi_of_file
+from neural_sim.stages.stage import Results
+from neural_sim.stages.store import Store, locked
+from neural_sim.stages.version import code_version
+from neural_sim.synthesis.export.bop import Model
+from neural_sim.synthesis.export.dataset import FORMATS, DataSet, Format, ImageFormat
+from neural_sim.synthesis.export.files import write_json, write_whole
+from neural_sim.synthesis.export.folder import ExportFolder
+from neural_sim.synthesis.export.images import ImageSource
+from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
+from neural_sim.synthesis.export.records import opencv_entry
+from neural_sim.synthesis.scene import Scene
+
+_log = logging.getLogger(__name__)
+
+UNKNOWN_RADIUS = 100.0
+"""Millimetres that stand for the radius of objects of unknown size in BOP's files."""
+
+
+@dataclass(frozen=True)
+class ExportStep:
+    """A data set of ``count`` images. See ``docs/usage.md``, Exporting a data set.
+
+    Args:
+        count: images. A folder that has some already gets the missing ones.
+        psi: ``learned``, ``initial``, ``target``, or a file: a run's folder or its ``results.json`` (its learned psi),
+            or the ``psi.json`` of an export.
+        width, height: in pixels; null: those of the run's synthesised images.
+        formats: some of ``coco``, ``yolo`` and ``bop``.
+        folder: null: ``dataset`` in the run's folder.
+        image_format: ``jpg`` (quality 95, no chroma subsampling) or ``png``.
+        quality: of the renders, ``draft``, ``normal`` or ``final``; null: the renderer's.
+        detail: ``auto`` fits finer fields to larger views where the images' size asks for it; ``run``: the
+            run's.
+        largest_views: largest side, in pixels, of the views of ``detail=auto``.
+        scene_size: images of a scene of BOP.
+        workers: processes; 0: this one alone; null: one for each core, this one alone with a GPU.
+
+    Raises:
+        ValueError: any of these out of its range.
+    """
+
+    count: int = 1000
+    psi: str = "learned"
+    width: int | None = None
+    height: int | None = None
+    formats: Sequence[str] = ("coco",)
+    folder: str | None = None
+    image_format: ImageFormat = "jpg"
+    quality: Quality | None = None
+    detail: Literal["auto", "run"] = "auto"
+    largest_views: int = 384
+    scene_size: int = 1000
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        at_least("export", 1, count=self.count, largest_views=self.largest_views, scene_size=self.scene_size)
+        at_least("export", 0, workers=self.workers or 0)
+        for side in ("width", "height"):
+            if getattr(self, side) is not None:
+                at_least("export", 8, **{side: getattr(self, side)})
+        if (self.width is None) != (self.height is None):
+            raise ValueError(f"export: want width and height or neither, got {self.width} and {self.height}")
+        wanted = list(self.formats) if not isinstance(self.formats, str) else [self.formats]
+        if not wanted or set(wanted) - set(FORMATS) or len(set(wanted)) < len(wanted):
+            raise ValueError(f"export.formats: want some of {list(FORMATS)}, got {wanted}")
+        choices = {"image_format": get_args(ImageFormat), "quality": (None, *get_args(Quality)),
+                   "detail": ("auto", "run")}  # fmt: skip
+        for key, known in choices.items():
+            if getattr(self, key) not in known:
+                raise ValueError(f"export.{key} must be one of {known}, got {getattr(self, key)!r}")
+
+    def run(self, context: Context) -> None:
+        """The data set and the table of psi.
+
+        Raises:
+            ValueError: a psi that is not in the store or the file, a folder of other images or that cannot be written,
+                BOP for objects of one image under different focal lengths.
+        """
+        root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
+        data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
+        root.parent.mkdir(parents=True, exist_ok=True)
+        with locked(root.with_name(f".{root.name}")):
+            records = data.write(lambda numbers: context.shown(numbers, "export"))
+            rows = psi_rows(distribution, data.source.psi, data.source.scene.names)
+            write_whole(root / "psi.csv", psi_csv(rows))
+            write_json(root / "psi.json", {"rows": rows, **_psi_identity(data)}, indent=1)
+        labelled = sum(item["labelled"] for record in records for item in record["objects"])
+        print(f"{len(records)} images with {labelled} labelled objects\ndata set: {root}")
+
+    def _data_set(self, context: Context, root: Path) -> DataSet:
+        x, graph = context.experiment, context.graph
+        distribution, synthesis = x.imaging.distribution, x.imaging.synthesis
+        zooms = any(factor.coordinate == "magnification" for factor in distribution.binned)
+        if "bop" in self.formats and zooms and synthesis.count.most > 1:
+            raise ValueError(
+                "export.formats: bop has one camera for all objects of an image, and parameter.zoom.by=focal_length "
+                "gives each its own; want other formats, parameter.zoom.by=distance, or "
+                "synthesis.objects_per_image=[1, 1]"
+            )
+        size = (graph.camera.width, graph.camera.height) if self.width is None else (self.width, self.height)
+        camera = reframed(graph.camera, *cast(tuple[int, int], size))
+        workers = self._processes(context)
+        # What an export needs beside psi it makes itself.
+        results = Results(Store(x.run.store), (*context.stages, "views", "field"), context.account.reused)
+        psi, models = self._psi(context), models_of(graph.objects)
+        stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
+        renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
+        scene = Scene(graph.names, (), renderer, graph.camera, synthesis, distribution, graph.radii)
+        source = ImageSource(scene, psi, camera, tuple(model.millimetres for model in models), x.run.seed)
+        identity = self._identity(source, [stage.key for stage in stages])
+        ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
+        fields = tuple(results(stage).field for stage in context.shown(stages, "field"))
+        source = replace(source, scene=replace(scene, fields=fields))
+        return DataSet(
+            source, root, models, identity, self.count, cast(Sequence[Format], tuple(self.formats)),
+            self.image_format, self.scene_size, farthest(source), workers,
+        )  # fmt: skip
+
+    def _psi(self, context: Context) -> Float[Tensor, "objects K"]:
+        graph, distribution = context.graph, context.experiment.imaging.distribution
+        if self.psi == "learned":
+            return context.results(graph.learned).last
+        if self.psi in ("initial", "target"):
+            return graph.psi(self.psi)
+        return psi_of_file(Path(self.psi).expanduser(), distribution, graph.names)
+
+    def _processes(self, context: Context) -> int:
+        on_cpu = context.graph.device.type == "cpu"
+        if self.workers is None:
+            return len(os.sched_getaffinity(0)) if on_cpu else 0
+        if self.workers and not on_cpu:
+            raise ValueError(f"export.workers: want 0 or null with trainer=gpu, got {self.workers}")
+        return self.workers
+
+    def _identity(self, source: ImageSource, fields: Sequence[str]) -> dict[str, Any]:
+        """What an image depends on but its number."""
+        scene = source.scene
+        described = {"renderer": describe(scene.renderer), "synthesis": describe(scene.synthesizer)}
+        p = scene.distribution.probabilities(source.psi.double())
+        psi = {
+            name: {factor: [round(v, 12) for v in p[factor][label].tolist()] for factor in p}
+            for label, name in enumerate(scene.names)
+        }
+        return {
+            "seed": source.seed,
+            "classes": list(scene.names),
+            "camera": opencv_entry(source.camera),
+            "psi": psi,
+            "distribution": describe(scene.distribution.drawn),
+            "millimetres_per_radius": list(source.millimetres),
+            "fields": list(fields),
+            **described,
+            "image_format": self.image_format,
+            "bop": {"scene_size": self.scene_size} if "bop" in self.formats else None,
+            "code": code_version([ImageSource.__module__, *modules_of(described)]),
+        }
+
+
+def models_of(objects: Objects) -> list[Model]:
+    """The objects in the frames of their own meshes, in millimetres; photographed ones in their normalised frame.
+
+    Where the size of any is not known, 100 mm stand for the radius of each, which the log says.
+    """
+    radii, made = objects.radii, []
+    unknown = [name for name, radius in radii.items() if radius is None]
+    if unknown:
+        _log.warning(
+            "export: nothing says the size of %s; a radius counts as %g mm in poses and depth",
+            ", ".join(unknown), UNKNOWN_RADIUS,
+        )  # fmt: skip
+    for name in objects.names:
+        radius = radii[name]
+        millimetres = UNKNOWN_RADIUS if unknown or radius is None else 1000.0 * radius
+        if isinstance(objects, Meshes):
+            item = objects.items[name]
+            to_model = np.diag([millimetres / item.radius] * 3 + [1.0]) @ item.transform
+            made.append(Model(name, millimetres, to_model, item.mesh.copy().apply_transform(to_model)))
+        else:
+            made.append(Model(name, millimetres, np.diag([millimetres] * 3 + [1.0])))
+    return made
+
+
+def farthest(source: ImageSource) -> float:
+    """No depth is larger, in millimetres."""
+    scene, distribution = source.scene, source.scene.distribution
+    factor = next((f for f in distribution.binned if f.coordinate == "distance"), None)
+    reach = distribution.ranges["distance"][1] if factor is None else factor.high
+    radii = scene.radii or (1.0,) * len(scene.names)
+    reaches = [field.reach for field in scene.fields]
+    each = zip(radii, source.millimetres, reaches, strict=True)
+    return max((reach / radius + own) * millimetres for radius, millimetres, own in each)
+
+
+def _psi_identity(data: DataSet) -> dict[str, Any]:
+    return {key: data.identity[key] for key in ("classes", "psi", "distribution")}

@@ -1,0 +1,63 @@
+"""psi from what a run or an export left."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.parameter.product import SceneDistribution
+
+KEY = "export.psi"
+
+
+def psi_of_file(
+    path: Path, distribution: SceneDistribution, names: Sequence[str]
+) -> Float[Tensor, "objects K"]:
+    """The psi of a run's folder or its ``results.json`` (the learned one), or of an export's ``psi.json``.
+
+    Raises:
+        ValueError: no such file, none of these, or one without an object or a factor, or with other bins.
+    """
+    file = path / "results.json" if path.is_dir() else path
+    if not file.is_file():
+        raise ValueError(
+            f"{KEY}: want learned, initial, target, a run's folder, its results.json or an export's psi.json, got "
+            f"{file}, which does not exist"
+        )
+    try:
+        held = json.loads(file.read_text(encoding="utf-8"))["psi"]
+        rows = [[_numbers(held, name, factor.name) for factor in distribution.factors] for name in names]
+    except KeyError as error:
+        raise ValueError(
+            f"{KEY}: {file} has no psi of {error.args[0]}; want objects {list(names)} with {list(distribution.names)}"
+        ) from error
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{KEY}: {file} is no results.json or psi.json ({error})") from error
+    psi = []
+    for name, row in zip(names, rows, strict=True):
+        parts = []
+        for factor, numbers in zip(distribution.factors, row, strict=True):
+            p = torch.tensor(numbers, dtype=torch.float64)
+            if p.shape != (factor.size,) or not bool(p.isfinite().all()) or abs(float(p.sum()) - 1.0) > 1e-4:
+                raise ValueError(
+                    f"{KEY}: {file}: {name}.{factor.name}: want {factor.size} numbers that add up to 1, got {numbers}"
+                )
+            parts.append(factor.psi_of(p))
+        psi.append(torch.cat(parts))
+    return torch.stack(psi)
+
+
+def _numbers(held: Any, name: str, factor: str) -> list[float]:
+    """Of ``results.json``, where a factor has an initial and a target distribution too, or of ``psi.json``."""
+    if name not in held:
+        raise KeyError(name)
+    if factor not in held[name]:
+        raise KeyError(f"{name}.{factor}")
+    numbers = held[name][factor]
+    return [float(value) for value in (numbers["learned"] if isinstance(numbers, dict) else numbers)]

@@ -1,0 +1,1 @@
+"""Data sets of drawn images in the formats that others read."""

@@ -1,0 +1,166 @@
+"""A BOP data set: https://github.com/thodan/bop_toolkit, docs/bop_datasets_format.md. Millimetres, OpenCV axes.
+
+``train/<scene>/{rgb,depth,mask,mask_visib}`` with ``scene_gt.json``, ``scene_gt_info.json`` and ``scene_camera.json``;
+``models/models_info.json`` and the meshes, where there are some. All objects are listed, labelled or hidden.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from PIL import Image
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
+from trimesh.exchange.ply import export_ply
+
+from neural_sim.synthesis.export.files import same_file, write_json, write_whole
+from neural_sim.synthesis.export.images import ExportImage
+
+SPLIT = "bop/train"
+OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenGL's camera axes to OpenCV's."""
+LARGEST = 65535
+"""The largest number of a depth image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """An object as BOP knows it. ``millimetres`` is the radius of its bounding sphere, ``to_model`` maps the object's
+    normalised frame to its model's, in millimetres; ``mesh`` is in that frame, None where there is none."""
+
+    name: str
+    millimetres: float
+    to_model: Float[np.ndarray, "4 4"]
+    mesh: trimesh.Trimesh | None = None
+
+    def info(self) -> dict[str, float]:
+        """The entry of ``models_info.json``: the bounding box and the largest distance of two points, of the bounding
+        sphere where there is no mesh."""
+        if self.mesh is None:
+            low, size = self.to_model[:3, 3] - self.millimetres, np.full(3, 2.0 * self.millimetres)
+            diameter = 2.0 * self.millimetres
+        else:
+            points = np.asarray(self.mesh.vertices)
+            low, size = points.min(0), np.ptp(points, axis=0)
+            diameter = float(pdist(points[ConvexHull(points).vertices]).max())
+        sides = {f"{kind}_{axis}": float(v) for kind, values in (("min", low), ("size", size))
+                 for axis, v in zip("xyz", values, strict=True)}  # fmt: skip
+        return {"diameter": diameter, **sides}
+
+    def pose(self, camera_to_world: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
+        """Model to camera, rigid, from the camera's pose in the object's normalised frame."""
+        # Both frames measure the same object: the scales cancel.
+        to_camera = (
+            np.diag([self.millimetres] * 3 + [1.0]) @ OPENCV @ np.linalg.inv(np.asarray(camera_to_world))
+        )
+        return to_camera @ np.linalg.inv(self.to_model)
+
+
+def object_ids(class_names: Sequence[str]) -> list[int]:
+    """BOP's ids: the numbers of names such as ``obj_000003`` where all classes have such, else 1, 2, ..."""
+    found = [re.fullmatch(r"obj_(\d+)", name) for name in class_names]
+    numbers = [int(match[1]) for match in found if match]
+    return numbers if len(set(numbers)) == len(found) else list(range(1, len(found) + 1))
+
+
+def depth_scale(farthest: float) -> float:
+    """Millimetres of one step of a depth image, a power of ten that reaches ``farthest`` millimetres."""
+    return 10.0 ** math.ceil(math.log10(farthest / LARGEST))
+
+
+def place(number: int, scene_size: int) -> tuple[str, int]:
+    """The scene's folder below the data set's, and the number there, of an image."""
+    return f"{SPLIT}/{number // scene_size:06d}", number % scene_size
+
+
+def image_files(image: ExportImage, number: int, scene_size: int, scale: float) -> dict[str, bytes]:
+    """Depth and masks of an image, by path."""
+    folder, own = place(number, scene_size)
+    depth = np.rint(image.depth / scale).clip(0, LARGEST).astype(np.uint16)
+    files = {f"{folder}/depth/{own:06d}.png": _png(depth)}
+    for index, item in enumerate(image.objects):
+        for kind, mask in (("mask", item.full), ("mask_visib", item.visible)):
+            files[f"{folder}/{kind}/{own:06d}_{index:06d}.png"] = _png(mask.astype(np.uint8) * np.uint8(255))
+    return files
+
+
+def write_bop(
+    folder: Path, records: Sequence[Mapping[str, Any]], models: Sequence[Model], scene_size: int, scale: float
+) -> None:
+    """All of a data set but depth and masks, which are written with the images."""
+    names = [model.name for model in models]
+    ids = object_ids(names)
+    scenes: dict[str, dict[str, dict[str, Any]]] = {}
+    for record in records:
+        scene, own = place(record["number"], scene_size)
+        same_file(folder / record["file"], folder / scene / "rgb" / f"{own:06d}{Path(record['file']).suffix}")
+        files = scenes.setdefault(scene, {"scene_gt": {}, "scene_gt_info": {}, "scene_camera": {}})
+        objects = record["objects"]
+        files["scene_gt"][str(own)] = [
+            _pose(models[item["label"]], ids[item["label"]], item) for item in objects
+        ]
+        files["scene_gt_info"][str(own)] = [_info(item) for item in objects]
+        files["scene_camera"][str(own)] = {"cam_K": matrix_of(record["camera"]), "depth_scale": scale}
+    for scene, files in scenes.items():
+        for name, document in files.items():
+            write_json(folder / scene / f"{name}.json", document)
+    root = folder / "bop"
+    if records:
+        camera = records[0]["camera"]
+        sides = {key: camera[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        write_json(root / "camera.json", sides | {"depth_scale": scale}, indent=1)
+    infos = {str(id): model.info() for id, model in zip(ids, models, strict=True)}
+    write_json(root / "models" / "models_info.json", infos, indent=1)
+    for id, model in zip(ids, models, strict=True):
+        if model.mesh is not None:
+            text = export_ply(model.mesh, encoding="ascii", vertex_normal=True)
+            write_whole(root / "models" / f"obj_{id:06d}.ply", text)
+    write_whole(root / "dataset_info.md", _described(names, ids))
+
+
+def matrix_of(camera: Mapping[str, float]) -> list[float]:
+    """The camera matrix, row by row."""
+    return [camera["fx"], 0.0, camera["cx"], 0.0, camera["fy"], camera["cy"], 0.0, 0.0, 1.0]
+
+
+def _pose(model: Model, id: int, item: Mapping[str, Any]) -> dict[str, Any]:
+    pose = model.pose(item["pose"]["camera_to_world"])
+    return {"cam_R_m2c": pose[:3, :3].flatten().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": id}
+
+
+def _info(item: Mapping[str, Any]) -> dict[str, Any]:
+    pixels = item["pixels"]
+    boxes = {"bbox_obj": item["box_full"], "bbox_visib": item["box_visible"]}
+    return {
+        **{key: _toolkit_box(box) if pixels["visible"] else [-1] * 4 for key, box in boxes.items()},
+        "px_count_all": pixels["all"],
+        "px_count_valid": pixels["valid"],
+        "px_count_visib": pixels["visible"],
+        "visib_fract": item["visibility"],
+    }
+
+
+def _toolkit_box(box: Sequence[int]) -> list[int]:
+    """As the toolkit counts: width and height are differences of the last and the first pixel."""
+    return [box[0], box[1], box[2] - 1, box[3] - 1]
+
+
+def _described(names: Sequence[str], ids: Sequence[int]) -> str:
+    lines = [f"- obj_{id:06d}: {name}" for id, name in zip(ids, names, strict=True)]
+    return "\n".join(["# Images drawn by Neural-Sim", "", *lines, "", json.dumps({"split": "train"}), ""])
+
+
+def _png(grid: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(grid).save(stream, "PNG", compress_level=1)
+    return stream.getvalue()

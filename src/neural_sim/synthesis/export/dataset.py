@@ -1,0 +1,118 @@
+"""A data set of drawn images: every image with all its files, then the annotations of all in each format."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from PIL import Image
+
+from neural_sim.synthesis.export import bop
+from neural_sim.synthesis.export.coco import coco_document
+from neural_sim.synthesis.export.files import write_json, write_whole
+from neural_sim.synthesis.export.folder import ExportFolder
+from neural_sim.synthesis.export.images import ImageSource
+from neural_sim.synthesis.export.records import opencv_entry, record_of
+from neural_sim.synthesis.export.workers import each
+from neural_sim.synthesis.export.yolo import write_yolo
+
+_log = logging.getLogger(__name__)
+
+Format = Literal["coco", "yolo", "bop"]
+ImageFormat = Literal["jpg", "png"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+
+@dataclass(frozen=True)
+class ImageWriter:
+    """Writes an image with all files that are its own, and gives its record; ``scene_size`` and ``scale`` are those of
+    BOP, None where it is not asked for. The image itself comes last."""
+
+    source: ImageSource
+    root: Path
+    image_format: ImageFormat
+    scene_size: int | None
+    scale: float
+
+    def __call__(self, number: int) -> dict[str, Any]:
+        image = self.source.image(number)
+        if self.scene_size is not None:
+            files = bop.image_files(image, number, self.scene_size, self.scale)
+            for path, content in files.items():
+                write_whole(self.root / path, content)
+        file, stream = f"images/{number:06d}.{self.image_format}", io.BytesIO()
+        # Fine edges keep their colour only without chroma subsampling.
+        options = {"quality": 95, "subsampling": 0} if self.image_format == "jpg" else {"compress_level": 1}
+        Image.fromarray(image.pixels).save(stream, "JPEG" if self.image_format == "jpg" else "PNG", **options)
+        write_whole(self.root / file, stream.getvalue())
+        digest = hashlib.sha256(stream.getvalue()).hexdigest()
+        return record_of(image, self.source.camera, number, file, digest)
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """``count`` images of ``source`` in ``root``, in ``formats``.
+
+    Images that are there already stay, with their ids; one with a number of ``count`` or more stays in the set, too.
+    ``identity`` is what all images depend on, see :class:`ExportFolder`; ``models`` are the objects as BOP has them.
+    """
+
+    source: ImageSource
+    root: Path
+    models: Sequence[bop.Model]
+    identity: Mapping[str, Any]
+    count: int
+    formats: Sequence[Format]
+    image_format: ImageFormat = "jpg"
+    scene_size: int = 1000
+    farthest: float = 6553.5
+    workers: int = 0
+
+    def write(self, shown: Callable[[Iterable[int]], Iterable[int]]) -> list[dict[str, Any]]:
+        """All images that are missing, then the annotations; returns the records of all. ``shown`` is a progress bar.
+
+        Raises:
+            ValueError: a folder with images of another identity, or one that cannot be written.
+        """
+        folder, with_bop = ExportFolder(self.root, self.identity), "bop" in self.formats
+        scale = bop.depth_scale(self.farthest)
+        writer = ImageWriter(
+            self.source, self.root, self.image_format, self.scene_size if with_bop else None, scale
+        )
+        with folder.opened() as records:
+            missing = [number for number in range(self.count) if number not in records]
+            if records:
+                _log.info("export: %s has %d images, %d to go", self.root, len(records), len(missing))
+            begun, made = time.perf_counter(), each(writer, missing, self.workers)
+            try:
+                for number in shown(missing):
+                    records[number] = next(made)
+                    folder.add(records[number])
+            finally:
+                made.close()
+            spent = time.perf_counter() - begun
+            if missing:
+                _log.info("export: %d images, %.2f a second", len(missing), len(missing) / spent)
+            ordered = [records[number] for number in sorted(records)]
+            self._annotate(ordered, scale)
+            folder.finish(ordered)
+        return ordered
+
+    def _annotate(self, records: Sequence[Mapping[str, Any]], scale: float) -> None:
+        names = self.source.scene.names
+        if "coco" in self.formats:
+            varies = any(
+                factor.coordinate == "magnification" for factor in self.source.scene.distribution.binned
+            )
+            camera = None if varies else opencv_entry(self.source.camera)
+            write_json(self.root / "annotations.json", coco_document(records, names, camera))
+        if "yolo" in self.formats:
+            write_yolo(self.root, records, names)
+        if "bop" in self.formats:
+            bop.write_bop(self.root, records, self.models, self.scene_size, scale)

@@ -1,0 +1,50 @@
+"""YOLO's text labels: boxes beside the images, and polygons in a folder of their own, since a set has one or the other.
+
+https://docs.ultralytics.com/datasets/detect and /segment: one line an object, its class and numbers in units of the
+image's width and height.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neural_sim.synthesis.export.files import same_file, write_whole
+from neural_sim.synthesis.export.masks import mask_of, polygon
+
+DATA = "dataset.yaml"
+SEGMENT = "segment"
+
+
+def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: Sequence[str]) -> None:
+    """``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``; below ``segment`` the same images with the
+    visible masks as polygons. Images without objects have empty files, as YOLO has them."""
+    for record in records:
+        name = Path(record["file"])
+        for place, line in ((folder, box_line), (folder / SEGMENT, polygon_line)):
+            lines = [line(item, record["camera"]) for item in record["objects"] if item["labelled"]]
+            path = place / "labels" / f"{name.stem}.txt"
+            if not path.is_file():
+                write_whole(path, "".join(f"{text}\n" for text in lines))
+        same_file(folder / name, folder / SEGMENT / "images" / name.name)
+    names = "".join(f"  {label}: {json.dumps(name)}\n" for label, name in enumerate(class_names))
+    # Readers take paths to be relative to this file where it names no root.
+    text = f"train: images\nval: images # no split is made; name your own\nnc: {len(class_names)}\nnames:\n{names}"
+    for place in (folder, folder / SEGMENT):
+        write_whole(place / DATA, text)
+
+
+def box_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
+    """Class, and the visible box's centre and size."""
+    x, y, width, height = item["box_visible"]
+    numbers = (x + 0.5 * width) / size["width"], (y + 0.5 * height) / size["height"]
+    sides = width / size["width"], height / size["height"]
+    return " ".join([str(item["label"]), *(f"{value:.9f}" for value in (*numbers, *sides))])
+
+
+def polygon_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
+    """Class, and the corners of a polygon along the edges of the visible mask's pixels, see :func:`masks.polygon`."""
+    corners = polygon(mask_of(item["mask_visible"])) / (size["width"], size["height"])
+    return " ".join([str(item["label"]), *(f"{value:.9f}" for value in corners.flatten().tolist())])

@@ -1,0 +1,177 @@
+"""``stages=[export]``: from objects and a psi to a data set, through the command line's own composition."""
+
+import functools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from PIL import Image
+
+from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.stages import export as stage
+from neural_sim.stages.detail import finer_recipe, view_size_for
+from neural_sim.stages.walk import walk
+from neural_sim.target.coco import CocoTarget
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "+experiment=pose_gap", "scale=smoke", "progress=false", "stages=[export]", "objects.names=[pitcher,drill]",
+    "views.count=8", "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64",
+    "export.width=48", "export.height=36",
+    "export.count=3", "export.workers=0", "export.psi=target", "export.detail=run",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return tmp_path_factory.mktemp("export")
+
+
+def composed(base, *overrides):
+    paths = [f"paths.store={base / 'store'}", f"paths.mlflow={base / 'mlflow.db'}"]
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return compose("config", [*SMALL, *paths, *overrides])
+
+
+def export(base, folder, *overrides):
+    context, others = context_of(composed(base, *overrides), folder)
+    walk(context, others)
+    return folder / "dataset"
+
+
+@pytest.fixture(scope="module")
+def made(base):
+    return export(base, base / "run", "export.formats=[coco,yolo,bop]")
+
+
+def test_a_data_set_needs_objects_and_a_psi_alone(made):
+    """Views and fields are made by the stage itself; no target set and no detector is."""
+    manifest = json.loads((made / "manifest.json").read_text())
+    assert manifest["identity"]["classes"] == ["pitcher", "drill"]
+    assert [image["number"] for image in manifest["images"]] == [0, 1, 2]
+    assert {Image.open(made / image["file"]).size for image in manifest["images"]} == {(48, 36)}
+    assert {path.name for path in made.iterdir()} == {
+        "annotations.json", "bop", "dataset.yaml", "images", "labels", "manifest.json", "psi.csv", "psi.json",
+        "records.jsonl", "segment",
+    }  # fmt: skip
+    kinds = {path.parent.name for path in (made.parents[1] / "store").rglob("*.pt")}
+    assert kinds == {"views", "field"}
+    loaded = CocoTarget(made / "annotations.json").load(["pitcher", "drill"], 36, 48)
+    assert len(loaded) == 3 and bool(loaded.present.any())
+    assert float(loaded.images.std()) > 0.05
+
+
+def test_images_follow_the_psi_that_is_asked_for(base, made):
+    """The dominant bin of the target is drawn most often, and the table says with which weight."""
+    held = json.loads((made / "psi.json").read_text())
+    config = composed(base)
+    wanted = config.parameter.pose.biased.pitcher.target.dominant
+    weights = held["psi"]["pitcher"]["pose"]
+    assert int(np.argmax(weights)) == wanted - 1 and weights[wanted - 1] == pytest.approx(0.86)
+    rows = [row for row in held["rows"] if row["object"] == "pitcher" and row["factor"] == "pose"]
+    assert [row["weight"] for row in rows] == pytest.approx(weights)
+
+
+def test_a_second_run_continues_the_folder(base, made, monkeypatch):
+    """More images in the same folder; a psi read back from psi.json is the same psi."""
+    before = {path.name: path.read_bytes() for path in (made / "images").iterdir()}
+    psi = base / "psi.json"
+    psi.write_bytes((made / "psi.json").read_bytes())
+    again = [f"export.folder={made}", f"export.psi={psi}", "export.formats=[coco,yolo,bop]", "export.count=4"]
+    export(base, base / "other", *again)
+    after = {path.name: path.read_bytes() for path in (made / "images").iterdir()}
+    assert len(after) == 4 and {name: after[name] for name in before} == before
+    assert not (base / "other" / "dataset").exists()
+
+
+def test_psi_is_read_from_a_runs_results(base, tmp_path):
+    learned = {
+        "learned": [0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1],
+        "initial": [0.125] * 8,
+        "target": [0.125] * 8,
+    }
+    document = {"psi": {name: {"pose": learned} for name in ("pitcher", "drill")}}
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    folder = export(base, tmp_path / "run", f"export.psi={tmp_path}", "export.count=1")
+    held = json.loads((folder / "psi.json").read_text())["psi"]
+    assert held["drill"]["pose"] == pytest.approx(learned["learned"])
+
+
+def results(path, document):
+    (path / "results.json").write_text(document if isinstance(document, str) else json.dumps(document))
+    return f"export.psi={path}/results.json"
+
+
+REFUSED = [
+    (["export.count=0"], r"export\.count must be at least 1, got 0"),
+    (["export.width=null"], r"export: want width and height or neither, got None and 36"),
+    (["export.formats=[coco,voc]"], r"export\.formats: want some of \['coco', 'yolo', 'bop'\], got \['coco', 'voc'\]"),
+    (["export.formats=[]"], r"export\.formats: want some of .*, got \[\]"),
+    (["export.image_format=gif"], r"export\.image_format: want .*'gif'|export\.image_format must be one of"),
+    (["export.workers=-1"], r"export\.workers must be at least 0, got -1"),
+    (["export.psi=learned"], r"stages: psi loop is not in .*store; add stage psi to \['export'\]"),
+    (["export.psi=/none"], r"export\.psi: want learned, initial, target, a run's folder.*, got /none, which does not"),
+    (lambda path: [results(path, "{")], r"export\.psi: .*results\.json is no results\.json or psi\.json"),
+    (lambda path: [results(path, {"psi": {"pitcher": {"pose": [0.125] * 8}}})],
+     r"export\.psi: .*results\.json has no psi of drill; want objects \['pitcher', 'drill'\] with \['pose'\]"),
+    (lambda path: [results(path, {"psi": {name: {"pose": [0.5] * 2} for name in ("pitcher", "drill")}})],
+     r"results\.json: pitcher\.pose: want 8 numbers that add up to 1, got \[0\.5, 0\.5\]"),
+    (["parameter=[pose,zoom]", "parameter.zoom.by=focal_length", "parameter.zoom.range=[0.5,2.0]",
+      "export.formats=[bop]", "synthesis.objects_per_image=[1,2]"],
+     r"export\.formats: bop has one camera for all objects of an image"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED)
+def test_bad_settings_are_one_line_and_leave_nothing(overrides, message, base, tmp_path):
+    given = overrides(tmp_path) if callable(overrides) else overrides
+    with pytest.raises((ValueError, UserError), match=message) as caught:
+        export(base, tmp_path / "run", *given)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_another_configuration_of_a_folder_is_refused_before_fields_are_fitted(
+    base, made, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(stage, "farthest", None)  # comes after the fields
+    for change, message in (("seed=9", r"made with seed=0, now it is 9"),
+                            ("export.width=64", r"made with camera\.width=48, now it is 64"),
+                            ("export.image_format=png", r"made with image_format=\"jpg\", now it is \"png\""),
+                            ("export.psi=initial", r"made with psi\.pitcher\.pose=")):  # fmt: skip
+        with pytest.raises(ValueError, match=rf"export\.folder: .*{message}"):
+            export(base, tmp_path, f"export.folder={made}", "export.formats=[coco,yolo,bop]", change)
+
+
+def test_on_the_command_line_bad_settings_end_with_status_two(base, tmp_path):
+    words = [*SMALL, f"paths.store={base / 'store'}", "export.formats=[voc]", f"hydra.run.dir={tmp_path}/run"]
+    done = subprocess.run(
+        [sys.executable, "-m", "src.main", *words], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("neural-sim: export: export.formats: want some of")
+
+
+def test_views_for_larger_images_have_as_many_pixels_for_a_radius(base):
+    """A square image of the views' field of view and nearest distance wants views of its own size."""
+    context, _ = context_of(composed(base, "unlearned.distance=[2.4,4.0]"), base / "unused")
+    views, distribution = context.experiment.imaging.views, context.experiment.imaging.distribution
+    assert view_size_for(views, views.camera(480), distribution, 1.0) in (480, 481)
+    assert view_size_for(views, views.camera(480), distribution, 2.0) in (960, 961)
+
+
+def test_a_finer_recipe_has_more_steps_and_cells_and_may_be_fitted(base):
+    recipe = context_of(composed(base), base / "unused")[0].experiment.imaging.field
+    finer = finer_recipe(recipe, 3.0)
+    assert isinstance(finer.fitting, functools.partial) and finer.steps == 60
+    given = finer.fitting.keywords
+    assert (given["resolution"], given["refine_steps"], given["prune_steps"]) == (256, (75,), (135,))
+    assert recipe.fitting.keywords["resolution"] == 64  # the run's own stays
+    fitting = finer.fitting(finer.field())
+    assert fitting.resolution == 256
+    assert torch.is_tensor(fitting.field.table)
