@@ -40,7 +40,16 @@ def test_heavy_libraries_stay_in_their_rooms():
     homes = {
         "pyrender": {"renderer/mesh.py"},
         "matplotlib": {
-            f"report/{name}.py" for name in ("figures", "curves", "interpolation", "temperatures")
+            f"report/{name}.py"
+            for name in (
+                "figures",
+                "curves",
+                "interpolation",
+                "temperatures",
+                "side_by_side",
+                "gallery",
+                "detection_gallery",
+            )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},
         "onnx": {"detector/onnx_export.py", "detector/onnx_nms.py"},
