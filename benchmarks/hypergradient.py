@@ -21,15 +21,15 @@ from pathlib import Path
 
 import torch
 from field import fit, load_objects, training_views  # the benchmark beside this one
-from machine import add_device, forget_peak, machine
+from machine import add_device, machine
 from torch import Tensor
-from torch.profiler import ProfilerActivity, profile
 
 from neural_sim import cameras
 from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
 from neural_sim.field.training import field_from_state, field_state
 from neural_sim.gradient.pathwise import contract
+from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -96,26 +96,6 @@ def reverse(of: Case, patch: int) -> Tensor:
         )
         total += part
     return total
-
-
-def peak_bytes(run: Callable[[], object], device: torch.device | None = None) -> int:
-    """Most bytes that torch held at once on a GPU, else on the CPU, beyond what it held before."""
-    if device is not None and device.type == "cuda":
-        before = torch.cuda.memory_allocated(device)
-        forget_peak(device)
-        run()
-        return torch.cuda.max_memory_allocated(device) - before
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
-        run()
-    held, most = 0, 0
-    kineto = record.profiler.kineto_results if record.profiler is not None else None
-    events = [event for event in kineto.events() if event.name() == "[memory]"] if kineto is not None else []
-    if not events:
-        raise RuntimeError("the profiler recorded no allocation")
-    for event in sorted(events, key=lambda event: event.start_ns()):
-        held += event.nbytes()
-        most = max(most, held)
-    return most
 
 
 def measure(of: Case, name: str, run: Callable[[Case], Tensor], repeats: int) -> dict[str, object]:

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
-from hypergradient import peak_bytes
 from machine import add_device, machine
 
 from neural_sim import cameras
 from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
+from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.types import PinholeCamera, PosedViews, Rays
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import torch
 import trimesh
 from captures import capture
 from documented import PAGES, ROOT
+from omegaconf import OmegaConf
 from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
 
@@ -78,10 +79,11 @@ def meshes(root: Path) -> Path:
     return root
 
 
-def coco(path: Path) -> Path:
-    """Frames of four videos, a folder each, with a box of each of two of the embedded objects in every frame."""
+def coco(path: Path, names: Sequence[str] = ()) -> Path:
+    """Frames of four videos, a folder each, with a box of each of two of six objects, of the embedded ones unless their
+    names are given, in every frame."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    names, generator = Procedural().names(), torch.Generator().manual_seed(1)
+    names, generator = names or Procedural().names(), torch.Generator().manual_seed(1)
     images, annotations = [], []
     for video in range(4):
         folder = path.parent / f"video{video}"
@@ -103,6 +105,17 @@ def coco(path: Path) -> Path:
     document = {"images": images, "annotations": annotations, "categories": categories, "camera": camera}
     path.write_text(json.dumps(document))
     return path
+
+
+def wild(path: Path) -> Path:
+    """:func:`coco` with the paper's six YCB objects."""
+    return coco(path, OmegaConf.load(ROOT / "conf" / "experiment" / "detection_gallery.yaml").objects.names)
+
+
+def blenderproc(root: Path) -> Path:
+    """The pictures of :func:`coco` as BlenderProc writes them."""
+    coco(root / "coco_data" / "coco_annotations.json")
+    return root
 
 
 def ycb_video(root: Path) -> Path:
@@ -166,6 +179,8 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/meshes": meshes,
     "/data/captures": captures,
     "/data/val.json": coco,
+    "/data/wild.json": wild,
+    "/data/blenderproc": blenderproc,
     "/data/backgrounds": backgrounds,
     "/data/YCB_Video": ycb_video,
     "/data/ycbv": bop_scenes,

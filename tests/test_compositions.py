@@ -20,7 +20,13 @@ BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
 PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]", "[pose,zoom,illumination]")
 EXPERIMENTS = sorted(
     {path.stem for path in (CONF / "experiment").glob("*.yaml") if not path.stem.endswith("_ycb")}
-    - {"stress", "compare", "illumination_interpolation"}
+    - {
+        "stress",
+        "compare",
+        "illumination_interpolation",
+        "nerf_vs_mesh",
+        "detection_gallery",
+    }  # no object is biased
 )
 
 

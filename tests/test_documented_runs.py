@@ -93,7 +93,9 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     folders = [path.parent.parent for path in folder.glob("**/.hydra/config.yaml")]
     assert len(folders) == len(jobs)
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
-             "temperatures": _temperatures}  # fmt: skip
+             "temperatures": _temperatures, "patch_memory": _patch_memory,
+             "nerf_vs_mesh": _nerf_vs_mesh, "samples_gallery": _samples_gallery,
+             "detection_gallery": _detection_gallery}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
         alone = {"predict": _predict, "export": _export, "preflight": _preflight}.get(config["stages"][0])
         check = alone or kinds.get(next((key for key in kinds if key in config), ""), _run)
@@ -222,6 +224,46 @@ def _temperatures(folder, config):
     cold = held["rows"][0]
     assert cold["temperature"] == min(values) and cold["frequencies"][6] > 0.8
     assert (folder / "figures" / "temperatures.png").stat().st_size > 5000
+
+
+def _patch_memory(folder, config):
+    rows = json.loads((folder / "patch_memory.json").read_text())["rows"]
+    side = config["camera"].get("width") or config["training"]["image_size"]
+    patches = [patch for patch in config["patch_memory"]["patches"] if patch < side**2]
+    assert [row["patch"] for row in rows] == [None, *patches, side**2]
+    assert all(row["difference"] < 1e-2 for row in rows)  # float32
+    assert (folder / "patch_memory.md").stat().st_size > 300
+
+
+def _nerf_vs_mesh(folder, config):
+    held = json.loads((folder / "nerf_vs_mesh.json").read_text())
+    other = "blenderproc" if config["nerf_vs_mesh"]["blenderproc"] else "mesh"
+    assert held["sources"] == ["nerf", other] and len(held["seeds"]) == config["nerf_vs_mesh"]["seeds"]
+    assert set(held["ap"]) == {"single", "multiple"}
+    assert all(
+        0.0 <= row[source]["value"] <= 1.0 for row in held["ap"].values() for source in held["sources"]
+    )
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == {"ap", "training_images"}
+    poses = json.loads((folder / "training_set" / "annotations.json").read_text())["images"]
+    assert poses and all(pose["camera_to_world"] for image in poses for pose in image["poses"])
+
+
+def _samples_gallery(folder, config):
+    held, settings = json.loads((folder / "samples_gallery.json").read_text()), config["samples_gallery"]
+    assert set(held) == set(config["parameter"]["pose"]["biased"])
+    for each in held.values():
+        count = settings.get("count", 18)
+        assert set(each["images"].values()) == {count} and 0 < each["test"] <= count
+        assert set(each["total_variation"]) == set(settings.get("methods", ("neural_sim", "auto_sim")))
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == set(held)
+
+
+def _detection_gallery(folder, config):
+    held = json.loads((folder / "detection_gallery.json").read_text())
+    assert list(held["methods"]) == config["detection_gallery"]["methods"] and held["shown"]
+    boxes = {each["right"] + each["missed"] for each in held["methods"].values()}
+    assert len(boxes) == 1  # every method is judged by the same boxes
+    assert (folder / "figures" / "detections.png").stat().st_size > 5000
 
 
 def _stress(folder, config):

@@ -48,6 +48,9 @@ def test_heavy_libraries_stay_in_their_rooms():
                 "temperatures",
                 "page/charts",
                 "page/comparison_page",
+                "side_by_side",
+                "gallery",
+                "detection_gallery",
             )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},

@@ -12,7 +12,7 @@ import re
 import sys
 import typing
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
 from inspect import signature
 from pathlib import Path
@@ -23,7 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 if TYPE_CHECKING:
     from neural_sim.stages.context import Context, Step
@@ -92,10 +92,17 @@ def _build(plain: dict[str, Any]) -> Experiment:
     return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain, parts["model"])
 
 
-def context_of(config: DictConfig, folder: Path) -> tuple[Context, dict[str, Step]]:
+Recompose = Callable[[Sequence[str]], DictConfig]
+"""The configuration of the same command with other choices, as overrides."""
+
+
+def context_of(
+    config: DictConfig, folder: Path, recompose: Recompose | None = None
+) -> tuple[Context, dict[str, Step]]:
     """A run in ``folder``, and those of its stages that are none from objects to a report, by name.
 
-    The experiment is built at once if a stage needs it, so that bad settings are refused before any stage runs.
+    The experiment is built at once if a stage needs it, so that bad settings are refused before any stage runs. With
+    ``recompose`` stages can build the experiment of another method.
 
     Raises:
         UserError: as :func:`build`, and for an unknown stage.
@@ -115,6 +122,8 @@ def context_of(config: DictConfig, folder: Path) -> tuple[Context, dict[str, Ste
         others[name] = _instantiate(node, name)
     wanted = {*plain["stages"], *(name for step in others.values() for name in getattr(step, "needs", ()))}
     context = Context(plain, folder, lambda: _build(plain), (*(n for n in STEPS if n in wanted), *others))
+    if recompose is not None:
+        context.of_method = lambda method: _build(_plain(recompose([f"baseline={method}"])))
     if wanted & set(STEPS):
         _ = context.experiment
     return context, others
@@ -157,6 +166,9 @@ def _plain(config: DictConfig) -> dict[str, Any]:
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
+        wanted = (config.get("needs") or {}).get(str(error.full_key))
+        if wanted is not None and isinstance(error, MissingMandatoryValue):
+            raise UserError(f"{error.full_key} is not given: want {wanted}") from error
         raise UserError(f"{error.full_key or 'configuration'}: {_first_line(error)}") from error
     if not isinstance(plain, dict):
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
@@ -237,6 +249,12 @@ def _first_line(error: BaseException) -> str:
     return lines[0].strip() if lines else type(error).__name__
 
 
+def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
+    """A command's overrides with ``choices`` in the place of those of the same groups."""
+    chosen = {choice.partition("=")[0] for choice in choices}
+    return [*(o for o in overrides if o.partition("=")[0].lstrip("+") not in chosen), *choices]
+
+
 @hydra.main(version_base="1.3", config_path=str(conf_directory()), config_name="config")
 def _task(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
@@ -244,7 +262,9 @@ def _task(config: DictConfig) -> float | None:
     warnings.filterwarnings("ignore", message=r".*torch\.jit\.script.*")
     warnings.filterwarnings("ignore", message=r".*LeafSpec.*")
     try:
-        context, others = context_of(config, Path(runtime.runtime.output_dir))
+        given = list(runtime.overrides.task)
+        folder, name = Path(runtime.runtime.output_dir), runtime.job.config_name
+        context, others = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
         from neural_sim.stages.walk import walk
 
         return walk(context, others)

@@ -88,10 +88,10 @@ def compare(
     ]
     point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
     spread = resampled(matches, draws, seed)
-    ap = dict(zip(columns, estimates(point, spread), strict=True))
+    ap = dict(zip(columns, with_intervals(point, spread), strict=True))
     gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
-    won = estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
-    ahead = estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
+    won = with_intervals((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
+    ahead = with_intervals(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
@@ -189,13 +189,15 @@ def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) ->
     for method, each in values.items():
         numbers, random = np.asarray(each), np.random.default_rng(seed)
         chosen = random.integers(len(each), size=(draws, len(each)))
-        over_seeds[method] = estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
+        over_seeds[method] = with_intervals(
+            numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True)
+        )[0]
         if len(each) == 1:
             over_seeds[method] = Estimate(over_seeds[method].value)
     return over_seeds
 
 
-def estimates(
+def with_intervals(
     point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
 ) -> list[Estimate]:
     """Values with the 2.5 % and 97.5 % quantiles of their bootstrap draws, of those that have a value."""

@@ -42,7 +42,8 @@ class Step(Protocol):
 class Context:
     """``build`` makes the experiment when a stage first asks for it: comparisons and the stress suite need none.
 
-    ``returned`` is what the run returns to a sweep, ``live`` its MLflow run while it is open.
+    ``returned`` is what the run returns to a sweep, ``live`` its MLflow run while it is open. ``of_method`` makes the
+    experiment of the same command with another method (``baseline=...``), where the program can compose it.
     """
 
     config: dict[str, Any]
@@ -52,6 +53,7 @@ class Context:
     account: Account = field(default_factory=Account)
     live: LiveRun | None = None
     returned: float | None = None
+    of_method: Callable[[str], Experiment] | None = None
 
     @staticmethod
     def of(experiment: Experiment, folder: Path | None = None) -> Context:

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from neural_sim.report.bootstrap import match
-from neural_sim.report.statistics import Estimate, estimates, mean_ap, resampled
+from neural_sim.report.statistics import Estimate, mean_ap, resampled, with_intervals
 from neural_sim.types import LabelledImages
 
 Outcome = Literal["better", "worse", "no difference", "not scored"]
@@ -61,7 +61,7 @@ def gain_of(
     matches = [[match(detections[which], test, label) for label in labels] for which in WHICH]
     point = np.asarray([mean_ap(classes) for classes in matches])
     spread = resampled([matches], draws, seed=0)
-    gain, room = estimates(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
+    gain, room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
     ap = dict(zip(WHICH, point.tolist(), strict=True))
     return Gain(tuple(names), ap, gain, None if same_target else room)
 

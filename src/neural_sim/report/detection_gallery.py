@@ -1,0 +1,205 @@
+"""Detections of several methods on the same photographs, right and wrong: `+experiment=detection_gallery`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from torch import Tensor
+from torchvision.ops import box_iou
+
+from neural_sim.detector.metrics import AveragePrecision
+from neural_sim.report import figures, tracking
+from neural_sim.report.figures import INK
+from neural_sim.types import LabelledImages
+
+RIGHT, WRONG, MISSED = "#2ca25f", "#d7301f", "#ffd23f"
+Detections = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Detections of one image, best first: ``kept`` are those that count, ``right`` which of them lie on a box of their
+    class, ``missed`` which true boxes have none."""
+
+    kept: Int[Tensor, "d"]
+    right: Bool[Tensor, "d"]
+    missed: Bool[Tensor, "b"]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Of one method over all test images."""
+
+    right: int
+    wrong: int
+    missed: int
+
+
+def judge(
+    found: Detections, boxes: Float[Tensor, "b 4"], labels: Int[Tensor, "b"], above: float, overlap: float
+) -> Judged:
+    """The best detection first, each takes the free box of its class that it overlaps most, by ``overlap`` or more; a
+    second detection of a box is wrong."""
+    order = found["scores"].argsort(descending=True, stable=True)
+    kept = order[found["scores"][order] >= above]
+    ious = box_iou(found["boxes"][kept].float(), boxes.float())
+    ious = torch.where(found["labels"][kept][:, None] == labels[None], ious, -1.0)
+    free = torch.ones(len(boxes), dtype=torch.bool)
+    right = torch.zeros(len(kept), dtype=torch.bool)
+    for row, values in enumerate(ious):
+        candidates = torch.where(free, values, -1.0)
+        if len(candidates) and float(candidates.max()) >= overlap:
+            free[candidates.argmax()] = False
+            right[row] = True
+    return Judged(kept, right, free)
+
+
+def judged(found: Sequence[Detections], test: LabelledImages, above: float, overlap: float) -> list[Judged]:
+    """Every test image."""
+    truth = zip(test.boxes, test.labels, test.present, strict=True)
+    return [
+        judge(each, boxes[there], labels[there], above, overlap)
+        for each, (boxes, labels, there) in zip(found, truth, strict=True)
+    ]
+
+
+def count(images: Sequence[Judged]) -> Counts:
+    right = sum(int(each.right.sum()) for each in images)
+    kept, missed = sum(len(each.kept) for each in images), sum(int(each.missed.sum()) for each in images)
+    return Counts(right, kept - right, missed)
+
+
+def detections_figure(
+    test: LabelledImages,
+    found: Mapping[str, Sequence[Detections]],
+    verdicts: Mapping[str, Sequence[Judged]],
+    class_names: Sequence[str],
+    rows: Int[Tensor, "n"],
+) -> Figure:
+    """A row for each method, a column for each of the test images ``rows``."""
+    height, width = test.images.shape[-2:]
+    side = 2.1
+    figure = Figure(
+        figsize=(side * len(rows) + 0.3, side * height / width * len(found) + 0.25 * len(found) + 0.8),
+        layout="constrained",
+    )
+    grid = figure.subplots(len(found), len(rows), squeeze=False)
+    for line, (method, every) in enumerate(found.items()):
+        for column, row in enumerate(rows.tolist()):
+            axes = grid[line, column]
+            axes.imshow(
+                test.images[row].clamp(0.0, 1.0).movedim(0, -1).cpu().numpy(), extent=(0, width, height, 0)
+            )
+            _draw(
+                axes, every[row], verdicts[method][row], test.select(slice(row, row + 1)), class_names, width
+            )
+            axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+            for spine in axes.spines.values():
+                spine.set_visible(False)
+        grid[line, 0].set_ylabel(method, color=INK, fontsize=9)
+    handles = [Rectangle((0, 0), 1, 1, fill=False, edgecolor=RIGHT, linewidth=1.6),
+               Rectangle((0, 0), 1, 1, fill=False, edgecolor=WRONG, linewidth=1.6),
+               Rectangle((0, 0), 1, 1, fill=False, edgecolor=MISSED, linewidth=1.2, linestyle="--")]  # fmt: skip
+    figure.legend(
+        handles, ["right", "wrong", "missed"], loc="outside lower center", ncols=3, frameon=False, fontsize=8
+    )
+    figure.suptitle("Detections on the test images", color=INK, fontsize=11)
+    return figure
+
+
+def _draw(
+    axes: Any,
+    found: Detections,
+    verdict: Judged,
+    image: LabelledImages,
+    class_names: Sequence[str],
+    width: int,
+) -> None:
+    there = image.present[0]
+    for box in image.boxes[0][there][verdict.missed].tolist():
+        _box(axes, box, MISSED, dashed=True)
+    lowest = list(zip(verdict.kept.tolist(), verdict.right.tolist(), strict=True))[::-1]  # the best on top
+    for index, right in lowest:
+        colour, (x0, y0, x1, y1) = RIGHT if right else WRONG, found["boxes"][index].tolist()
+        _box(axes, (x0, y0, x1, y1), colour, dashed=False)
+        name = class_names[int(found["labels"][index])]
+        text = f"{name} {float(found['scores'][index]):.2f}"
+        inside = y0 < 0.06 * width  # no room above the box
+        axes.text(
+            max(x0, 0.0), y0, text, fontsize=5.5, color="white", clip_on=True,
+            ha="left", va="top" if inside else "bottom",
+            bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.85},
+        )  # fmt: skip
+
+
+def _box(axes: Any, box: Sequence[float], colour: str, dashed: bool) -> None:
+    x0, y0, x1, y1 = box
+    width, style = (1.2, "--") if dashed else (1.6, "-")
+    axes.add_patch(
+        Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=width, linestyle=style)
+    )
+
+
+def report_detections(
+    test: LabelledImages,
+    found: Mapping[str, Sequence[Detections]],
+    ap: Mapping[str, AveragePrecision],
+    class_names: Sequence[str],
+    rows: Int[Tensor, "n"],
+    above: float,
+    overlap: float,
+    experiment: str,
+    config: Mapping[str, Any],
+    uri: str,
+    folder: Path,
+    begun: float,
+) -> tracking.Run:
+    """The figure, detection_gallery.md and detection_gallery.json in ``folder``, and a run in MLflow that began at
+    ``begun`` (seconds since 1970)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    verdicts = {method: judged(every, test, above, overlap) for method, every in found.items()}
+    counts = {method: count(every) for method, every in verdicts.items()}
+    drawn = detections_figure(test, found, verdicts, class_names, rows)
+    figures.save(drawn, folder / "figures" / "detections.png")
+    lines = [
+        f"{len(test)} test images; detections with a score of {above:g} or more, right where they overlap a box of "
+        f"their class by {overlap:g} or more.",
+        "",
+        "| method | right | wrong | missed boxes | AP (0.50 to 0.95) | AP50 |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method, each in counts.items():
+        values = (
+            each.right,
+            each.wrong,
+            each.missed,
+            f"{100 * ap[method].ap:.1f}",
+            f"{100 * ap[method].ap50:.1f}",
+        )
+        lines.append(f"| {method} | " + " | ".join(map(str, values)) + " |")
+    text = "\n".join(lines)
+    (folder / "detection_gallery.md").write_text(text + "\n")
+    methods = {
+        method: {**asdict(each), **{key: _known(getattr(ap[method], key)) for key in ("ap", "ap50")}}
+        for method, each in counts.items()
+    }
+    document = {"images": len(test), "shown": rows.tolist(), "methods": methods}
+    (folder / "detection_gallery.json").write_text(json.dumps(document, indent=1, allow_nan=False))
+    print(text)
+    metrics = {f"{m}/{key}": v for m, each in methods.items() for key, v in each.items() if v is not None}
+    seed = str(config["seed"])
+    named = uri, experiment, f"seed {seed}", {"seed": seed}
+    return tracking.log_run(*named, tracking.flatten(config), metrics, {}, folder, begun)
+
+
+def _known(value: float) -> float | None:
+    """None for the AP of test images without a box."""
+    return value if value == value else None

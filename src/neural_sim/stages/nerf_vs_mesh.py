@@ -1,0 +1,118 @@
+"""Stage ``nerf_vs_mesh``: fields against the mesh renderer as a source of training images, as
+conf/experiment/nerf_vs_mesh.yaml says."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from neural_sim.checks import at_least
+from neural_sim.report.run import write_training_set
+from neural_sim.report.side_by_side import report_side_by_side
+from neural_sim.stages.context import Context
+from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.meshes import Meshes
+from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
+from neural_sim.stages.side_by_side import (
+    compare_sources,
+    graphs_of_seeds,
+    pairs,
+    results_of_study,
+    sets_of_kinds,
+)
+from neural_sim.target.coco import CocoTarget
+
+ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
+"""Where BlenderProc's ``write_coco_annotations`` writes, in its output folder."""
+
+
+@dataclass(frozen=True)
+class NerfVsMeshStep:
+    """The paper's Sec. 4.1: the same detector trained on images of the fields and of the meshes, at the same poses and
+    distances, scored on images of one and of several objects.
+
+    Args:
+        single, multiple: fewest and most objects of a test image, of the two test sets.
+        seeds: how many detectors of each kind, from the run's seed on.
+        blenderproc: a folder of BlenderProc's COCO output, whose images take the place of the mesh renderer's; None:
+            the mesh renderer.
+        categories: its category names -> object names, null to leave a category out. Names not listed stand for
+            themselves.
+        draws: of the bootstrap over seeds and test images.
+        shown: training images of each kind in the figure.
+
+    Raises:
+        ValueError: numbers below their least, a range that is none, or a folder without BlenderProc's annotations.
+    """
+
+    single: Sequence[int] = (1, 1)
+    multiple: Sequence[int] = (2, 4)
+    seeds: int = 2
+    blenderproc: str | None = None
+    categories: Mapping[str, str | None] | None = None
+    draws: int = 300
+    shown: int = 8
+
+    def __post_init__(self) -> None:
+        at_least("nerf_vs_mesh", 1, seeds=self.seeds, shown=self.shown)
+        at_least("nerf_vs_mesh", 2, draws=self.draws)
+        for key in ("single", "multiple"):
+            value = list(getattr(self, key))
+            if len(value) != 2 or not 0 <= value[0] <= value[1] or value[1] < 1:
+                raise ValueError(f"nerf_vs_mesh.{key}: want fewest and most objects of an image, got {value}")
+        _ = self._rendered  # a folder without annotations is refused before anything is computed
+
+    @cached_property
+    def _rendered(self) -> CocoTarget | None:
+        if self.blenderproc is None:
+            return None
+        folder = Path(self.blenderproc).expanduser()
+        found = [folder / name for name in ANNOTATIONS if (folder / name).is_file()]
+        if not found:
+            raise ValueError(
+                f"nerf_vs_mesh.blenderproc: want the folder that BlenderProc's write_coco_annotations wrote, no "
+                f"{' or '.join(ANNOTATIONS)} in {folder}"
+            )
+        return CocoTarget(found[0], categories=self.categories)
+
+    def run(self, context: Context) -> None:
+        """Tables, figures, and the training images of the fields with their poses (``training_set``), from which
+        another program can render the same ones; to the run's folder and MLflow.
+
+        Raises:
+            ValueError: objects without meshes, or a target of photographs.
+        """
+        x, begun = context.experiment, time.time()
+        if not isinstance(context.graph.objects, Meshes):
+            raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
+        if not getattr(x.imaging.target, "renders", True):
+            raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")
+        graphs, results = graphs_of_seeds(context, self.seeds), results_of_study(context)
+        kinds = {"single": self.single, "multiple": self.multiple}
+        found = compare_sources(
+            graphs, results, self.sources, lambda graph: sets_of_kinds(graph, kinds), self.draws
+        )
+        first, names = graphs[0], list(context.graph.names)
+        drawn = self.sources(first)["nerf"].images(results(first.scene))
+        write_training_set(drawn, names, context.folder / "training_set")
+        shown = pairs(first, results, self.sources(first), self.shown)
+        other = found.sources[1]
+        run = report_side_by_side(
+            found, shown, names, f"Detectors trained on images of fields (nerf) and of meshes ({other}).",
+            x.run.name, x.config, context.uri, context.folder, begun,
+        )  # fmt: skip
+        print(f"results: {context.folder}\n{run.where}")
+
+    def sources(self, graph: Graph) -> dict[str, DetectorStage]:
+        """The detectors that are compared, by what their images show."""
+        nerf = graph.synthetic(graph.psi("target"), "images of the fields")
+        if self._rendered is not None:
+            other = trained_on(nerf, CocoDetectorStage, source=self._rendered)
+            return {"nerf": nerf, "blenderproc": other}
+        supersample = graph.experiment.imaging.views.supersample
+        meshes = {"contents": graph.objects.digests, "supersample": supersample, "objects": graph.objects}
+        return {"nerf": nerf, "mesh": trained_on(nerf, MeshDetectorStage, **meshes)}

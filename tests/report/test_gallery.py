@@ -1,0 +1,47 @@
+"""The figure of learned images, its distances and files."""
+
+import json
+
+import torch
+from mlflow import MlflowClient
+
+from neural_sim.report.gallery import Samples, report_samples, samples_figure, table
+from neural_sim.types import LabelledImages
+
+
+def images(count, value):
+    pixels = torch.full((count, 3, 32, 32), value)
+    return LabelledImages(
+        pixels, torch.zeros(count, 1, 4), torch.zeros(count, 1).long(), torch.zeros(count).long()
+    )
+
+
+def samples(name="pitcher", distances=None):
+    known = {"neural_sim": {"pose": 0.25}, "auto_sim": {"pose": 0.5}} if distances is None else distances
+    return Samples(name, {"neural_sim": images(18, 0.2), "auto_sim": images(18, 0.4)}, images(7, 0.6), known)
+
+
+def test_the_figure_has_a_panel_for_each_method_and_one_of_test_images():
+    figure = samples_figure(samples(), 9)
+    canvases = [axes.images[0].get_array() for axes in figure.axes]
+    assert [round(float(canvas[0, 0, 0]), 3) for canvas in canvases] == [0.2, 0.4, 0.6]
+    assert [canvas.shape[:2] for canvas in canvases] == [(65, 9 * 33 - 1)] * 2 + [(32, 9 * 33 - 1)]
+    assert float(canvases[2][0, 7 * 33 + 5, 0]) == 1.0  # seven test images
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles[0] == "neural_sim (total variation to the target: pose 0.25)" and titles[2] == "test images"
+
+
+def test_distances_are_tabled_where_the_target_is_known(tmp_path, uri):
+    unknown = samples("mug", {"neural_sim": None, "auto_sim": None})
+    assert "| pitcher, pose | 0.25 | 0.50 |" in table([samples(), unknown]) and "mug" not in table(
+        [samples(), unknown]
+    )
+    run = report_samples([samples(), unknown], 9, "samples_gallery", {"seed": 0}, uri, tmp_path / "run", 0.0)
+    document = json.loads((tmp_path / "run" / "samples_gallery.json").read_text())
+    assert (
+        document["pitcher"]["images"] == {"neural_sim": 18, "auto_sim": 18} and document["mug"]["test"] == 7
+    )
+    assert {path.stem for path in (tmp_path / "run" / "figures").iterdir()} == {"pitcher", "mug"}
+    assert MlflowClient(uri).get_run(run.run_id).data.metrics == {
+        "pitcher/pose/neural_sim": 0.25, "pitcher/pose/auto_sim": 0.5,
+    }  # fmt: skip

@@ -1,0 +1,156 @@
+"""Studies with a stage of their own: what they need, which methods and images they compare."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from neural_sim.main import UserError, _with, conf_directory, context_of
+from neural_sim.stages.nerf_vs_mesh import NerfVsMeshStep
+from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage
+from neural_sim.stages.side_by_side import graphs_of_seeds, sets_of_kinds
+from neural_sim.synthesis.export import write_coco
+from neural_sim.types import LabelledImages
+
+
+def context(*overrides):
+    """Of a command, with its other methods."""
+
+    def composed(more=()):
+        with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+            return compose("config", _with(["scale=smoke", *overrides], more))
+
+    return context_of(composed(), Path("unused"), composed)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "keys"),
+    [
+        (
+            ["+experiment=detection_gallery"],
+            ["objects.root is not given", "YCB scans", "objects.root=<folder>"],
+        ),
+        (
+            ["+experiment=detection_gallery", "objects.root=."],
+            ["target.annotations is not given", "COCO's format", "target.annotations=<file>"],
+        ),
+        (
+            ["+experiment=detection_gallery", "objects.root=.", "target=ycb_video"],
+            ["target.root is not given", "YCB-Video", "target.root=<folder>"],
+        ),
+        (
+            ["+experiment=nerf_vs_mesh", "nerf_vs_mesh.blenderproc=nowhere"],
+            ["nerf_vs_mesh.blenderproc", "coco_annotations.json", "in nowhere"],
+        ),
+    ],
+    ids=["objects", "coco", "ycb_video", "blenderproc"],
+)
+def test_data_that_is_not_there_stops_the_run_with_one_line(overrides, keys):
+    with pytest.raises(UserError) as caught:
+        context(*overrides)
+    assert all(key in str(caught.value) for key in keys) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["+experiment=nerf_vs_mesh", "nerf_vs_mesh.multiple=[3,2]"],
+        ["+experiment=nerf_vs_mesh", "nerf_vs_mesh.seeds=0"],
+        ["+experiment=nerf_vs_mesh", "nerf_vs_mesh.draws=1"],
+        ["+experiment=samples_gallery", "samples_gallery.count=0"],
+        ["+experiment=samples_gallery", "samples_gallery.methods=[ns,ns]"],
+    ],
+    ids=lambda words: words[1],
+)
+def test_bad_settings_are_refused_by_name(wrong):
+    with pytest.raises(UserError, match=wrong[1].split("=")[0].split(".")[0]):
+        context(*wrong)
+
+
+def test_another_method_is_what_its_own_command_would_compose():
+    """Apart from ``stages`` and the study's own node, which follow from the experiment."""
+    run, _ = context("+experiment=samples_gallery", "baseline=ns", "seed=3")
+    own, _ = context("+experiment=samples_gallery", "baseline=auto_sim", "seed=3")
+    assert run.of_method("auto_sim").config == own.config and run.config != own.config
+    assert run.experiment.loop.method.name == "ns" and run.of_method("ns").config == run.config
+    with pytest.raises(Exception, match="baseline/theirs"):
+        run.of_method("theirs")
+
+
+def test_choices_take_the_place_of_those_of_the_same_group():
+    given = ["+experiment=pose_gap", "baseline=ns", "+baseline.part=1", "seed=2"]
+    assert _with(given, ["baseline=lts"]) == [
+        "+experiment=pose_gap",
+        "+baseline.part=1",
+        "seed=2",
+        "baseline=lts",
+    ]
+
+
+def test_nerf_and_mesh_share_all_but_what_is_rendered():
+    run, steps = context("+experiment=nerf_vs_mesh", "seed=5")
+    first, second = graphs_of_seeds(run, 2)
+    nerf, mesh = steps["nerf_vs_mesh"].sources(first).values()
+    assert isinstance(mesh, MeshDetectorStage) and nerf.key != mesh.key
+    for name in ("detector", "training", "epochs", "probabilities", "seed", "psi"):
+        assert getattr(nerf, name) is getattr(mesh, name)
+    assert nerf.seed == 5 and steps["nerf_vs_mesh"].sources(second)["nerf"].seed == 6
+    assert set(steps["nerf_vs_mesh"].sources(second)["mesh"].contents) == set(first.names)
+    tests = sets_of_kinds(first, {"single": (1, 1), "multiple": (2, 4)})
+    assert [t.synthesizer.objects_per_image for t in tests.values()] == [(1, 1), (2, 4)]
+    assert len(
+        {t.key for t in tests.values()}
+    ) == 2 and first.experiment.imaging.synthesis.objects_per_image == [1, 3]
+
+
+@pytest.mark.parametrize("folder", ["", "coco_data"])
+def test_blenderproc_images_take_the_place_of_the_mesh_renderers(tmp_path, folder):
+    """Two pictures, of 48 x 48 pixels, of a mug and a can; the detector's images have 64."""
+    output = tmp_path / "output"
+    boxes, pixels = torch.tensor([[[8.0, 8.0, 24.0, 24.0]]] * 2), torch.zeros(2, 3, 48, 48)
+    pixels[:, :, 8:24, 8:24] = 1.0
+    images = LabelledImages(pixels, boxes, torch.tensor([[0], [1]]), torch.zeros(2, dtype=torch.long))
+    (output / folder).mkdir(parents=True)
+    write_coco(images, ["red mug", "can"], output / folder).rename(output / folder / "coco_annotations.json")
+    run, _ = context("+experiment=nerf_vs_mesh")
+    step = NerfVsMeshStep(blenderproc=str(output), categories={"red mug": "mug"})
+    stage = step.sources(run.graph)["blenderproc"]
+    assert isinstance(stage, CocoDetectorStage)
+
+    class Empty:
+        names, camera = run.graph.names, run.graph.camera
+
+        @staticmethod
+        def device(_):
+            return torch.device("cpu")
+
+    loaded = stage.images(Empty()).images
+    assert [run.graph.names[label] for label in loaded.labels[:, 0]] == ["mug", "can"]
+    torch.testing.assert_close(loaded.boxes[:, 0], boxes[:, 0] * (64 / 48))
+    key = stage.key
+    document = json.loads((output / folder / "coco_annotations.json").read_text())
+    document["annotations"][0]["bbox"][0] += 1
+    (output / folder / "coco_annotations.json").write_text(json.dumps(document))
+    other = NerfVsMeshStep(blenderproc=str(output), categories={"red mug": "mug"}).sources(run.graph)
+    assert other["blenderproc"].key != key  # the contents are part of the key
+
+
+def test_objects_of_photographs_alone_are_refused_before_anything_is_rendered(tmp_path):
+    run, steps = context(
+        "+experiment=nerf_vs_mesh", "target=coco", "target.annotations=" + str(_labels(tmp_path))
+    )
+    with pytest.raises(ValueError, match="want target=rendered"):
+        steps["nerf_vs_mesh"].run(run)
+
+
+def _labels(folder):
+    path = folder / "labels.json"
+    document = {
+        "images": [{"id": i, "file_name": f"{i}.png"} for i in range(2)],
+        "annotations": [],
+        "categories": [],
+    }
+    path.write_text(json.dumps(document))
+    return path
