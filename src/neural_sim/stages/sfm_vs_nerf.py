@@ -74,7 +74,7 @@ class SfmVsNerfStep:
         held = [self._held_out(graphs[0], results, i, mesh) for i, mesh in enumerate(meshes)]
 
         def sources(graph: Graph) -> dict[str, DetectorStage]:
-            nerf = graph.trained_on(graph.psi("target"), "images of the fields")
+            nerf = graph.synthetic(graph.psi("target"), "images of the fields")
             more = {"reconstructions": stages, "shown": meshes}
             return {"nerf": nerf, "sfm": trained_on(nerf, ReconstructionDetectorStage, **more)}
 
