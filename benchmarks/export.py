@@ -2,7 +2,6 @@
 
 Fits fields to the embedded objects, then writes data sets into a temporary folder. Times are those of the images
 (drawing, rendering, composing, encoding, writing), without fitting and without the final annotations.
-
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import argparse
 import json
 import math
 import multiprocessing
-import resource
 import tempfile
 import time
 from dataclasses import replace
@@ -19,7 +17,7 @@ from pathlib import Path
 
 import torch
 from field import fit, load_objects, training_views  # the benchmark beside this one
-from machine import machine
+from machine import machine, memory_mb
 
 from neural_sim.cameras import reframed
 from neural_sim.parameter.pose import Pose
@@ -72,7 +70,7 @@ def measured(source: ImageSource, count: int, workers: int, bop: bool, image_for
 
 def _alone(queue, *arguments) -> None:
     made = measured(*arguments)
-    queue.put(made | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024})
+    queue.put(made | {"peak_mb": memory_mb()[1]})
 
 
 def in_process(*arguments) -> dict[str, float]:
