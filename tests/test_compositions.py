@@ -25,6 +25,7 @@ EXPERIMENTS = sorted(
         "compare",
         "illumination_interpolation",
         "nerf_vs_mesh",
+        "sfm_vs_nerf",
         "detection_gallery",
     }  # no object is biased
 )

@@ -84,7 +84,7 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     assert len(folders) == len(jobs)
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures, "patch_memory": _patch_memory,
-             "nerf_vs_mesh": _nerf_vs_mesh, "samples_gallery": _samples_gallery,
+             "nerf_vs_mesh": _nerf_vs_mesh, "sfm_vs_nerf": _sfm_vs_nerf, "samples_gallery": _samples_gallery,
              "detection_gallery": _detection_gallery}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
         predicts = config["stages"] == ["predict"]
@@ -199,6 +199,15 @@ def _nerf_vs_mesh(folder, config):
     assert {path.stem for path in (folder / "figures").glob("*.png")} == {"ap", "training_images"}
     poses = json.loads((folder / "training_set" / "annotations.json").read_text())["images"]
     assert poses and all(pose["camera_to_world"] for image in poses for pose in image["poses"])
+
+
+def _sfm_vs_nerf(folder, config):
+    held = json.loads((folder / "sfm_vs_nerf.json").read_text())
+    assert held["sources"] == ["nerf", "sfm"] and set(held["ap"]) == {"test"}
+    for scores in held["held_out"].values():
+        assert all(10.0 < scores[source]["psnr"] < 60.0 for source in held["sources"])
+    figures = {path.stem for path in (folder / "figures").glob("*.png")}
+    assert figures == {"ap", "training_images", "held_out"}
 
 
 def _samples_gallery(folder, config):

@@ -49,6 +49,7 @@ def test_heavy_libraries_stay_in_their_rooms():
                 "side_by_side",
                 "gallery",
                 "detection_gallery",
+                "reconstruction",
             )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},
@@ -59,6 +60,7 @@ def test_heavy_libraries_stay_in_their_rooms():
         "beartype": {"main.py"},
         "optuna": {"baseline/search.py"},
         "h5py": {"target/matlab.py"},
+        "skimage": {"field/reconstruction.py"},
         "hydra": {"main.py"},
         "omegaconf": {"main.py"},
     }

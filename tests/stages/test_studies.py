@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_dir
 from neural_sim.main import UserError, _with, conf_directory, context_of
 from neural_sim.stages.nerf_vs_mesh import NerfVsMeshStep
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage
+from neural_sim.stages.reconstruction import ReconstructionStage
 from neural_sim.stages.side_by_side import graphs_of_seeds, sets_of_kinds
 from neural_sim.synthesis.export import write_coco
 from neural_sim.types import LabelledImages
@@ -154,3 +155,32 @@ def _labels(folder):
     }
     path.write_text(json.dumps(document))
     return path
+
+
+def test_a_reconstruction_is_what_the_store_gives_back(tmp_path):
+    """From a cube's views without those held out, packed and unpacked."""
+    run, _ = context("+experiment=sfm_vs_nerf", "objects.names=[flat_box]", "views.held_out=2")
+    stage = ReconstructionStage(run.graph.views[0], 32)
+    views = run.graph.views[0].make(None)
+
+    def results(asked):
+        assert asked is stage.views
+        return views
+
+    made = stage.make(results)
+    again = stage.unpack(stage.pack(made))
+    assert (again.vertices == made.vertices).all() and (again.faces == made.faces).all()
+    assert (again.visual.vertex_colors == made.visual.vertex_colors).all()
+    assert stage.views.held_out == 2 and len(views) == 22
+    spoiled = views.images.clone()
+    spoiled[-2:] = 0.0  # held out: not used
+    views = type(views)(spoiled, views.camera_to_world, views.camera)
+    assert (stage.make(results).vertices == made.vertices).all()
+
+
+@pytest.mark.parametrize(
+    "wrong", ["sfm_vs_nerf.resolution=100", "sfm_vs_nerf.seeds=0", "sfm_vs_nerf.draws=1"]
+)
+def test_bad_settings_of_the_reconstruction_are_refused(wrong):
+    with pytest.raises(UserError, match=wrong.split("=")[0].split(".")[1]):
+        context("+experiment=sfm_vs_nerf", wrong)

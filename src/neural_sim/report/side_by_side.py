@@ -129,15 +129,20 @@ def report_side_by_side(
     folder: Path,
     begun: float,
     extra: Mapping[str, Any] | None = None,
+    text: str = "",
+    more_figures: Mapping[str, Figure] | None = None,
 ) -> tracking.Run:
     """``<name>.md``, ``<name>.json`` and figures in ``folder``, and a run in MLflow that began at ``begun`` (seconds
-    since 1970). ``shown`` are training images of every source, source by source, ``extra`` more of the document."""
+    since 1970). ``shown`` are training images of every source, source by source; ``extra``, ``text`` and
+    ``more_figures`` are added to the document, the table and the figures."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = table(found, heading)
+    text = "\n\n".join([part for part in (table(found, heading), text) if part])
     (folder / f"{name}.md").write_text(text + "\n")
     document = {**dataclasses.asdict(found), **(extra or {})}
     (folder / f"{name}.json").write_text(json.dumps(_plain(document), indent=1, allow_nan=False))
     figures.save(ap_figure(found, heading), folder / "figures" / "ap.png")
+    for called, drawn in (more_figures or {}).items():
+        figures.save(drawn, folder / "figures" / f"{called}.png")
     rows = "; ".join(f"row {i + 1}: {source}" for i, source in enumerate(found.sources))
     grid = figures.image_grid(
         shown, classes, len(shown) // len(found.sources), title=f"Training images, {rows}"
