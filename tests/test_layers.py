@@ -6,9 +6,9 @@ from pathlib import Path
 import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
-ORDER = ("types", "checks", "digests", "cameras", "devices", "objects", "field", "renderer", "parameter", "synthesis",
-         "target", "detector", "solver", "gradient", "baseline", "outer", "stress", "report", "stages",
-         "main")  # fmt: skip
+ORDER = ("types", "checks", "digests", "configuration", "cameras", "devices", "objects", "field", "renderer",
+         "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "stress", "report",
+         "stages", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -40,7 +40,16 @@ def test_heavy_libraries_stay_in_their_rooms():
     homes = {
         "pyrender": {"renderer/mesh.py"},
         "matplotlib": {
-            f"report/{name}.py" for name in ("figures", "curves", "interpolation", "temperatures")
+            f"report/{name}.py"
+            for name in (
+                "figures",
+                "curves",
+                "interpolation",
+                "temperatures",
+                "levels",
+                "histograms",
+                "layouts",
+            )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},
         "onnx": {"detector/onnx_export.py", "detector/onnx_nms.py"},

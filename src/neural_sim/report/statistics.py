@@ -88,10 +88,10 @@ def compare(
     ]
     point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
     spread = resampled(matches, draws, seed)
-    ap = dict(zip(columns, _estimates(point, spread), strict=True))
+    ap = dict(zip(columns, estimates(point, spread), strict=True))
     gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
-    won = _estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
-    ahead = _estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
+    won = estimates((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
+    ahead = estimates(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
@@ -161,7 +161,7 @@ def _at_equal_cost(
     ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
     reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
-    return _over_seeds(reached, draws, seed), _mean(budgets.values())
+    return over_seeds(reached, draws, seed), _mean(budgets.values())
 
 
 def _areas(
@@ -179,23 +179,26 @@ def _areas(
         return {}
     areas = {key: area_under(*curve, min(starts), max(ends)) for key, curve in curves.items()}
     ahead = {m: [areas[methods[0], s] - areas[m, s] for s in seeds] for m in methods[1:]}
-    return _over_seeds(ahead, draws, seed)
+    return over_seeds(ahead, draws, seed)
 
 
-def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
-    """Means over seeds; seeds alone are resampled, since detections of intermediate psi are not kept."""
-    estimates = {}
+def over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
+    """Means over seeds of numbers by name; seeds alone are resampled. One seed has no interval."""
+    found = {}
     for method, each in values.items():
         numbers, random = np.asarray(each), np.random.default_rng(seed)
         chosen = random.integers(len(each), size=(draws, len(each)))
-        estimates[method] = _estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
+        found[method] = estimates(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
         if len(each) == 1:
-            estimates[method] = Estimate(estimates[method].value)
-    return estimates
+            found[method] = Estimate(found[method].value)
+    return found
 
 
-def _estimates(point: np.ndarray, spread: Float[np.ndarray, "draws columns"]) -> list[Estimate]:
-    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
+def estimates(
+    point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
+) -> list[Estimate]:
+    """Of each column: its value, and the 2.5 and 97.5 % quantiles of its resampled values, nan left out."""
+    low, high = np.nanquantile(spread, [0.025, 0.975], axis=0)
     return [Estimate(float(p), float(a), float(b)) for p, a, b in zip(point, low, high, strict=True)]
 
 
