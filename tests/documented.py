@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -51,8 +52,14 @@ class Command:
         return [word for word in self.arguments if not word.startswith("-")]
 
     @property
+    def swept(self) -> dict[str, str]:
+        """What the experiment itself sweeps."""
+        names = [word.split("=")[1] for word in self.overrides if word.startswith("+experiment=")]
+        return swept_by(names[0]) if len(names) == 1 and re.fullmatch(r"\w+", names[0]) else {}
+
+    @property
     def multirun(self) -> bool:
-        return bool(self.flags & {"-m", "--multirun"})
+        return bool(self.flags & {"-m", "--multirun"}) or bool(self.swept)
 
     def jobs(self, seeds: int | None = None) -> list[list[str]]:
         """The overrides of each of a run's jobs, as Hydra's sweeper makes them; of the first ``seeds`` seeds alone."""
@@ -70,13 +77,26 @@ class Command:
         if not self.multirun:
             yield from ([word] for word in self.overrides)
             return
-        for override in OverridesParser.create().parse_overrides(self.overrides):
+        found: dict[
+            str, list[str]
+        ] = {}  # the command line's in the place of the experiment's, as Hydra has it
+        written = [*(f"{key}={values}" for key, values in self.swept.items()), *self.overrides]
+        for override in OverridesParser.create().parse_overrides(written):
             key = override.get_key_element()
             if override.is_sweep_override():
                 values = [f"{key}={value}" for value in override.sweep_string_iterator()]
             else:
                 values = [str(override.input_line)]
-            yield values[:seeds] if key == "seed" else values
+            found[key] = values[:seeds] if key == "seed" else values
+        yield from found.values()
+
+
+def swept_by(experiment: str) -> dict[str, str]:
+    """The parameters that a study, an experiment that is a sweep, sweeps by itself."""
+    path = ROOT / "conf" / "experiment" / f"{experiment}.yaml"
+    node = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if path.is_file() else {}
+    sweeper = node.get("hydra", {}).get("sweeper", {}) if isinstance(node, dict) else {}
+    return {key: str(values) for key, values in sweeper.get("params", {}).items()}
 
 
 def commands(kind: str | None = None) -> list[Command]:

@@ -172,6 +172,12 @@ def trained(root: Path) -> Path:
     return root
 
 
+def page(path: Path) -> Path:
+    """Where a command may write a page, instead of into the documentation."""
+    path.parent.mkdir(parents=True)
+    return path
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycb": ycb,
     "../shared/ycb": ycb,
@@ -186,6 +192,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycbv": bop_scenes,
     "/data/photos": backgrounds,
     "/data/val": coco_photographs,
+    "docs/experiments.md": page,
     "outputs/runs/pose_gap/2026-11-22_09-00-00": trained,
 }
 """What the documentation's paths stand for."""
@@ -197,6 +204,12 @@ class MadeData:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.made: dict[Callable[[Path], Path], Path] = {}
+
+    @property
+    def shared(self) -> Path:
+        """A folder for ``paths.data``, with ycb/ in it."""
+        self.localise("objects.root=../shared/ycb")
+        return self.made[ycb].parent
 
     def localise(self, word: str) -> str:
         """The word with a documented path replaced by that of made data.

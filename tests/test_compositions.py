@@ -19,7 +19,7 @@ CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))
 PARAMETERS = ("[pose]", "[zoom]", "[pose,zoom]", "[pose,zoom,illumination]")
 EXPERIMENTS = sorted(
-    {path.stem for path in (CONF / "experiment").glob("*.yaml") if not path.stem.endswith("_ycb")}
+    {path.stem for path in (CONF / "experiment").glob("*.yaml") if "paths.data" not in path.read_text()}
     - {
         "stress",
         "compare",
@@ -27,8 +27,9 @@ EXPERIMENTS = sorted(
         "nerf_vs_mesh",
         "sfm_vs_nerf",
         "detection_gallery",
-    }  # no object is biased
-)
+        "experiments_table",
+    }
+)  # those of embedded objects, some of which are biased; tests/test_experiments.py has all
 
 
 def experiment(*overrides):
@@ -60,12 +61,6 @@ def test_the_papers_variant_takes_every_experiment(name):
     assert made.loop.method.name == "neural_sim_paper" and isinstance(made.loop.gradient, PathwiseEstimator)
     poses = [node for what, node in made.config["parameter"].items() if what == "pose"]
     assert all(node["bin_mean"] == "linear" for node in poses)
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*_ycb.yaml")))
-def test_experiments_on_ycb_name_objects_that_exist(name, shared_data):
-    made = experiment(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}")
-    assert set(made.imaging.distribution.biased) <= set(made.imaging.objects.names())
 
 
 def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from neural_sim.main import conf_directory
 
 CONF = conf_directory()
-# Experiments, scales and variants only override.
-OVERRIDES = {"experiment", "scale", "variant", "hydra"}
+# Experiments, scales and variants only override; the paper's numbers are data.
+OVERRIDES = {"experiment", "scale", "variant", "hydra", "paper"}
 CHOICES = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
     for path in CONF.glob("*/**/*.yaml")

@@ -41,7 +41,7 @@ def test_a_documented_run_composes_and_builds(command, data):
     """All jobs of a sweep with its first seed, and one with its last."""
     assert command.flags <= FLAGS
     for job in [*command.jobs(seeds=1), command.jobs()[-1]]:
-        compose_and_build(tuple(data.localise(word) for word in job))
+        compose_and_build((*(data.localise(word) for word in job), f"paths.data={data.shared}"))
 
 
 class _Parsed(Exception):
@@ -159,6 +159,24 @@ def test_commands_are_found_in_text_and_blocks_and_taken_apart_as_a_shell_does()
     assert sweep.jobs() == [[f"x={x}", f"seed={seed}", "y=[3,4]"] for x in (1, 2) for seed in (0, 1)]
     assert sweep.jobs(seeds=1) == [["x=1", "seed=0", "y=[3,4]"], ["x=2", "seed=0", "y=[3,4]"]]
     assert sweep.cut(1) == ["x=1,2", "seed=0", "y=[3,4]"]
+
+
+def test_a_study_is_taken_apart_as_hydra_does():
+    (study,) = commands_in("`python -m src.main +experiment=gap_levels gap=same baseline=ns,lts`", "page")
+    assert study.multirun and not study.flags
+    cases = ["pose_gap_ycb", "zoom_gap_ycb", "illumination_gap_ycb"]
+    assert study.jobs(seeds=1) == [
+        [
+            "seed=0",
+            f"experiment@_global_={case}",
+            "gap=same",
+            f"baseline={baseline}",
+            "+experiment=gap_levels",
+        ]
+        for case in cases
+        for baseline in ("ns", "lts")
+    ]
+    assert len(study.jobs()) == 5 * 6
 
 
 def test_paths_without_made_data_are_refused(data):

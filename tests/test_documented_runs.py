@@ -58,6 +58,7 @@ class Runs:
         if command not in self.folders:
             folder = self.root / "runs" / str(next(self.numbers))
             added = [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
+            added.append(f"paths.data={self.data.shared}")
             added.append(f"hydra.{'sweep' if command.multirun else 'run'}.dir={folder}")
             run = [sys.executable, "-m", "src.main", *sorted(command.flags), *self.words(command), *added]
             done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=3000)
@@ -76,10 +77,15 @@ def runs(tmp_path_factory):
 ALL = [command for command in commands("main") if "--help" not in command.flags]
 
 
-@pytest.mark.parametrize("command", sorted(ALL, key=_compares), ids=lambda command: command.where)
+def _reads_runs(command):
+    return _compares(command) or "+experiment=experiments_table" in command.overrides
+
+
+@pytest.mark.parametrize("command", sorted(ALL, key=_reads_runs), ids=lambda command: command.where)
 def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     jobs = command.jobs(seeds=1)
-    configurations = [_configuration([runs.data.localise(word) for word in job]) for job in jobs]
+    shared = f"paths.data={runs.data.shared}"
+    configurations = [_configuration([*(runs.data.localise(word) for word in job), shared]) for job in jobs]
     if (
         any(config.trainer.accelerator == "gpu" for config in configurations)
         and not torch.cuda.is_available()
@@ -95,7 +101,7 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
     kinds = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures, "patch_memory": _patch_memory,
              "nerf_vs_mesh": _nerf_vs_mesh, "sfm_vs_nerf": _sfm_vs_nerf, "samples_gallery": _samples_gallery,
-             "detection_gallery": _detection_gallery}  # fmt: skip
+             "detection_gallery": _detection_gallery, "experiments": _experiments}  # fmt: skip
     for job, config in zip(folders, [_of(path) for path in folders], strict=True):
         alone = {"predict": _predict, "export": _export, "preflight": _preflight}.get(config["stages"][0])
         check = alone or kinds.get(next((key for key in kinds if key in config), ""), _run)
@@ -273,6 +279,14 @@ def _detection_gallery(folder, config):
     boxes = {each["right"] + each["missed"] for each in held["methods"].values()}
     assert len(boxes) == 1  # every method is judged by the same boxes
     assert (folder / "figures" / "detections.png").stat().st_size > 5000
+
+
+def _experiments(folder, config):
+    text = (folder / "experiments.md").read_text()
+    assert all(
+        f"| `{row['command']}` |" in text
+        for row in json.loads((folder / "experiments.json").read_text())["rows"].values()
+    )
 
 
 def _stress(folder, config):

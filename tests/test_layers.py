@@ -6,9 +6,9 @@ from pathlib import Path
 import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
-ORDER = ("types", "checks", "digests", "cameras", "devices", "objects", "field", "renderer", "parameter", "synthesis",
-         "target", "detector", "solver", "gradient", "baseline", "outer", "stress", "report", "stages",
-         "main")  # fmt: skip
+ORDER = ("types", "checks", "digests", "configuration", "cameras", "devices", "objects", "field", "renderer",
+         "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "stress", "report",
+         "stages", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -52,6 +52,9 @@ def test_heavy_libraries_stay_in_their_rooms():
                 "gallery",
                 "detection_gallery",
                 "reconstruction",
+                "levels",
+                "histograms",
+                "layouts",
             )
         },
         "mlflow": {"report/tracking.py", "report/pyfunc.py", "report/pyfunc_model.py"},

@@ -16,14 +16,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from neural_sim.configuration import conf_directory
 
 if TYPE_CHECKING:
     from neural_sim.stages.context import Context, Step
@@ -46,19 +49,6 @@ _PARTS = (
 
 class UserError(ValueError):
     """Something in the configuration or the input that the user can mend."""
-
-
-def conf_directory() -> Path:
-    """The checkout's ``conf/`` where there is one, else the copy that travels in the wheel.
-
-    Raises:
-        FileNotFoundError: neither exists.
-    """
-    here = Path(__file__).resolve()
-    for candidate in (here.parents[2] / "conf", here.parent / "conf"):
-        if (candidate / "config.yaml").is_file():
-            return candidate
-    raise FileNotFoundError(f"no conf/config.yaml beside {here.parents[2]} or in the installed package")
 
 
 def build(config: DictConfig) -> Experiment:
@@ -271,15 +261,36 @@ def _task(config: DictConfig) -> float | None:
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise
-        _log.debug("details", exc_info=True)
-        print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(error)
     except RuntimeError as error:
         from neural_sim.stages.context import StageFailure
 
         if runtime.mode == RunMode.MULTIRUN or not isinstance(error, StageFailure):
             raise
         sys.exit(1)
+
+
+class RefuseStudies(Callback):
+    """Stops a study whose data is missing or whose settings are wrong before its first job.
+
+    A study is an experiment that sweeps by itself, by ``hydra.sweeper.params``. Each of its jobs would fail in the same
+    way."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        if not config.hydra.sweeper.get("params"):
+            return
+        job = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        try:
+            context_of(job, Path())
+        except (ValueError, FileNotFoundError) as error:
+            _refuse(error)
+
+
+def _refuse(error: Exception) -> NoReturn:
+    """One line, and exit status 2."""
+    _log.debug("details", exc_info=True)
+    print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
+    sys.exit(2)
 
 
 def main() -> None:

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neural_sim.objects.files import MeshFiles, folder_of
+from neural_sim.objects.files import MeshFiles
+
+LAYOUT = "<id>_<name>/google_16k/textured.obj"
+ORIGIN = (
+    "get the google_16k meshes of the YCB Object and Model Set (ycbbenchmarks.com), put them there or set "
+    "objects.root"
+)
 
 
 class YCB(MeshFiles):
@@ -19,11 +25,13 @@ class YCB(MeshFiles):
     """
 
     def __init__(self, root: str | Path, names: list[str] | None = None) -> None:
-        folder = folder_of(root)
+        folder = Path(root)
         files = {path.parts[-3]: path for path in folder.glob("*/google_16k/textured.obj")}
+        if not files:
+            raise ValueError(f"objects.root: {folder} holds no {LAYOUT}; {ORIGIN}")
         aliases: dict[str, str] = {}
         for name in sorted(files):
             number, _, rest = name.partition("_")
             aliases.setdefault(number, name)
             aliases.setdefault(rest, name)
-        super().__init__(folder, files, names, aliases, "<id>_<name>/google_16k/textured.obj")
+        super().__init__(folder, files, names, aliases, LAYOUT)

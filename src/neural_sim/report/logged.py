@@ -40,6 +40,12 @@ def runs(uri: str, experiment: str) -> list[LoggedRun]:
     return logged
 
 
+def experiments(uri: str) -> list[str]:
+    """Names of the experiments that are not deleted."""
+    with quiet():
+        return sorted(experiment.name for experiment in connect(uri).search_experiments())
+
+
 def where_runs(uri: str, experiment: str) -> str:
     """How to look at an experiment's table of runs, see :func:`tracking.where`.
 

@@ -162,7 +162,7 @@ def _at_equal_cost(
     ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
     reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
-    return _over_seeds(reached, draws, seed), _mean(budgets.values())
+    return over_seeds(reached, draws, seed), _mean(budgets.values())
 
 
 def _areas(
@@ -180,27 +180,25 @@ def _areas(
         return {}
     areas = {key: area_under(*curve, min(starts), max(ends)) for key, curve in curves.items()}
     ahead = {m: [areas[methods[0], s] - areas[m, s] for s in seeds] for m in methods[1:]}
-    return _over_seeds(ahead, draws, seed)
+    return over_seeds(ahead, draws, seed)
 
 
-def _over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
-    """Means over seeds; seeds alone are resampled, since detections of intermediate psi are not kept."""
-    over_seeds = {}
+def over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
+    """Means over seeds of numbers by name; seeds alone are resampled. One seed has no interval."""
+    found = {}
     for method, each in values.items():
         numbers, random = np.asarray(each), np.random.default_rng(seed)
         chosen = random.integers(len(each), size=(draws, len(each)))
-        over_seeds[method] = with_intervals(
-            numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True)
-        )[0]
+        found[method] = with_intervals(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
         if len(each) == 1:
-            over_seeds[method] = Estimate(over_seeds[method].value)
-    return over_seeds
+            found[method] = Estimate(found[method].value)
+    return found
 
 
 def with_intervals(
     point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
 ) -> list[Estimate]:
-    """Values with the 2.5 % and 97.5 % quantiles of their bootstrap draws, of those that have a value."""
+    """Of each column: its value, and the 2.5 % and 97.5 % quantiles of its resampled values, nan left out."""
     if not len(point):  # of which nanquantile has no bounds
         return []
     low, high = np.nanquantile(spread, [0.025, 0.975], axis=0)

@@ -1,0 +1,124 @@
+"""Learned beside target distributions (the paper's Fig. 7) and total variation over seeds. Bins that look the same are
+one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from neural_sim.parameter.distributions import merged
+from neural_sim.report import figures
+from neural_sim.report.levels import short
+from neural_sim.report.settings import Setting, modes
+from neural_sim.report.statistics import Estimate, over_seeds
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """One factor of one object at one start.
+
+    ``groups`` are its bins, from 1, that look the same. ``p`` maps initial, target and learned to [seeds, groups],
+    ``distance`` initial and learned to the mean total variation to the target."""
+
+    experiment: str
+    name: str
+    factor: str
+    start: str
+    aim: str
+    seeds: tuple[int, ...]
+    groups: Sequence[Sequence[int]]
+    p: Mapping[str, Float[np.ndarray, "seeds groups"]]
+    distance: Mapping[str, Estimate]
+
+
+def histograms(settings: Sequence[Setting], draws: int, seed: int) -> Iterator[Histogram]:
+    """Of the reference method's runs, for every biased object and factor."""
+    for setting in settings:
+        for name in setting.scores.objects:
+            for factor in setting.factors(name):
+                yield _histogram(setting, name, factor, draws, seed)
+
+
+def _histogram(setting: Setting, name: str, factor: str, draws: int, seed: int) -> Histogram:
+    runs = setting.of_reference
+    own = [run["psi"][name][factor] for run in runs]
+    bins = range(1, len(own[0]["target"]) + 1)
+    groups = runs[0].get("symmetric_bins", {}).get(name, {}).get(factor) or [[b] for b in bins]
+    p = {
+        which: merged(torch.tensor([each[which] for each in own]), groups).numpy()
+        for which in ("initial", "learned", "target")
+    }
+    away = {
+        which: [run["total_variation"][name][factor][which] for run in runs]
+        for which in ("initial", "learned")
+    }
+    start, aim = (modes(setting.distribution(which, name, factor)) for which in ("initial", "target"))
+    seeds = tuple(run["seed"] for run in runs)
+    distance = over_seeds(away, draws, seed)
+    return Histogram(setting.experiment, name, factor, start, aim, seeds, groups, p, distance)
+
+
+def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
+    """A panel a start: initial, learned (mean over seeds, with smallest and largest) and target probabilities."""
+    columns = min(3, len(all_of))
+    rows = -(-len(all_of) // columns)
+    figure = Figure(figsize=(3.7 * columns, 2.4 * rows + 0.6), layout="constrained")
+    colours = {"initial": figures.METHOD_COLOURS["ns"], "learned": figures.METHOD_COLOURS["learned"],
+               "target": figures.METHOD_COLOURS["matched"]}  # fmt: skip
+    handles = []
+    for number, each in enumerate(all_of, 1):
+        axes, x = figure.add_subplot(rows, columns, number), np.arange(len(each.groups))
+        handles = []
+        for i, (which, colour) in enumerate(colours.items()):
+            p = each.p[which]
+            mean = p.mean(0)
+            spread = (
+                np.stack([mean - p.min(0), p.max(0) - mean]) if which == "learned" and len(p) > 1 else None
+            )
+            bars = axes.bar(x + 0.28 * (i - 1), mean, 0.26, yerr=spread, color=colour, capsize=2,
+                            error_kw={"linewidth": 0.8, "ecolor": figures.INK})  # fmt: skip
+            handles.append(bars)
+        labels = ["=".join(map(str, group)) for group in each.groups]
+        axes.set_xticks(x, labels)
+        axes.set(ylim=(0, 1))
+        title = f"{short(each.name)}, {each.factor}: target {each.aim}, from {each.start}"
+        axes.set_title(title, fontsize=8.5, color=figures.INK)
+        axes.yaxis.grid(color=figures.GRID)
+        axes.set_axisbelow(True)
+        figures.style(axes)
+    figure.legend(handles, list(colours), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def distance(estimate: Estimate) -> str:
+    """A total variation with its interval."""
+    if estimate.low is None or estimate.high is None:
+        return f"{estimate.value:.2f}"
+    return f"{estimate.value:.2f} ({estimate.low:.2f} to {estimate.high:.2f})"
+
+
+def histogram_table(all_of: Sequence[Histogram]) -> str:
+    """Total variation to the target, with 95 % intervals over seeds."""
+    lines = [
+        "| experiment | object | factor | target | start | seeds | initial | learned |",
+        "|" + "---|" * 8,
+    ]
+    for h in all_of:
+        cells = [h.experiment, short(h.name), h.factor, h.aim, h.start, ", ".join(map(str, h.seeds))]
+        cells += [distance(h.distance[which]) for which in ("initial", "learned")]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def histogram_summary(all_of: Sequence[Histogram]) -> list[str]:
+    """Total variation before and after, a line each."""
+    return [
+        f"{short(h.name)}, {h.factor} target {h.aim} from {h.start}: total variation "
+        f"{distance(h.distance['initial'])} to {distance(h.distance['learned'])}"
+        for h in all_of
+    ]

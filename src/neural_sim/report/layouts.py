@@ -1,0 +1,135 @@
+"""What is shown of an experiment's finished runs: lines for the table of experiments, a table of its own, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from neural_sim.report.compare import points
+from neural_sim.report.histograms import histogram_figure, histogram_summary, histogram_table, histograms
+from neural_sim.report.levels import Axis, levels_figure, levels_summary, levels_table
+from neural_sim.report.object_scores import MEAN, ObjectScores, called
+from neural_sim.report.settings import Setting
+
+
+@dataclass(frozen=True)
+class Shown:
+    """``lines`` are for the table of all experiments, ``text`` is Markdown below it, ``figures`` are by file name."""
+
+    lines: Sequence[str]
+    text: str = ""
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A table of the paper, as conf/paper/numbers.yaml has it: ``rows`` maps a name to a number for each column, None
+    where it prints none. ``lines`` are those of its LaTeX source.
+
+    Raises:
+        ValueError: a row without a number for each column.
+    """
+
+    title: str
+    lines: tuple[int, int]
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[float | None]]
+
+    def __post_init__(self) -> None:
+        short = [name for name, row in self.rows.items() if len(row) != len(self.columns)]
+        if short or not self.rows:
+            raise ValueError(f"{self.title}: want a number for each of {list(self.columns)} in rows {short}")
+
+    def markdown(self) -> str:
+        """The table with its title and source."""
+        lines = [f"{self.title} (l. {self.lines[0]} to {self.lines[1]}):", ""]
+        lines += ["| | " + " | ".join(self.columns) + " |", "|" + "---|" * (1 + len(self.columns))]
+        for name, row in self.rows.items():
+            cells = ["N/A" if value is None else f"{value:g}" for value in row]
+            lines.append("| " + " | ".join([name, *cells]) + " |")
+        return "\n".join(lines)
+
+
+def _levels(axis: Axis) -> Callable[..., Shown]:
+    def show(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+        figure = levels_figure(settings, axis)
+        return Shown(levels_summary(settings, axis), levels_table(settings, axis), {"levels": figure})
+
+    return show
+
+
+def _histograms(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+    found = list(histograms(settings, draws, seed))
+    return Shown(histogram_summary(found), histogram_table(found), {"histograms": histogram_figure(found)})
+
+
+def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+    """The paper's Table 1: rows are objects, columns methods, ours and the paper's."""
+    lines, parts = [], []
+    for setting in settings:
+        scores = setting.scores
+        ahead = [
+            f"{called(method)} by {points(own[MEAN])}"
+            for method, own in scores.ahead.items()
+            if method != "matched"
+        ]
+        ours = points(scores.ap[scores.reference][MEAN])
+        lines.append(f"{setting.group.label}: mAP of NSO {ours}; ahead of {', '.join(ahead)}")
+        parts.append(
+            f"{setting.group.label}, seeds {', '.join(map(str, scores.seeds))}:\n\n" + beside(scores, paper)
+        )
+    return Shown(lines, "\n\n".join(parts))
+
+
+def beside(scores: ObjectScores, paper: Paper | None) -> str:
+    """AP of every object in points with 95 % intervals, beside the paper's."""
+    columns = [] if paper is None else list(paper.columns)
+    rows = {} if paper is None else paper.rows
+    head = ["", *(f"{called(m)}, ours" for m in scores.methods), *(f"{name}, the paper" for name in columns)]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for name in (MEAN, *scores.objects):
+        theirs = rows.get(name, [None] * len(columns))
+        cells = [name, *(points(scores.ap[method][name]) for method in scores.methods)]
+        lines.append("| " + " | ".join([*cells, *("" if v is None else f"{v:g}" for v in theirs)]) + " |")
+    return "\n".join(lines)
+
+
+def _seconds(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+    """Wall-clock seconds of the reference method's iterations and of an object's field."""
+    lines = []
+    for setting in settings:
+        iterations = [_iteration(record) for run in setting.of_reference for record in run["iterations"]]
+        fields = [_field(run) for run in setting.of_reference]
+        lines.append(
+            f"{setting.group.label}: an iteration takes {_range(iterations)} s, an object's field {_range(fields)} s"
+        )
+    return Shown(lines)
+
+
+def _iteration(record: Mapping[str, Any]) -> float:
+    """Phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    return sum(s for phase, s in record["seconds"].items() if not phase.startswith("hypergradient_"))
+
+
+def _field(run: Mapping[str, Any]) -> float:
+    """Of one object on average, also where the store had it: then the seconds that it took when it was fitted."""
+    stored = [o["seconds"] for o in run["left_out"] if o["stage"] == "field" and o["seconds"] is not None]
+    return (run["seconds"]["field"] + sum(stored)) / len(run["psi"])
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.1f}", f"{max(values):.1f}"
+    return low if low == high else f"{low} to {high}"
+
+
+LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None, int, int], Shown]] = {
+    "gaps": _levels("gap"),
+    "targets": _levels("target"),
+    "objects": _objects,
+    "histograms": _histograms,
+    "seconds": _seconds,
+}
+"""By the name that a row of ``experiments.rows`` gives."""

@@ -1,0 +1,133 @@
+"""AP of each biased object over settings: over how far its start is from the target (the paper's Fig. 5), or over
+targets (Fig. 6)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from neural_sim.report import figures
+from neural_sim.report.compare import points
+from neural_sim.report.object_scores import called
+from neural_sim.report.settings import Setting, modes
+
+Axis = Literal["gap", "target"]
+STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
+COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
+"""As in the paper's Fig. 5."""
+LABELS = {"gap": "initial distribution", "target": "bins of the target"}
+
+
+def short(name: str) -> str:
+    """An object's name without its number."""
+    return re.sub(r"^\d+_", "", name).replace("_", " ")
+
+
+def place(setting: Setting, name: str, axis: Axis) -> str:
+    """Where a setting of an object stands on the axis."""
+    if axis == "gap":
+        return STARTS[setting.gap]
+    return "; ".join(modes(setting.distribution("target", name, f)) for f in setting.factors(name))
+
+
+def _order(label: str, axis: Axis) -> tuple[Any, ...]:
+    if axis == "gap":
+        return (list(STARTS.values()).index(label),)
+    return (label.count(","), label)
+
+
+def _panels(settings: Sequence[Setting], axis: Axis) -> dict[tuple[str, str, str], dict[str, Setting]]:
+    """Settings by their places on the axis, by experiment, start (unless that is the axis) and object."""
+    panels: dict[tuple[str, str, str], dict[str, Setting]] = {}
+    for setting in settings:
+        for name in setting.scores.objects:
+            start = "" if axis == "gap" else STARTS[setting.gap]
+            panel = panels.setdefault((setting.experiment, start, name), {})
+            panel[place(setting, name, axis)] = setting
+    return {
+        key: dict(sorted(panel.items(), key=lambda item: _order(item[0], axis)))
+        for key, panel in sorted(panels.items(), key=lambda item: _rank(item[0], settings))
+    }
+
+
+def _rank(key: tuple[str, str, str], settings: Sequence[Setting]) -> tuple[int, int, str]:
+    experiments = [setting.experiment for setting in settings]
+    starts = ["", *STARTS.values()]
+    return experiments.index(key[0]), starts.index(key[1]), key[2]
+
+
+def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
+    """A panel an object, a line a method with 95 % intervals; matched, the upper bound, is dashed."""
+    panels = _panels(settings, axis)
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.6 * columns + 0.8, 2.6 * rows + 0.5), layout="constrained")
+    handles: dict[str, Any] = {}
+    for number, ((experiment, start, name), panel) in enumerate(panels.items(), 1):
+        axes = figure.add_subplot(rows, columns, number)
+        for method in dict.fromkeys(m for setting in panel.values() for m in setting.scores.methods):
+            handles.setdefault(called(method), _line(axes, list(panel.values()), name, method))
+        title = short(name) + (f", from the {start} start" if start else "")
+        axes.set_title(f"{experiment}: {title}", fontsize=9, color=figures.INK)
+        axes.set_xticks(range(len(panel)), list(panel))
+        axes.set(ylim=(0, 100), xlim=(-0.3, len(panel) - 0.7))
+        axes.set_xlabel(LABELS[axis], fontsize=8, color=figures.MUTED)
+        if (number - 1) % columns == 0:
+            axes.set_ylabel("AP on the test set (%)", fontsize=8)
+        axes.yaxis.grid(color=figures.GRID)
+        figures.style(axes)
+    figure.legend(handles.values(), handles.keys(), loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
+def _line(axes: Any, panel: Sequence[Setting], name: str, method: str) -> Any:
+    """One method's line; settings that it was not run on are gaps in it."""
+    found = [setting.scores.ap.get(method, {}).get(name) for setting in panel]
+    values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
+    low, high = (
+        100 * np.asarray([np.nan if e is None or (v := getattr(e, end)) is None else v for e in found])
+        for end in ("low", "high")
+    )
+    spread = np.nan_to_num(np.abs(np.stack([values - low, high - values])))
+    bound = method == "matched"
+    return axes.errorbar(
+        range(len(panel)), values, None if bound else spread, fmt="--" if bound else "o-", markersize=3.5,
+        color=COLOURS.get(method, figures.MUTED if bound else "#7b5cc4"), linewidth=1.2, capsize=2,
+    )  # fmt: skip
+
+
+def levels_table(settings: Sequence[Setting], axis: Axis) -> str:
+    """AP of every object at every setting, a column a method, in points with 95 % intervals."""
+    methods = list(dict.fromkeys(m for setting in settings for m in setting.scores.methods))
+    head = ["experiment", "object", *(["start"] if axis == "target" else []), LABELS[axis], "seeds"]
+    lines = [
+        "| " + " | ".join([*head, *map(called, methods)]) + " |",
+        "|" + "---|" * (len(head) + len(methods)),
+    ]
+    for (experiment, start, name), panel in _panels(settings, axis).items():
+        for label, setting in panel.items():
+            ap = setting.scores.ap
+            cells = [experiment, short(name), *([start] if start else []), label]
+            cells.append(", ".join(map(str, setting.scores.seeds)))
+            cells += [points(ap[method][name]) if method in ap else "" for method in methods]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def levels_summary(settings: Sequence[Setting], axis: Axis) -> list[str]:
+    """NSO's AP on each object, and how far it is ahead, for each setting; over ``gap`` that of the disjoint start."""
+    lines = []
+    for (experiment, start, name), panel in _panels(settings, axis).items():
+        for label, setting in panel.items():
+            if axis == "gap" and setting.gap != "disjoint":
+                continue
+            where = f", {start} start, target {label}" if axis == "target" else ""
+            ours = points(setting.scores.ap[setting.scores.reference][name])
+            ahead = [f"{called(method)} by {points(own[name])}" for method, own in setting.scores.ahead.items()
+                     if method != "matched"]  # fmt: skip
+            lines.append(f"{experiment}, {short(name)}{where}: NSO {ours}; ahead of {', '.join(ahead)}")
+    return lines

@@ -1,0 +1,90 @@
+"""AP of each biased object for every method of a group of finished runs, and how far the reference is ahead on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from neural_sim.report.bootstrap import Matches, average_precision
+from neural_sim.report.finished import FinishedRun
+from neural_sim.report.statistics import BOUNDS, FIXED, Estimate, resampled, with_intervals
+
+MEAN = "mAP"
+"""The name of the mean over the biased objects among them."""
+CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
+"""The paper's names of methods."""
+
+
+def called(method: str) -> str:
+    """The paper's name of a method, or our own."""
+    return CALLED.get(method, method)
+
+
+@dataclass(frozen=True)
+class ObjectScores:
+    """``ap`` and ``ahead`` map a method, then an object or ``MEAN``, to an estimate in [0, 1]: the AP (0.50 to 0.95) on
+    the test set, and the reference's AP minus the method's. ``methods`` begin with ns and end with matched, the
+    detectors trained on the initial and on the target's distribution."""
+
+    reference: str
+    methods: tuple[str, ...]
+    objects: tuple[str, ...]
+    seeds: tuple[int, ...]
+    ap: Mapping[str, Mapping[str, Estimate]]
+    ahead: Mapping[str, Mapping[str, Estimate]]
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The objects, then ``MEAN``."""
+        return (*self.objects, MEAN)
+
+
+def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> ObjectScores:
+    """Of the runs of one group: one of each method at each seed, on equal test images.
+
+    Seeds and test images are resampled, the same ones for all methods and objects, so that differences are paired.
+
+    Raises:
+        ValueError: a method that lacks a seed of another.
+    """
+    table = {(run.method, run.seed): run for run in runs}
+    learned = [reference, *sorted({run.method for run in runs} - {reference, *FIXED})]
+    seeds = tuple(sorted({run.seed for run in runs}))
+    missing = [f"{m} seed {s}" for m in learned for s in seeds if (m, s) not in table]
+    if missing:
+        raise ValueError(f"scores of {reference}: want a run of each method at each seed, lacking {missing}")
+    methods = (BOUNDS[0], *reversed(learned), BOUNDS[1])
+    objects = tuple(runs[0].results["biased"])
+    matches = [
+        [[own] for method in methods for own in _matches(table, reference, method, at)] for at in seeds
+    ]
+    shape = (-1, len(methods), len(objects))
+    point = np.asarray([[average_precision(own) for (own,) in row] for row in matches]).mean(0)
+    point = _with_mean(point.reshape(shape))[0]
+    spread = _with_mean(resampled(matches, draws, seed).reshape(shape))
+    rows, ours = (*objects, MEAN), methods.index(reference)
+    ap = {m: with_intervals(point[i], spread[:, i]) for i, m in enumerate(methods)}
+    ahead = {
+        m: with_intervals(point[ours] - point[i], spread[:, ours] - spread[:, i])
+        for i, m in enumerate(methods)
+        if m != reference
+    }
+    named = [{m: dict(zip(rows, each, strict=True)) for m, each in of.items()} for of in (ap, ahead)]
+    return ObjectScores(reference, methods, objects, seeds, *named)
+
+
+def _matches(
+    table: Mapping[tuple[str, int], FinishedRun], reference: str, method: str, seed: int
+) -> Sequence[Matches]:
+    """Of a method's detector at a seed. The reference's run stands for ns and matched, which all methods share."""
+    if method in BOUNDS:
+        return table[reference, seed].matches[method]
+    return table[method, seed].matches["learned"]
+
+
+def _with_mean(values: Float[np.ndarray, "n m objects"]) -> Float[np.ndarray, "n m rows"]:
+    """With the mean over objects as a last one; an object without a box stays out of it."""
+    return np.concatenate([values, np.nanmean(values, -1, keepdims=True)], -1)

@@ -1,0 +1,144 @@
+"""The page of experiments from made-up finished runs: measured rows have numbers, others say that there are none."""
+
+import json
+
+import pytest
+from finished_runs import BUDGET, setting
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from neural_sim.configuration import conf_directory
+from neural_sim.report import experiments as module
+from neural_sim.report.experiments import Experiments, Row
+from neural_sim.report.layouts import LAYOUTS, Paper
+from neural_sim.report.selection import LeftOut
+
+TABLE = {
+    "title": "Table 1",
+    "lines": [1, 2],
+    "columns": ["NS", "NSO"],
+    "rows": {"mAP": [10, 20], "can": [30, None]},
+}
+PAPER = {
+    "claims": {
+        "gains": [{"what": "over LTS", "value": 34, "source": "Sec. 4.2", "line": 845, "quote": "34"}]
+    },
+    "tables": {"one": TABLE, "two": {**TABLE, "title": "Table 2"}},
+}
+ROWS = {
+    "gaps": {
+        "title": "Gaps",
+        "experiment": "gap_levels",
+        "runs": ["gap"],
+        "layout": "gaps",
+        "claims": ["gains"],
+    },
+    "large": {
+        "title": "Large",
+        "experiment": "ycb_large_scale",
+        "runs": ["large"],
+        "layout": "objects",
+        "table": "one",
+    },
+    "figure": {"title": "Figure", "experiment": "illumination_interpolation"},
+    "planned": {"title": "Planned", "experiment": "no_such_file", "runs": ["gap"], "layout": "gaps"},
+}
+MEASURED = {
+    "gap": [setting(gap=gap, methods=(("neural_sim", 0.75), ("lts", 0.5))) for gap in ("same", "disjoint")]
+}
+
+
+@pytest.fixture
+def page(monkeypatch, tmp_path):
+    def read(self, runs):
+        return MEASURED.get(runs[0], []), [LeftOut("lts seed 3", "0123456789", runs[0], "it failed")]
+
+    monkeypatch.setattr(module.Settings, "read", read)
+
+    def write(**arguments):
+        step = Experiments(**{"rows": ROWS, "paper": PAPER, "draws": 5, **arguments})
+        return step.write("uri", {"budget": BUDGET, "seed": 0}, tmp_path)
+
+    return write
+
+
+# At 101 recalls, a class of which 75 % is found has an AP of 76 / 101, one of 25 % 26 / 101, and one of 50 % 51 / 101.
+
+
+def test_the_page_has_what_was_measured_and_says_what_was_not(page, tmp_path):
+    text = page(page=str(tmp_path / "page.md"))
+    assert (tmp_path / "page.md").read_text() == (tmp_path / "experiments.md").read_text() == text
+    rows = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
+    assert "| `python -m src.main +experiment=gap_levels` | gap, can: NSO 75.2" in rows["Gaps"]
+    assert rows["Gaps"].endswith("over LTS 34 (Sec. 4.2, l. 845) |  |")
+    assert "| not yet measured | Table 1: below |" in rows["Large"]
+    assert "in the run's folder" in rows["Figure"] and "Planned" not in text
+    assert (
+        "84 views of 96 pixels" in text and "## gaps" in text and "\n| gap | can | the target's | 0 |" in text
+    )
+    assert "\n| can | 30 | N/A |" in text.split("## large")[1], "the paper's table where ours is not measured"
+    assert "Table 2" in text.split("without an experiment here")[1]
+    assert (tmp_path / "figures" / "gaps_levels.png").stat().st_size > 5000
+    data = json.loads((tmp_path / "experiments.json").read_text())
+    assert list(data["rows"]) == ["gaps", "large", "figure"] and data["rows"]["large"]["ours"] is None
+    assert [run["reason"] for run in data["left_out"]] == ["it failed"] * 2
+    assert "it failed" in (tmp_path / "left_out.md").read_text()
+
+
+def test_some_rows_alone(page):
+    text = page(only=["large"])
+    assert "| Large |" in text and "| Gaps |" not in text and "Table 2" not in text
+
+
+def test_our_scores_stand_beside_those_of_the_papers_table():
+    shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE), 5, 0)
+    assert shown.lines[0].startswith("gap, disjoint: mAP of NSO 75.2")
+    head, _, mean, can, mug = shown.text.splitlines()[2:]
+    assert head == "|  | NS, ours | LTS, ours | NSO, ours | matched, ours | NS, the paper | NSO, the paper |"
+    assert mean.startswith("| mAP | 38.1") and mean.endswith("| 10 | 20 |")
+    assert can.startswith("| can | 25.7") and can.endswith("| 30 |  |") and mug.endswith("|  |  |")
+
+
+def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
+    (line,) = LAYOUTS["seconds"]([setting(seeds=(0, 1))], None, 5, 0).lines
+    # Phases hypergradient_* are within hypergradient: 2 + 3. Two objects' fields took 1 s now and 5 s when stored.
+    assert line == "gap, disjoint: an iteration takes 5.0 s, an object's field 3.0 s"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"only": ["none"]}, r"experiments.only: no row \['none'\], want some of gaps"),
+        ({"draws": 1}, "experiments.draws"),
+        ({"only": ["gaps"], "page": "page.md"}, "want all rows on the page"),
+        (
+            {"paper": {"claims": {}, "tables": {"one": TABLE}}},
+            r"gap_levels: the paper's numbers have no \['gains'\]",
+        ),
+        ({"paper": {**PAPER, "tables": {"one": {**TABLE, "columns": ["NS"]}}}}, "a number for each of"),
+        ({"rows": {"x": {"title": "", "experiment": "x", "runs": ["x"], "layout": "pie"}}}, "layout of gaps"),
+        ({"rows": {"x": {"title": "", "experiment": "x", "layout": "gaps"}}}, "want runs and a layout"),
+    ],
+)
+def test_bad_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Experiments(**{"rows": ROWS, "paper": PAPER, **arguments})
+
+
+def test_rows_name_the_runs_that_their_experiments_leave():
+    """A study's runs are named by the experiments that it sweeps, others by their own."""
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        rows = compose("config", ["+experiment=experiments_table"]).experiments.rows
+    for arguments in OmegaConf.to_container(rows).values():
+        row = Row(**arguments)
+        if not (row.exists and row.runs):
+            continue
+        text = (conf_directory() / "experiment" / f"{row.experiment}.yaml").read_text()
+        swept = [
+            line.split(": ")[1].split(",") for line in text.splitlines() if "  experiment@_global_:" in line
+        ]
+        assert list(row.runs) == (swept[0] if swept else [row.experiment])
+
+
+def test_what_is_made_twice_is_equal(page):
+    assert page() == page()

@@ -1,0 +1,42 @@
+"""Learned beside target distributions over seeds, bins that look the same as one."""
+
+import numpy as np
+import pytest
+from finished_runs import dominant, setting
+
+from neural_sim.report.histograms import histogram_figure, histogram_summary, histogram_table, histograms
+
+HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
+
+
+def test_bins_that_look_the_same_are_one():
+    groups = {"can": {"pose": [[1, 8], [2, 7], [3, 6], [4, 5]]}}
+    can, mug = histograms([setting(learned=HALF, symmetric_bins=groups)], draws=10, seed=0)
+    assert (can.name, can.start, can.aim, can.factor) == ("can", "4", "1", "pose")
+    assert can.p["learned"].tolist() == [[1.0, 0.0, 0.0, 0.0]]
+    assert can.p["target"] == pytest.approx(np.array([[0.88, 0.04, 0.04, 0.04]]))
+    assert mug.groups == [[b] for b in range(1, 9)] and mug.p["learned"].tolist() == [HALF]
+
+
+def test_total_variation_has_an_interval_over_seeds():
+    runs = [setting(seeds=(0, 1, 2)), setting(seeds=(0,), learned=dominant(2))]
+    spread, single = list(histograms(runs, draws=50, seed=0))[::2]
+    assert (spread.distance["learned"].value, spread.distance["learned"].high) == (0.0, 0.0)
+    assert spread.distance["initial"].value == pytest.approx(0.84)  # 0.86 - 0.02, of two dominant bins
+    assert single.distance["learned"].value == pytest.approx(0.84) and single.distance["learned"].low is None
+    table = histogram_table([spread, single]).splitlines()
+    assert table[2] == "| gap | can | pose | 1 | 4 | 0, 1, 2 | 0.84 (0.84 to 0.84) | 0.00 (0.00 to 0.00) |"
+    assert table[3].endswith("| 0 | 0.84 | 0.84 |")
+    assert histogram_summary([single]) == ["can, pose target 1 from 4: total variation 0.84 to 0.84"]
+
+
+def test_bars_are_the_probabilities():
+    figure = histogram_figure(list(histograms([setting(learned=HALF)], draws=5, seed=0)))
+    axes = figure.axes[0]
+    initial, learned, target = [[bar.get_height() for bar in bars.patches] for bars in axes.containers]
+    assert (
+        learned == pytest.approx(HALF)
+        and target == pytest.approx(dominant(1))
+        and initial == pytest.approx(dominant(4))
+    )
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == [str(b) for b in range(1, 9)]

@@ -1,0 +1,123 @@
+"""Every experiment of conf/experiment: it composes and builds, says what it needs, and stops where that is missing."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from documented import Command
+from documented_data import MadeData
+from hydra import compose, initialize_config_dir
+
+from neural_sim.configuration import conf_directory
+from neural_sim.main import UserError, context_of
+from neural_sim.stages.walk import STEPS
+
+ROOT = Path(__file__).parents[1]
+CONF = conf_directory()
+FILES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((CONF / "experiment").glob("*.yaml"))}
+OWN = [name for name, text in FILES.items() if "paths.data" in text]
+"""Experiments on data that is not embedded."""
+STUDIES = [name for name, text in FILES.items() if "MULTIRUN" in text]
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def made(*overrides):
+    return context_of(composed(*overrides), Path("unused"))[0]
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """Made data in the place of ``paths.data``."""
+    return MadeData(tmp_path_factory.mktemp("data")).shared
+
+
+def _jobs(name):
+    return Command(name, ("python", "-m", "src.main", f"+experiment={name}")).jobs()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_experiment_composes_at_every_scale_and_builds(name, shared):
+    """A budget reaches an experiment by ``budget`` alone, see tests/test_main.py."""
+    budgets = [
+        composed(f"+experiment={name}", f"scale={scale}").budget for scale in ("smoke", "quick", "paper")
+    ]
+    assert len({repr(budget) for budget in budgets}) == 3
+    context = made(f"+experiment={name}", f"paths.data={shared}")
+    if set(context.stages) & set(STEPS):
+        assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, shared):
+    jobs = [job for job in _jobs(name) if "seed=0" in job and "baseline=lts" not in job]
+    settings = []
+    for job in jobs:
+        config = composed(*job)
+        parameters = {what: repr(node.biased) for what, node in config.parameter.items()}
+        settings.append((config.name, config.gap, config.baseline.name, repr(parameters)))
+    assert len(jobs) > 1 and len(set(settings)) == len(jobs)
+    assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
+
+
+@pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
+def test_experiments_name_objects_that_exist(name, shared_data):
+    context = made(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}")
+    assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_experiments_on_other_data_begin_with_what_they_need_and_how_long_they_take(name):
+    comment = [line for line in FILES[name].splitlines() if line.startswith("#")]
+    text = " ".join(comment)
+    assert re.search(r"the paper's|paper's own bias|pose_bin1_ycb|gap_levels", text, re.IGNORECASE)
+    assert "Needs " in text and re.search(r"scale=quick on two cores: about [\d.]+ (minutes|hours)", text)
+
+
+@pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
+def test_without_its_data_an_experiment_says_in_one_line_what_to_get_and_where(name, tmp_path):
+    with pytest.raises(UserError) as caught:
+        made(f"+experiment={name}", f"paths.data={tmp_path}")
+    text = str(caught.value)
+    assert "\n" not in text and "YCB" in text and str(tmp_path) in text and "objects.root" in text
+
+
+@pytest.mark.parametrize(
+    "name", ["gap_levels", *(pytest.param(n, marks=pytest.mark.slow) for n in STUDIES if n != "gap_levels")]
+)
+def test_without_its_data_a_study_stops_before_its_first_job(name, tmp_path):
+    command = [sys.executable, "-m", "src.main", f"+experiment={name}", f"paths.data={tmp_path}",
+               f"hydra.sweep.dir={tmp_path / 'sweep'}"]  # fmt: skip
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 2 and not (tmp_path / "sweep").exists()
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("neural-sim: ") and str(tmp_path) in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_runs_and_its_results_go_on_the_page(name, shared, tmp_path):
+    """At smoke scale on made data, its first seed and methods, and its first two cases."""
+    store = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}", "scale=smoke"]
+    cut = {"interpretability": ["gap=uniform"], "ycb_large_scale": ["seed=0"]}.get(name, ["gap=disjoint"])
+    _run("+experiment=" + name, "seed=0", *cut, *store, f"paths.data={shared}",
+         f"hydra.sweep.dir={tmp_path / 'sweep'}", "progress=false")  # fmt: skip
+    folder = tmp_path / "page"
+    _run("+experiment=experiments_table", f"experiments.only=[{name}]", "experiments.draws=5", *store,
+         f"hydra.run.dir={folder}")  # fmt: skip
+    (row,) = json.loads((folder / "experiments.json").read_text())["rows"].values()
+    assert row["ours"] and "not yet measured" not in (folder / "experiments.md").read_text()
+    assert name == "ycb_large_scale" or list((folder / "figures").glob(f"{name}_*.png"))
+
+
+def _run(*arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "src.main", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=3000
+    )
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
