@@ -6,6 +6,7 @@ import torch
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.protocol import Detector
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
@@ -28,9 +29,9 @@ STEP = 1e-5  # of differences: AdamW's steps bend within |gradient| of their sta
 class Micro:
     """The micro detector and a few images of noise with boxes, in float64, some to train on and some to validate on."""
 
-    def __init__(self, proximal: float = 0.0) -> None:
+    def __init__(self, proximal: float = 0.0, detector: Detector | None = None) -> None:
         generator = torch.Generator().manual_seed(3)
-        detector = RetinaNet(
+        detector = detector or RetinaNet(
             3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
         )
         params = {

@@ -32,6 +32,13 @@ class FcosHead(nn.Module):
             settings.channels, 1, num_classes, settings.convs, norm_layer=norm
         )
         self.regression_head = FCOSRegressionHead(settings.channels, 1, settings.convs, norm_layer=norm)
+        if settings.normalisation == "group":
+            # A shift that all channels of a group have in common is subtracted. Its gradient is a rounding error, by
+            # which AdamW divides, and which the derivative through a training would magnify.
+            for branch in (self.classification_head, self.regression_head):
+                for layer in branch.conv:
+                    if isinstance(layer, nn.Conv2d):
+                        layer.bias = None
         self.positive = F.relu if activation == "relu" else F.softplus
 
     def forward(self, levels: list[Tensor]) -> dict[str, Tensor]:

@@ -75,6 +75,6 @@ class RetinaNet(PyramidDetector):
         self, code: Float[Tensor, "*n 4"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:
         anchors = self.anchors.to(code)
-        chosen = anchors.expand(len(code), -1, -1).reshape(-1, 4) if anchor is None else anchors[anchor]
+        chosen = anchors.expand(code.shape[0], -1, -1).reshape(-1, 4) if anchor is None else anchors[anchor]
         boxes = BoxCoder((1.0, 1.0, 1.0, 1.0)).decode_single(code.reshape(-1, 4), chosen)
         return clip_boxes_to_image(boxes, self.image_size).reshape(code.shape)
