@@ -10,6 +10,7 @@ import pytest
 from documented import Command
 from documented_data import MadeData
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
 from neural_sim.main import UserError, context_of
@@ -60,7 +61,9 @@ def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, sha
     settings = []
     for job in jobs:
         config = composed(*job)
-        parameters = {what: repr(node.biased) for what, node in config.parameter.items()}
+        parameters = {
+            what: OmegaConf.to_container(node, resolve=True) for what, node in config.parameter.items()
+        }
         settings.append((config.name, config.gap, config.baseline.name, repr(parameters)))
     assert len(jobs) > 1 and len(set(settings)) == len(jobs)
     assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
@@ -88,6 +91,15 @@ def test_without_its_data_an_experiment_says_in_one_line_what_to_get_and_where(n
     assert "\n" not in text and "YCB" in text and str(tmp_path) in text and "objects.root" in text
 
 
+def test_without_photographs_the_line_names_the_file_and_its_key(shared, tmp_path):
+    missing = f"target.annotations={tmp_path / 'annotations.json'}"
+    with pytest.raises(
+        UserError, match=rf"target.annotations: no such file: {tmp_path}.*; put a COCO file"
+    ) as caught:
+        made("+experiment=ycb_in_the_wild", f"paths.data={shared}", missing)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     "name", ["gap_levels", *(pytest.param(n, marks=pytest.mark.slow) for n in STUDIES if n != "gap_levels")]
 )
@@ -105,7 +117,11 @@ def test_without_its_data_a_study_stops_before_its_first_job(name, tmp_path):
 def test_a_study_runs_and_its_results_go_on_the_page(name, shared, tmp_path):
     """At smoke scale on made data, its first seed and methods, and its first two cases."""
     store = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}", "scale=smoke"]
-    cut = {"interpretability": ["gap=uniform"], "ycb_large_scale": ["seed=0"]}.get(name, ["gap=disjoint"])
+    cut = {
+        "interpretability": ["gap=uniform"],
+        "ycb_large_scale": ["progress=false"],
+        "ycb_in_the_wild": ["gap=disjoint", "wild={target: {dominant: 2}, start: {dominant: 7}}"],
+    }.get(name, ["gap=disjoint"])
     _run("+experiment=" + name, "seed=0", *cut, *store, f"paths.data={shared}",
          f"hydra.sweep.dir={tmp_path / 'sweep'}", "progress=false")  # fmt: skip
     folder = tmp_path / "page"

@@ -21,6 +21,7 @@ from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, large_enough
 from neural_sim.target.bin_attribute import bins_of
+from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.coco_file import labels_of_categories, read_coco
 from neural_sim.target.groups import groups_of
@@ -63,10 +64,14 @@ class CocoTarget:
         bin_attribute: the attribute of the file's annotations, or else of their image, that says the pose bin, counted
             from 1 as ``dominant`` of a distribution is; dots lead into entries of entries (``attributes.pose``). Boxes
             without one have no bin. None: no box has.
+        match_bins: in both parts take those photographs alone with which each object's bins are distributed as the
+            ``target`` of the first parameter with bins says, see :func:`neural_sim.target.bin_matching.matching`. Wants
+            photographs of one object.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a number out of its range, images that
-            ``split_by`` does not put into two or more groups, or a bin that is none or that no entry has.
+        ValueError: no such file, one that is not in COCO form, a number out of its range, ``match_bins`` without
+            ``bin_attribute``, images that ``split_by`` does not put into two or more groups, or a bin that is none or
+            that no entry has.
     """
 
     renders: ClassVar[bool] = False  # of the objects it takes the names alone
@@ -78,10 +83,18 @@ class CocoTarget:
     minimum_side: float = 2.0
     split_by: str | None = None
     bin_attribute: str | None = None
+    match_bins: bool = False
 
     def __post_init__(self) -> None:
         if not self._file.is_file():
-            raise ValueError(f"target.annotations: no such file: {self._file}")
+            raise ValueError(
+                f"target.annotations: no such file: {self._file}; put a COCO file of labelled photographs there, "
+                "or set target.annotations"
+            )
+        if self.match_bins and self.bin_attribute is None:
+            raise ValueError(
+                "target.match_bins: want target.bin_attribute, which says the pose bins, got null"
+            )
         if not 0.0 < self.val_fraction < 1.0:
             raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
         if self.limit is not None and self.limit < 1:
@@ -169,7 +182,8 @@ class CocoTarget:
         photos = [item.photo for item in read]
         pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
         groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
-        val, test = split(groups, self.val_fraction, torch.Generator().manual_seed(seed))
+        generator = torch.Generator().manual_seed(seed)
+        val, test = split(groups, self.val_fraction, generator)
         if self.split_by is None:
             self._warn_of_duplicates(torch.stack([item.thumbnail for item in read]), val, test)
         else:
@@ -177,8 +191,18 @@ class CocoTarget:
                 "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g)",
                 self._file, self.split_by, len(set(self._groups)), len(val), len(photos), self.val_fraction,
             )  # fmt: skip
-        images = assemble(photos)
-        return {"val": images.select(val), "test": images.select(test)}
+        images, parts = assemble(photos), {"val": val, "test": test}
+        if self.match_bins:
+            if first is None:
+                raise ValueError("target.match_bins: want a parameter with bins, such as parameter=[pose]")
+            goals = {name: first.probabilities("target", name) for name in objects}
+            parts = {
+                part: matching(images, rows, goals, generator, f"{self._file}: target.match_bins, {part}")
+                for part, rows in parts.items()
+            }
+            counts = ", ".join(f"{len(rows)} of {part}" for part, rows in parts.items())
+            _log.info("%s: target.match_bins takes %s", self._file, counts)
+        return {part: images.select(rows) for part, rows in parts.items()}
 
     def load(self, class_names: Sequence[str], height: int, width: int) -> LabelledImages:
         """All images; labels are positions in ``class_names``. Crowd annotations are left out, boxes clipped.
