@@ -118,6 +118,26 @@ def blenderproc(root: Path) -> Path:
     return root
 
 
+def in_the_wild(root: Path) -> Path:
+    """Four photographs of each of the six objects of ycb_in_the_wild in each of eight bins."""
+    root.mkdir(parents=True)
+    text = (ROOT / "conf" / "experiment" / "ycb_in_the_wild.yaml").read_text(encoding="utf-8")
+    names = sorted(set(re.findall(r"\b0\d\d_[a-z_]+[a-z]\b", text)))
+    images, annotations, random = [], [], np.random.default_rng(4)
+    for number, (label, bin, _) in enumerate(np.ndindex(len(names), 8, 4)):
+        picture = random.integers(0, 255, (60, 80, 3), np.uint8)
+        left, top = (int(v) for v in random.integers(2, 25, 2))
+        picture[top : top + 30, left : left + 40] = COLOURS[label % 6]
+        Image.fromarray(picture).save(root / f"{number:04d}.png")
+        images.append({"id": number, "file_name": f"{number:04d}.png", "width": 80, "height": 60})
+        annotations.append({"id": number, "image_id": number, "category_id": label, "pose": bin + 1,
+                            "bbox": [left, top, 40, 30], "area": 1200, "iscrowd": 0})  # fmt: skip
+    categories = [{"id": label, "name": name} for label, name in enumerate(names)]
+    document = {"images": images, "annotations": annotations, "categories": categories}
+    (root / "annotations.json").write_text(json.dumps(document))
+    return root
+
+
 def ycb_video(root: Path) -> Path:
     """Six scenes of YCB-Video that show the objects of the documentation and another, and which are key frames."""
     meshes = meshes_in_metres({"019_pitcher_base": "pitcher", "035_power_drill": "drill", "025_mug": "mug"})
@@ -207,9 +227,12 @@ class MadeData:
 
     @property
     def shared(self) -> Path:
-        """A folder for ``paths.data``, with ycb/ in it."""
+        """A folder for ``paths.data``, with ycb/ and ycb_in_the_wild/ in it."""
         self.localise("objects.root=../shared/ycb")
-        return self.made[ycb].parent
+        root = self.made[ycb].parent
+        if in_the_wild not in self.made:
+            self.made[in_the_wild] = in_the_wild(root / "ycb_in_the_wild")
+        return root
 
     def localise(self, word: str) -> str:
         """The word with a documented path replaced by that of made data.

@@ -10,6 +10,7 @@ import pytest
 from documented import Command
 from documented_data import MadeData
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
 from neural_sim.main import UserError, context_of
@@ -21,6 +22,12 @@ FILES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((CONF / 
 OWN = [name for name, text in FILES.items() if "paths.data" in text]
 """Experiments on data that is not embedded."""
 STUDIES = [name for name, text in FILES.items() if "MULTIRUN" in text]
+
+
+def labels(name, shared):
+    """What an experiment that has no photographs of its own wants beside ``paths.data``."""
+    given = f"target.annotations={shared / 'ycb_in_the_wild' / 'annotations.json'}"
+    return [given] if name == "detection_gallery" else []
 
 
 def composed(*overrides):
@@ -49,7 +56,7 @@ def test_every_experiment_composes_at_every_scale_and_builds(name, shared):
         composed(f"+experiment={name}", f"scale={scale}").budget for scale in ("smoke", "quick", "paper")
     ]
     assert len({repr(budget) for budget in budgets}) == 3
-    context = made(f"+experiment={name}", f"paths.data={shared}")
+    context = made(f"+experiment={name}", f"paths.data={shared}", *labels(name, shared))
     if set(context.stages) & set(STEPS):
         assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
 
@@ -60,15 +67,17 @@ def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, sha
     settings = []
     for job in jobs:
         config = composed(*job)
-        parameters = {what: repr(node.biased) for what, node in config.parameter.items()}
+        parameters = {
+            what: OmegaConf.to_container(node, resolve=True) for what, node in config.parameter.items()
+        }
         settings.append((config.name, config.gap, config.baseline.name, repr(parameters)))
     assert len(jobs) > 1 and len(set(settings)) == len(jobs)
     assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
 
 
 @pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
-def test_experiments_name_objects_that_exist(name, shared_data):
-    context = made(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}")
+def test_experiments_name_objects_that_exist(name, shared_data, shared):
+    context = made(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}", *labels(name, shared))
     assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
 
 
@@ -81,11 +90,20 @@ def test_experiments_on_other_data_begin_with_what_they_need_and_how_long_they_t
 
 
 @pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
-def test_without_its_data_an_experiment_says_in_one_line_what_to_get_and_where(name, tmp_path):
+def test_without_its_data_an_experiment_says_in_one_line_what_to_get_and_where(name, shared, tmp_path):
     with pytest.raises(UserError) as caught:
-        made(f"+experiment={name}", f"paths.data={tmp_path}")
+        made(f"+experiment={name}", f"paths.data={tmp_path}", *labels(name, shared))
     text = str(caught.value)
     assert "\n" not in text and "YCB" in text and str(tmp_path) in text and "objects.root" in text
+
+
+def test_without_photographs_the_line_names_the_file_and_its_key(shared, tmp_path):
+    missing = f"target.annotations={tmp_path / 'annotations.json'}"
+    with pytest.raises(
+        UserError, match=rf"target.annotations: no such file: {tmp_path}.*; put a COCO file"
+    ) as caught:
+        made("+experiment=ycb_in_the_wild", f"paths.data={shared}", missing)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +123,11 @@ def test_without_its_data_a_study_stops_before_its_first_job(name, tmp_path):
 def test_a_study_runs_and_its_results_go_on_the_page(name, shared, tmp_path):
     """At smoke scale on made data, its first seed and methods, and its first two cases."""
     store = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}", "scale=smoke"]
-    cut = {"interpretability": ["gap=uniform"], "ycb_large_scale": ["seed=0"]}.get(name, ["gap=disjoint"])
+    cut = {
+        "interpretability": ["gap=uniform"],
+        "ycb_large_scale": ["progress=false"],
+        "ycb_in_the_wild": ["gap=disjoint", "wild={target: {dominant: 2}, start: {dominant: 7}}"],
+    }.get(name, ["gap=disjoint"])
     _run("+experiment=" + name, "seed=0", *cut, *store, f"paths.data={shared}",
          f"hydra.sweep.dir={tmp_path / 'sweep'}", "progress=false")  # fmt: skip
     folder = tmp_path / "page"

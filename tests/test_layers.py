@@ -63,7 +63,7 @@ def test_heavy_libraries_stay_in_their_rooms():
         "safetensors": {"detector/saved.py"},
         "jinja2": {"report/page/render.py"},
         "filelock": {"report/tracking.py", "stages/store.py"},
-        "beartype": {"main.py"},
+        "beartype": {"configuration.py"},
         "optuna": {"baseline/search.py"},
         "h5py": {"target/matlab.py"},
         "skimage": {"field/reconstruction.py"},

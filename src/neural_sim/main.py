@@ -26,7 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from neural_sim.configuration import conf_directory
+from neural_sim.configuration import UserError, check_fits, check_top, conf_directory, first_line
 
 if TYPE_CHECKING:
     from neural_sim.stages.context import Context, Step
@@ -45,10 +45,6 @@ _PARTS = (
     "objects", "views", "field", "renderer", "synthesis", "target", "camera", "detector", "solver", "baseline",
     "gradient", "outer", "training", "unlearned", "model",
 )  # fmt: skip
-
-
-class UserError(ValueError):
-    """Something in the configuration or the input that the user can mend."""
 
 
 def build(config: DictConfig) -> Experiment:
@@ -131,7 +127,7 @@ def _camera(parts: Mapping[str, Any]) -> Any:
     try:
         return parts["camera"].camera(parts["training"].image_size, views.field_of_view_deg, parts["target"])
     except ValueError as error:
-        raise UserError(_first_line(error)) from error
+        raise UserError(first_line(error)) from error
 
 
 def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
@@ -141,7 +137,7 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     try:
         distribution = SceneDistribution.of(parameters.values(), parts["unlearned"])
     except ValueError as error:
-        raise UserError(_first_line(error)) from error
+        raise UserError(first_line(error)) from error
     rig = parts["views"].rig
     if distribution.lights and (rig is None or rig.anchors != distribution.lights):
         lights = "one fixed light" if rig is None else f"{rig.anchors} anchor lights"
@@ -159,30 +155,12 @@ def _plain(config: DictConfig) -> dict[str, Any]:
         wanted = (config.get("needs") or {}).get(str(error.full_key))
         if wanted is not None and isinstance(error, MissingMandatoryValue):
             raise UserError(f"{error.full_key} is not given: want {wanted}") from error
-        raise UserError(f"{error.full_key or 'configuration'}: {_first_line(error)}") from error
+        raise UserError(f"{error.full_key or 'configuration'}: {first_line(error)}") from error
     if not isinstance(plain, dict):
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
     plain = {str(key): value for key, value in plain.items()}
-    _check_top(plain)
+    check_top(plain)
     return plain
-
-
-def _check_top(plain: Mapping[str, Any]) -> None:
-    if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:
-        raise UserError(f"seed must be a whole number from 0, got {plain['seed']!r}")
-    if not isinstance(plain["stages"], list) or not plain["stages"]:
-        raise UserError(f"stages must be a list of names, got {plain['stages']!r}")
-    parts = isinstance(plain["score_at"], list) and all(
-        type(at) in (int, float) and 0 < at <= 1 for at in plain["score_at"]
-    )
-    if not parts:
-        raise UserError(
-            f"score_at must be a list of parts of the method's iterations in (0, 1], got {plain['score_at']!r}"
-        )
-    if not isinstance(plain["progress"], bool):
-        raise UserError(f"progress must be true or false, got {plain['progress']!r}")
-    if plain["trainer"]["accelerator"] not in ("cpu", "gpu"):
-        raise UserError(f"trainer.accelerator must be cpu or gpu, got {plain['trainer']['accelerator']!r}")
 
 
 def _instantiate(node: Any, where: str) -> Any:
@@ -196,7 +174,7 @@ def _instantiate(node: Any, where: str) -> Any:
         inner = re.search(r"^full_key: (\S+)", str(error), re.MULTILINE)
         where = f"{where}.{inner[1]}" if inner else where
         if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
-            raise UserError(f"{where}: {_first_line(cause)}") from error
+            raise UserError(f"{where}: {first_line(cause)}") from error
         raise
 
 
@@ -214,29 +192,8 @@ def _check_arguments(node: Mapping[str, Any], where: str) -> None:
             raise UserError(f"{where}.{key}: unknown key, want one of {', '.join(known)}")
         if isinstance(value, Mapping) and "_target_" in value:
             _check_arguments(value, f"{where}.{key}")
-        elif not _fits(value, hints.get(key, Any)):
-            raise UserError(f"{where}.{key}: want {_type_name(hints[key])}, got {value!r}")
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a YAML scalar fits a type hint. Lists and mappings are left to the constructor."""
-    if isinstance(value, bool):  # an int to Python, not to a user
-        return hint is Any or bool in (hint, *typing.get_args(hint))
-    if not isinstance(value, (str, int, float, type(None))):
-        return True
-    from beartype import BeartypeConf
-    from beartype.door import is_bearable
-
-    return is_bearable(value, hint, conf=BeartypeConf(is_pep484_tower=True))
-
-
-def _type_name(hint: Any) -> str:
-    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")  # pyright: ignore
-
-
-def _first_line(error: BaseException) -> str:
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[0].strip() if lines else type(error).__name__
+        else:
+            check_fits(value, hints.get(key, Any), f"{where}.{key}")
 
 
 def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
@@ -289,7 +246,7 @@ class RefuseStudies(Callback):
 def _refuse(error: Exception) -> NoReturn:
     """One line, and exit status 2."""
     _log.debug("details", exc_info=True)
-    print(f"neural-sim: {_first_line(error)}", file=sys.stderr)
+    print(f"neural-sim: {first_line(error)}", file=sys.stderr)
     sys.exit(2)
 
 

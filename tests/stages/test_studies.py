@@ -12,7 +12,7 @@ from neural_sim.stages.nerf_vs_mesh import NerfVsMeshStep
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage
 from neural_sim.stages.reconstruction import ReconstructionStage
 from neural_sim.stages.side_by_side import graphs_of_seeds, sets_of_kinds
-from neural_sim.synthesis.export import write_coco
+from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
 
@@ -30,8 +30,8 @@ def context(*overrides):
     ("overrides", "keys"),
     [
         (
-            ["+experiment=detection_gallery"],
-            ["objects.root is not given", "YCB scans", "objects.root=<folder>"],
+            ["+experiment=samples_gallery_ycb", "paths.data=nowhere"],
+            ["objects.root", "YCB", "nowhere"],
         ),
         (
             ["+experiment=detection_gallery", "objects.root=."],

@@ -186,8 +186,8 @@ def test_a_run_is_watched_while_its_loop_goes_on(folder, returned, uri, monkeypa
     seconds = {name: held.data.metrics[f"seconds/{name}"] for name in (*results["seconds"], "report")}
     assert held.info.end_time - held.info.start_time >= 1000 * sum(seconds.values())
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-2] == f"mlflow ui --backend-store-uri {uri}"
-    assert f"/runs/{held.info.run_id}?" in printed[-1]
+    command = printed.index(f"mlflow ui --backend-store-uri {uri}")
+    assert f"/runs/{held.info.run_id}?" in printed[command + 1] and "report.html" in printed[-1]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from neural_sim.synthesis.sensor import Sensor, blurred, seen_by
 from neural_sim.target.mismatch import (
     distance_factor,
     luma_of,
-    matching,
+    matching_settings,
     mismatches,
     noise,
     sharpness,
@@ -84,7 +84,7 @@ def test_blur_lowers_sharpness_as_that_of_an_edge():
 def test_settings_that_match_make_the_difference_go():
     target = degraded(scenes(60, 0), blur=(0.8, 1.2), noise=(0.03, 0.05))
     plain = scenes(80, 1)
-    settings = matching(target, plain, mismatches(target, plain))
+    settings = matching_settings(target, plain, mismatches(target, plain))
     noise_range = [float(v) for v in settings["synthesis.sensor.noise"].strip("[]").split(",")]
     assert 0.5 * (noise_range[0] + noise_range[1]) == pytest.approx(0.04, rel=0.2)
     blur_range = [float(v) for v in settings["synthesis.sensor.blur"].strip("[]").split(",")]
@@ -95,7 +95,9 @@ def test_settings_that_match_make_the_difference_go():
 def test_several_objects_ask_for_as_many():
     target = scenes(40, 0, objects=2)
     assert (
-        matching(target, scenes(40, 1), mismatches(target, scenes(40, 1)))["synthesis.objects_per_image"]
+        matching_settings(target, scenes(40, 1), mismatches(target, scenes(40, 1)))[
+            "synthesis.objects_per_image"
+        ]
         == "[2,2]"
     )
 

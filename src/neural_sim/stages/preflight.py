@@ -14,7 +14,7 @@ from neural_sim.report.page.preflight_page import write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
 from neural_sim.report.preflight import Preflight
 from neural_sim.stages.context import Context
-from neural_sim.target.mismatch import distance_factor, matching, mismatches
+from neural_sim.target.mismatch import distance_factor, matching_settings, mismatches
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PreflightStep:
             level=level,
             bins=tuple(bin_scores(names, {"ns": detections}, validation)),
             mismatches=tuple(differ),
-            settings=matching(validation, images, differ),
+            settings=matching_settings(validation, images, differ),
             distance_factor=distance_factor(differ),
         )
         _write(context.folder / "preflight.json", report)

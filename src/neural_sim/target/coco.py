@@ -22,6 +22,7 @@ from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, large_enough
 from neural_sim.target.bin_attribute import bins_of
+from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.coco_file import labels_of_categories, read_coco
 from neural_sim.target.groups import groups_of
@@ -65,10 +66,14 @@ class CocoTarget:
         bin_attribute: the attribute of the file's annotations, or else of their image, that says the pose bin, counted
             from 1 as ``dominant`` of a distribution is; dots lead into entries of entries (``attributes.pose``). Boxes
             without one have no bin. None: no box has.
+        match_bins: in both parts take those photographs alone with which each object's bins are distributed as the
+            ``target`` of the first parameter with bins says, see :func:`neural_sim.target.bin_matching.matching`. Wants
+            photographs of one object.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a number out of its range, images that
-            ``split_by`` does not put into two or more groups, or a bin that is none or that no entry has.
+        ValueError: no such file, one that is not in COCO form, a number out of its range, ``match_bins`` without
+            ``bin_attribute``, images that ``split_by`` does not put into two or more groups, or a bin that is none or
+            that no entry has.
     """
 
     renders: ClassVar[bool] = False  # of the objects it takes the names alone
@@ -81,10 +86,18 @@ class CocoTarget:
     minimum_side: float = 2.0
     split_by: str | None = None
     bin_attribute: str | None = None
+    match_bins: bool = False
 
     def __post_init__(self) -> None:
         if not self._file.is_file():
-            raise ValueError(f"target.annotations: no such file: {self._file}")
+            raise ValueError(
+                f"target.annotations: no such file: {self._file}; put a COCO file of labelled photographs there, "
+                "or set target.annotations"
+            )
+        if self.match_bins and self.bin_attribute is None:
+            raise ValueError(
+                "target.match_bins: want target.bin_attribute, which says the pose bins, got null"
+            )
         if not 0.0 < self.val_fraction < 1.0:
             raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
         check_fraction(self.train_fraction)
@@ -193,7 +206,19 @@ class CocoTarget:
                 self.val_fraction, len(parts.get("train", ())),
             )  # fmt: skip
         images = assemble(photos)
-        return {part: images.select(torch.tensor(rows)) for part, rows in parts.items()}
+        chosen = {part: torch.tensor(rows) for part, rows in parts.items()}
+        if self.match_bins:
+            if first is None:
+                raise ValueError("target.match_bins: want a parameter with bins, such as parameter=[pose]")
+            goals = {name: first.probabilities("target", name) for name in objects}
+            where = f"{self._file}: target.match_bins"
+            chosen = {
+                part: matching(images, rows, goals, generator, f"{where}, {part}")
+                for part, rows in chosen.items()
+            }
+            counts = ", ".join(f"{len(rows)} of {part}" for part, rows in chosen.items())
+            _log.info("%s takes %s", where, counts)
+        return {part: images.select(rows) for part, rows in chosen.items()}
 
     def load(self, class_names: Sequence[str], height: int, width: int) -> LabelledImages:
         """All images; labels are positions in ``class_names``. Crowd annotations are left out, boxes clipped.

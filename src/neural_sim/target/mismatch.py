@@ -108,7 +108,7 @@ def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
     return flat.topk(count, dim=1).values.mean(1)
 
 
-def matching(
+def matching_settings(
     target: LabelledImages, synthesised: LabelledImages, found: list[Mismatch], largest_blur: float = 3.0
 ) -> dict[str, str]:
     """Settings that would match what differs, by key; those of ``synthesis`` whose effect is known."""

@@ -1,0 +1,92 @@
+"""Photographs chosen so that each object is seen in pose bins as often as a distribution says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.types import LabelledImages
+
+
+def matching(
+    images: LabelledImages,
+    rows: Int[Tensor, "part"],
+    targets: Mapping[str, Float[Tensor, "k"]],
+    generator: torch.Generator,
+    where: str,
+) -> Int[Tensor, "chosen"]:
+    """Those of ``rows`` that follow ``targets``, the distributions over bins by the objects' names in label order.
+
+    Of every object as many photographs as there are for its distribution, each at most once and at random within a bin.
+    The number in a bin is the distribution's, rounded up or down. Photographs without a box that has a bin are left
+    out, and objects without photographs too.
+
+    Raises:
+        ValueError: a photograph of several objects or bins, or none of a bin that the distribution needs; begins with
+            ``where``.
+    """
+    cells: dict[tuple[int, int], list[int]] = {}
+    for row in rows.tolist():
+        seen = {
+            (label, b)
+            for label, b in zip(images.labels[row].tolist(), _bins(images, row), strict=True)
+            if label >= 0
+        }
+        if len(seen) > 1:
+            raise ValueError(
+                f"{where}: want photographs of one object in one bin each, got one of {sorted(seen)}"
+            )
+        for label, b in seen:
+            if b >= 0:
+                cells.setdefault((label, b), []).append(row)
+    chosen: list[int] = []
+    for label, (name, p) in enumerate(targets.items()):
+        own = [cells.get((label, b), []) for b in range(len(p))]
+        if not any(own):
+            continue
+        counts = most(p.tolist(), [len(each) for each in own], generator)
+        if counts is None:
+            lacking = [b for b, each in enumerate(own, 1) if not each]
+            raise ValueError(
+                f"{where}: want {name} in bins as {[round(v, 3) for v in p.tolist()]}, none in {lacking}"
+            )
+        for each, count in zip(own, counts, strict=True):
+            order = torch.randperm(len(each), generator=generator)[:count].tolist()
+            chosen += [each[i] for i in order]
+    if not chosen:
+        raise ValueError(f"{where}: no photograph has a box with a pose bin")
+    return torch.tensor(sorted(chosen))
+
+
+def _bins(images: LabelledImages, row: int) -> list[int]:
+    own = images.bins[row]
+    return own.expand(images.labels.shape[1]).tolist() if own.ndim == 0 else own.tolist()
+
+
+def most(p: Sequence[float], available: Sequence[int], generator: torch.Generator) -> list[int] | None:
+    """The largest :func:`apportioned` number of photographs that is available; None where not even one is."""
+    for total in range(sum(available), 0, -1):
+        counts = apportioned(p, total, available, generator)
+        if counts is not None:
+            return counts
+    return None
+
+
+def apportioned(
+    p: Sequence[float], total: int, available: Sequence[int], generator: torch.Generator
+) -> list[int] | None:
+    """``total`` photographs split among bins by largest remainders, each ``total * p`` rounded up or down; None where a
+    bin has too few. Of bins with equal remainders those that have enough are rounded up, at random."""
+    quotas = [total * value for value in p]
+    counts = [math.floor(quota + 1e-9) for quota in quotas]
+    rest = [round(quota - count, 9) for quota, count in zip(quotas, counts, strict=True)]
+    enough = [count < limit for count, limit in zip(counts, available, strict=True)]
+    ties = torch.randperm(len(p), generator=generator).tolist()
+    order = sorted(range(len(p)), key=lambda b: (-rest[b], not enough[b], ties[b]))
+    for b in order[: total - sum(counts)]:
+        counts[b] += 1
+    return counts if all(c <= limit for c, limit in zip(counts, available, strict=True)) else None
