@@ -172,6 +172,11 @@ def captures(root: Path) -> Path:
     return root
 
 
+def labels(path: Path) -> Path:
+    """:func:`coco` with the objects of :func:`captures`."""
+    return coco(path, ["can", "mug"])
+
+
 def coco_photographs(root: Path) -> Path:
     """The pictures of :func:`coco`, in a folder of their own."""
     coco(root / "val.json")
@@ -212,8 +217,12 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycbv": bop_scenes,
     "/data/photos": backgrounds,
     "/data/val": coco_photographs,
+    "/data/shelf/captures": captures,
+    "/data/shelf/labels.json": labels,
+    "/data/shelf/new": backgrounds,
     "docs/experiments.md": page,
     "outputs/runs/pose_gap/2026-11-22_09-00-00": trained,
+    "outputs/runs/shelf/2026-11-22_09-00-00": trained,
 }
 """What the documentation's paths stand for."""
 
