@@ -62,7 +62,8 @@ class Command:
         return bool(self.flags & {"-m", "--multirun"}) or bool(self.swept)
 
     def jobs(self, seeds: int | None = None) -> list[list[str]]:
-        """The overrides of each of a run's jobs, as Hydra's sweeper makes them; of the first ``seeds`` seeds alone."""
+        """The overrides of each of a run's jobs, as Hydra's sweeper makes them; with ``seeds``, of so many seeds, and of
+        so many values of all else that an experiment sweeps by itself, which would be a hundred jobs."""
         return [list(job) for job in itertools.product(*self._options(seeds))]
 
     def cut(self, seeds: int) -> list[str]:
@@ -87,7 +88,7 @@ class Command:
                 values = [f"{key}={value}" for value in override.sweep_string_iterator()]
             else:
                 values = [str(override.input_line)]
-            found[key] = values[:seeds] if key == "seed" else values
+            found[key] = values[:seeds] if key == "seed" or key in self.swept else values
         yield from found.values()
 
 
