@@ -24,9 +24,10 @@ def demo(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """The fast suite, one run through the command line included."""
+    """The fast suite, one run through the command line included; a process for each core, each of one thread."""
     _install(session)
-    session.run("python", "-m", "pytest", *session.posargs)
+    session.env["OMP_NUM_THREADS"] = "1"
+    session.run("python", "-m", "pytest", "-n", "auto", *session.posargs)
 
 
 @nox.session
