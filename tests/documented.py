@@ -62,8 +62,8 @@ class Command:
         return bool(self.flags & {"-m", "--multirun"}) or bool(self.swept)
 
     def jobs(self, seeds: int | None = None) -> list[list[str]]:
-        """The overrides of each of a run's jobs, as Hydra's sweeper makes them; with ``seeds``, of so many seeds, and of
-        so many values of all else that an experiment sweeps by itself, which would be a hundred jobs."""
+        """The overrides of each of a run's jobs, as Hydra's sweeper makes them; with ``seeds``, of so many seeds, and
+        of so many values of all else that an experiment sweeps by itself, which would be a hundred jobs."""
         return [list(job) for job in itertools.product(*self._options(seeds))]
 
     def cut(self, seeds: int) -> list[str]:

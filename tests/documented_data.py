@@ -119,12 +119,12 @@ def blenderproc(root: Path) -> Path:
 
 
 def in_the_wild(root: Path) -> Path:
-    """Four photographs of each of the six objects of ycb_in_the_wild in each of eight bins."""
+    """Eight photographs of each of the six objects of ycb_in_the_wild in each of eight bins."""
     root.mkdir(parents=True)
     text = (ROOT / "conf" / "experiment" / "ycb_in_the_wild.yaml").read_text(encoding="utf-8")
     names = sorted(set(re.findall(r"\b0\d\d_[a-z_]+[a-z]\b", text)))
     images, annotations, random = [], [], np.random.default_rng(4)
-    for number, (label, bin, _) in enumerate(np.ndindex(len(names), 8, 4)):
+    for number, (label, bin, _) in enumerate(np.ndindex(len(names), 8, 8)):
         picture = random.integers(0, 255, (60, 80, 3), np.uint8)
         left, top = (int(v) for v in random.integers(2, 25, 2))
         picture[top : top + 30, left : left + 40] = COLOURS[label % 6]

@@ -1,4 +1,4 @@
-"""From photographs to a detector on new pictures, through the command line: fields, psi, detector, data set, detections."""
+"""From photographs to detections on new pictures, through the command line."""
 
 import json
 import subprocess
@@ -38,10 +38,11 @@ def test_photographs_become_a_detector_that_is_scored_on_exported_images(tmp_pat
         "export.formats=[coco,yolo,bop]",
     ]
     _run(tmp_path, *objects, *export, f"export.folder={data}", f"hydra.run.dir={tmp_path / 'export'}")
-    psi = {
-        (row["object"], row["coordinate"]): 0.0 for row in json.loads((data / "psi.json").read_text())["rows"]
-    }
-    assert {name for name, _ in psi} == set(results["psi"]) == {"can", "mug"}
+    rows = json.loads((data / "psi.json").read_text())["rows"]
+    for name, factors in results["psi"].items():
+        weights = [row["weight"] for row in rows if (row["object"], row["factor"]) == (name, "pose")]
+        assert weights == pytest.approx(factors["pose"]["learned"], abs=1e-9)
+    assert set(results["psi"]) == {"can", "mug"}
 
     predict = ["stages=[predict]", f"predict.model={run}", f"predict.images={data / 'images'}"]
     _run(tmp_path, *predict, f"predict.annotations={data / 'annotations.json'}", f"hydra.run.dir={seen}")
