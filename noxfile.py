@@ -24,7 +24,7 @@ def demo(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """The fast suite, one run through the command line included; a process of one thread for each of up to four cores."""
+    """The fast suite, one run through the command line included; up to four processes of one thread."""
     _install(session)
     session.env["OMP_NUM_THREADS"] = "1"
     session.run("python", "-m", "pytest", "-n", "auto", "--maxprocesses", "4", *session.posargs)
