@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neural_sim.report.page.verdict import gain_of, interval, listed, verdict
+from neural_sim.report.page.verdict import Resampled, interval, listed, verdict
 from neural_sim.report.statistics import Estimate
 from neural_sim.types import LabelledImages
 
@@ -26,7 +26,7 @@ def detections(hits):
 
 def gain(ns, learned, matched, same=False):
     found = {"ns": detections(ns), "learned": detections(learned), "matched": detections(matched)}
-    return gain_of(["mug"], [0], found, TEST, same)
+    return Resampled.of(found, TEST, 2).gain(["mug"], [0], same)
 
 
 def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
@@ -38,6 +38,12 @@ def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
     assert better.closed == pytest.approx(16 / 24, abs=0.03)
     text = verdict(better)
     assert text.startswith("It worked") and "on mug" in text and f"{better.closed:.0%}" in text
+
+
+def test_a_class_without_boxes_is_in_no_mean():
+    found = {"ns": detections(8), "learned": detections(24), "matched": detections(32)}
+    both = Resampled.of(found, TEST, 2)
+    assert both.present == [0] and both.gain(["mug", "can"], [0, 1], False).gain == gain(8, 24, 32).gain
 
 
 def test_a_loss_is_called_one():

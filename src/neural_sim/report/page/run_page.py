@@ -12,7 +12,7 @@ from torch import Tensor
 from neural_sim.report.page import charts, pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
-from neural_sim.report.page.verdict import Gain, gain_of, listed, verdict
+from neural_sim.report.page.verdict import Gain, Resampled, listed, verdict
 from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
 from neural_sim.report.run import RunResults
 from neural_sim.types import LabelledImages
@@ -106,14 +106,13 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
 def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, Gain]:
     """Of the objects that the run is about, of all others, and of each of these that certainly lost."""
     names = list(results.names)
-    same = {name: _same(results, label) for label, name in enumerate(names)}
+    same = all(_same(results, label) for label in range(len(names)))
+    scores = Resampled.of(shown.detections, shown.test, len(names))
+    present = [names[label] for label in scores.present]
 
     def gain(of: Sequence[str]) -> Gain:
-        labels = [names.index(name) for name in of if _present(shown.test, names.index(name))]
-        present = [names[label] for label in labels]
-        return gain_of(present, labels, shown.detections, shown.test, all(same[name] for name in names))
+        return scores.gain(of, [names.index(name) for name in of], same)
 
-    present = [name for name in names if _present(shown.test, names.index(name))]
     gains = {"aim": gain([name for name in aim if name in present] or present)}
     others = [name for name in present if name not in aim]
     if others:
@@ -121,10 +120,6 @@ def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, G
         each = {name: gain([name]) for name in others}
         gains |= {f"lost:{name}": g for name, g in each.items() if g.outcome == "worse"}
     return gains
-
-
-def _present(test: LabelledImages, label: int) -> bool:
-    return bool((test.labels == label).any())
 
 
 def _same(results: RunResults, label: int) -> bool:

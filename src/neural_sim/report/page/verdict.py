@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.report.bootstrap import match
-from neural_sim.report.statistics import Estimate, mean_ap, resampled, with_intervals
+from neural_sim.report.bootstrap import average_precision, match
+from neural_sim.report.statistics import Estimate, with_intervals
 from neural_sim.types import LabelledImages
 
 Outcome = Literal["better", "worse", "no difference", "not scored"]
@@ -46,24 +47,52 @@ class Gain:
         return self.gain.value / self.room.value
 
 
-def gain_of(
-    names: Sequence[str],
-    labels: Sequence[int],
-    detections: Mapping[str, Sequence[Mapping[str, Tensor]]],
-    test: LabelledImages,
-    same_target: bool,
-    draws: int = 200,
-) -> Gain:
-    """The gain of the classes ``labels``, called ``names``, by detections of ns, learned and matched on the test set.
+@dataclass(frozen=True)
+class Resampled:
+    """AP of every class by the detections of ns, learned and matched on one test set, and under resampled images.
 
-    ``same_target``: the target's distribution is the initial one.
+    ``point`` is [3, classes], ``spread`` [draws, 3, classes]; nan for a class without a box.
     """
-    matches = [[match(detections[which], test, label) for label in labels] for which in WHICH]
-    point = np.asarray([mean_ap(classes) for classes in matches])
-    spread = resampled([matches], draws, seed=0)
-    gain, room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
-    ap = dict(zip(WHICH, point.tolist(), strict=True))
-    return Gain(tuple(names), ap, gain, None if same_target else room)
+
+    point: Float[np.ndarray, "which classes"]
+    spread: Float[np.ndarray, "draws which classes"]
+
+    @staticmethod
+    def of(
+        detections: Mapping[str, Sequence[Mapping[str, Tensor]]],
+        test: LabelledImages,
+        classes: int,
+        draws: int = 200,
+    ) -> Resampled:
+        """All classes under the same resampled images, so that differences between any of them are paired."""
+        matches = [[match(detections[which], test, label) for label in range(classes)] for which in WHICH]
+        random, count = np.random.default_rng(0), len(test)
+
+        def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[float]]:
+            return [[average_precision(m, weights) for m in row] for row in matches]
+
+        weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
+        return Resampled(np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights]))
+
+    @property
+    def present(self) -> list[int]:
+        """Labels of the classes that the test set shows."""
+        return np.flatnonzero(~np.isnan(self.point[0])).tolist()
+
+    def gain(self, names: Sequence[str], labels: Sequence[int], same_target: bool) -> Gain:
+        """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
+        the target's distribution is the initial one."""
+        point, spread = (_mean(part[..., list(labels)]) for part in (self.point, self.spread))
+        gain, room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
+        ap = dict(zip(WHICH, point.tolist(), strict=True))
+        return Gain(tuple(names), ap, gain, None if same_target else room)
+
+
+def _mean(ap: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
+    """Over the classes with a value; nan where none has one."""
+    known = ~np.isnan(ap)
+    counts = known.sum(-1)
+    return np.where(counts, np.where(known, ap, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)
 
 
 def listed(names: Sequence[str]) -> str:
