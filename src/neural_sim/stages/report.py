@@ -49,11 +49,12 @@ def write_report(context: Context) -> None:
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
         _write_model(context, test)
     write_results(report, folder)
-    page = write_run_page(report, _shown(context, learned.last, test, scores), _commands(context), folder)
+    commands = _commands(context, detector=bool(scores))
+    page = write_run_page(report, _shown(context, learned.last, test, scores), commands, folder)
     context.live.finish(report, folder)
     print(report.summary())
     print(f"results: {folder}\n{context.live.where}")
-    for what, command in _commands(context).items():
+    for what, command in commands.items():
         print(f"{what.lower()}: {command}")
     print(f"did it work? open {page}")
 
@@ -68,12 +69,13 @@ def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str
     return Shown(before, after, test, {called: part.detections for called, part in scores.items()})
 
 
-def _commands(context: Context) -> dict[str, str]:
-    """What to run next, by what it does."""
+def _commands(context: Context, detector: bool) -> dict[str, str]:
+    """What to run next, by what it does; ``detector``: whether the run leaves one."""
     name, folder = context.experiment.run.name, context.folder
     compare = f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'"
     predict = f"python -m src.main 'stages=[predict]' predict.model={folder} predict.images=/data/photos"
-    return {"To compare methods and seeds": compare, "To detect objects in photographs": predict}
+    commands = {"To compare methods and seeds": compare}
+    return commands | ({"To detect objects in photographs": predict} if detector else {})
 
 
 def _write_model(context: Context, test: LabelledImages) -> None:

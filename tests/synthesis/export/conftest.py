@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from small_export import data_of
 
 from neural_sim.field.grid import GridField
 from neural_sim.parameter.pose import Pose
@@ -77,3 +78,10 @@ def boxes() -> Callable[..., Boxes]:
         return Boxes(source, tuple(models))
 
     return make
+
+
+@pytest.fixture(scope="module")
+def whole(boxes, tmp_path_factory):
+    """Seven images in all formats, and their records."""
+    root = tmp_path_factory.mktemp("export") / "data"
+    return root, data_of(boxes, root).write(lambda numbers: numbers)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from neural_sim.outer.certificate import untrusted
 from neural_sim.report.page import charts, pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
@@ -92,7 +93,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
             after=_training(shown.after, results),
             examples=_examples(shown, names) if scored else {},
             steps=step_rows(results.records, names),
-            trust=results.document()["certificates"],
+            trust=untrusted(results.records),
             bins=by_object(scores),
             weak=weakest([s for s in scores if s.name in aim]),
             commands=commands,

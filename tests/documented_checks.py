@@ -1,0 +1,200 @@
+"""What the documentation promises that a run, a study or a stage leaves in its folder."""
+
+import json
+from pathlib import Path
+
+from mlflow import MlflowClient
+
+from neural_sim.detector.saved import SavedDetector
+from neural_sim.report.tracking import tracking_uri
+
+
+def check_of(config):
+    """The check of a configuration, which takes the folder and the configuration."""
+    alone = {"predict": _predict, "export": _export, "preflight": _preflight}.get(config["stages"][0])
+    whole = _run if "report" in config["stages"] else _stored
+    return alone or KINDS.get(next((key for key in KINDS if key in config), ""), whole)
+
+
+def _export(folder, config):
+    """usage.md, Exporting a data set."""
+    made = folder / "dataset" if config["export"]["folder"] is None else Path(config["export"]["folder"])
+    manifest = json.loads((made / "manifest.json").read_text())
+    assert len(manifest["images"]) == 3 and all(
+        (made / image["file"]).is_file() for image in manifest["images"]
+    )
+    assert (made / "psi.csv").is_file() and (made / "psi.json").is_file()
+    files = {
+        "coco": "annotations.json",
+        "yolo": "segment/dataset.yaml",
+        "bop": "bop/train/000000/scene_gt.json",
+    }
+    for name, file in files.items():
+        assert (made / file).is_file() == (name in config["export"]["formats"])
+
+
+def _stored(folder, config):
+    """A run without a report: its results are in the store."""
+    assert config["stages"] == ["views", "field"] and not (folder / "results.json").exists()
+    assert all(list((Path(config["paths"]["store"]) / kind).glob("*")) for kind in ("views", "field"))
+
+
+def _run(folder, config):
+    """README.md, Use: the files of a run."""
+    results = json.loads((folder / "results.json").read_text())
+    beside = {"synthetic_only", "real_only"} if config["training"]["real"]["mode"] != "none" else set()
+    assert set(results["ap"]) == {"ns", "learned", "matched"} | beside
+    assert (results["experiment"], results["seed"]) == (config["name"], config["seed"])
+    assert {"seconds", "peak_memory_mb", "left_out"} <= set(results)
+    for factors in results["psi"].values():
+        assert set(config["parameter"]) <= set(factors)  # axis=both has a second of its own
+        assert all(set(psi) == {"initial", "learned", "target"} for psi in factors.values())
+    if config["baseline"]["name"].startswith("neural_sim"):
+        assert len(results["iterations"]) == config["outer"]["iterations"]
+    # A method without iterations has no psi over them.
+    promised = {
+        "ap",
+        "training_images",
+        "detections",
+        *(f"psi_{factor}" for factor in factors if results["iterations"]),
+    }
+    assert promised <= {path.stem for path in (folder / "figures").glob("*.png")}
+    made = json.loads((folder / "training_set" / "annotations.json").read_text())
+    assert len(made["images"]) == len(results["psi"]) * config["training"]["images_per_object"]
+    assert all((folder / "training_set" / image["file_name"]).is_file() for image in made["images"])
+    shown, fewest = (
+        [len(image["poses"]) for image in made["images"]],
+        config["synthesis"]["objects_per_image"][0],
+    )
+    assert min(shown) >= fewest and max(shown) > 0
+
+    page = (folder / "report.html").read_text()
+    assert "What was learned" in page or not results["iterations"]
+    _model(folder, config, list(results["psi"]))
+
+
+def _model(folder, config, names):
+    """README, What a run leaves."""
+    assert SavedDetector.load(folder).class_names == tuple(names)
+    assert (folder / "model.onnx").exists() == config["model"]["onnx"]
+    if config["model"]["registered_name"]:
+        client = MlflowClient(tracking_uri(config["paths"]["mlflow"]))
+        assert client.search_model_versions(f"name='{config['model']['registered_name']}'")
+
+
+def _predict(folder, config):
+    """README, The detector, and what it sees."""
+    images = json.loads((folder / "coco_images.json").read_text())["images"]
+    rows = json.loads((folder / "coco_results.json").read_text())
+    assert images and rows and {row["image_id"] for row in rows} <= {image["id"] for image in images}
+    assert all((folder / "pictures" / image["file_name"]).is_file() for image in images)
+    scored = config["predict"]["annotations"] is not None
+    assert (folder / "scores.json").exists() == scored
+
+
+def _preflight(folder, config):
+    """usage.md, Before an optimisation."""
+    report = json.loads((folder / "preflight.json").read_text())
+    assert {one["name"] for one in report["foreseen"]} == set(report["names"])
+    bins = config["parameter"]["pose"]["bins"]
+    assert all(len(one["by_bin"]) == len(one["by_bin_error"]) == bins for one in report["foreseen"])
+    assert report["verdict"] in (folder / "preflight.html").read_text()
+
+
+def _comparison(folder, config):
+    written = json.loads((folder / "compare.json").read_text())
+    tables = {table["setting"]: table for table in written["comparisons"]}
+    text = (folder / "compare.md").read_text()
+    assert set(config["compare"]["experiments"]) <= set(tables)
+    for setting, table in tables.items():
+        assert table["methods"][0] == config["compare"]["reference"] and len(table["methods"]) > 1
+        assert (folder / "figures" / f"{setting.replace(', ', '_')}.png").stat().st_size > 5000
+        assert all(f"\n| {method} |" in text for method in table["methods"])
+    assert "of the gap closed" in text
+
+
+def _interpolation(folder, config):
+    held = json.loads((folder / "interpolation.json").read_text())
+    assert max(held["opacity_change"].values()) <= 1e-6  # float32: the light has no part in it
+    assert (folder / "figures" / "interpolation.png").stat().st_size > 5000
+
+
+def _temperatures(folder, config):
+    held = json.loads((folder / "temperatures.json").read_text())
+    names, values = config["objects"]["names"], {row["temperature"] for row in held["rows"]}
+    assert len(values) > 2 and values == set(config["temperatures"].get("values", values))
+    assert [truth["object"] for truth in held["truths"]] == names
+    assert len(held["rows"]) == len(names) * len(values) and all(row["images"] > 0 for row in held["rows"])
+    # Nearly exact draws lie where p puts them: 0.86 on the first object's dominant bin, 7.
+    cold = held["rows"][0]
+    assert cold["temperature"] == min(values) and cold["frequencies"][6] > 0.8
+    assert (folder / "figures" / "temperatures.png").stat().st_size > 5000
+
+
+def _patch_memory(folder, config):
+    rows = json.loads((folder / "patch_memory.json").read_text())["rows"]
+    side = config["camera"].get("width") or config["training"]["image_size"]
+    patches = [patch for patch in config["patch_memory"]["patches"] if patch < side**2]
+    assert [row["patch"] for row in rows] == [None, *patches, side**2]
+    assert all(row["difference"] < 1e-2 for row in rows)  # float32
+    assert (folder / "patch_memory.md").stat().st_size > 300
+
+
+def _nerf_vs_mesh(folder, config):
+    held = json.loads((folder / "nerf_vs_mesh.json").read_text())
+    other = "blenderproc" if config["nerf_vs_mesh"]["blenderproc"] else "mesh"
+    assert held["sources"] == ["nerf", other] and len(held["seeds"]) == config["nerf_vs_mesh"]["seeds"]
+    assert set(held["ap"]) == {"single", "multiple"}
+    assert all(
+        0.0 <= row[source]["value"] <= 1.0 for row in held["ap"].values() for source in held["sources"]
+    )
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == {"ap", "training_images"}
+    poses = json.loads((folder / "training_set" / "annotations.json").read_text())["images"]
+    assert poses and all(pose["camera_to_world"] for image in poses for pose in image["poses"])
+
+
+def _sfm_vs_nerf(folder, config):
+    held = json.loads((folder / "sfm_vs_nerf.json").read_text())
+    assert held["sources"] == ["nerf", "sfm"] and set(held["ap"]) == {"test"}
+    for scores in held["held_out"].values():
+        assert all(10.0 < scores[source]["psnr"] < 60.0 for source in held["sources"])
+    figures = {path.stem for path in (folder / "figures").glob("*.png")}
+    assert figures == {"ap", "training_images", "held_out"}
+
+
+def _samples_gallery(folder, config):
+    held, settings = json.loads((folder / "samples_gallery.json").read_text()), config["samples_gallery"]
+    assert set(held) == set(config["parameter"]["pose"]["biased"])
+    for each in held.values():
+        count = settings.get("count", 18)
+        assert set(each["images"].values()) == {count} and 0 < each["test"] <= count
+        assert set(each["total_variation"]) == set(settings.get("methods", ("neural_sim", "auto_sim")))
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == set(held)
+
+
+def _detection_gallery(folder, config):
+    held = json.loads((folder / "detection_gallery.json").read_text())
+    assert list(held["methods"]) == config["detection_gallery"]["methods"] and held["shown"]
+    boxes = {each["right"] + each["missed"] for each in held["methods"].values()}
+    assert len(boxes) == 1  # every method is judged by the same boxes
+    assert (folder / "figures" / "detections.png").stat().st_size > 5000
+
+
+def _experiments(folder, config):
+    text = (folder / "experiments.md").read_text()
+    assert all(
+        f"| `{row['command']}` |" in text
+        for row in json.loads((folder / "experiments.json").read_text())["rows"].values()
+    )
+
+
+def _stress(folder, config):
+    held = json.loads((folder / "stress.json").read_text())
+    assert held and (folder / "stress.md").stat().st_size > 1000
+
+
+KINDS = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
+             "temperatures": _temperatures, "patch_memory": _patch_memory,
+             "nerf_vs_mesh": _nerf_vs_mesh, "sfm_vs_nerf": _sfm_vs_nerf, "samples_gallery": _samples_gallery,
+             "detection_gallery": _detection_gallery, "experiments": _experiments}  # fmt: skip
+"""Checks of studies, by the key of their stage."""
