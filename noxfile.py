@@ -32,9 +32,10 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def slow(session: nox.Session) -> None:
-    """The tests that take minutes."""
+    """The tests that take minutes, every documented command among them; one process a core."""
     _install(session)
-    session.run("python", "-m", "pytest", "-m", "slow", *session.posargs)
+    session.env["OMP_NUM_THREADS"] = "1"
+    session.run("python", "-m", "pytest", "-m", "slow", "-n", "auto", "--dist", "worksteal", *session.posargs)
 
 
 @nox.session

@@ -2,7 +2,6 @@
 it ends well and leaves what the documentation promises. Sweeps are cut to their first seed, and scales that take hours
 to smoke. Comparisons come last, after the runs that they compare."""
 
-import itertools
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import torch
 from documented import ROOT, Command, commands
 from documented_checks import check_of
 from documented_data import MadeData
+from filelock import FileLock
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import conf_directory
@@ -33,12 +33,11 @@ def _exports(command):
 
 
 class Runs:
-    """Runs commands once each, in folders of their own under one root, with one store and one MLflow."""
+    """Runs commands once each, in folders of their own under one root, with one store and one MLflow, whichever of
+    the test's processes asks first."""
 
-    def __init__(self, root):
-        self.root, self.data = root, MadeData(root / "data")
-        self.folders: dict[Command, object] = {}
-        self.numbers = itertools.count()
+    def __init__(self, root, data):
+        self.root, self.data = root, data
 
     def words(self, command):
         """The overrides at smoke scale, with the first of the seeds and made data for paths."""
@@ -51,23 +50,31 @@ class Runs:
 
     def folder(self, command):
         """Where the command left its files, which it must have done without an error."""
-        if command not in self.folders:
-            folder = self.root / "runs" / str(next(self.numbers))
-            added = [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
-            added.append(f"paths.data={self.data.shared}")
-            added.append(f"hydra.{'sweep' if command.multirun else 'run'}.dir={folder}")
-            run = [sys.executable, "-m", "src.main", *sorted(command.flags), *self.words(command), *added]
-            done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=3000)
-            assert done.returncode == 0, (
-                f"{command.where}: {' '.join(run)}\n{done.stdout[-1000:]}{done.stderr[-3000:]}"
-            )
-            self.folders[command] = folder
-        return self.folders[command]
+        folder = self.root / "runs" / str(ALL.index(command))
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        ended = folder.with_suffix(".ended")
+        with FileLock(folder.with_suffix(".lock")):
+            if not ended.exists():
+                self._run(command, folder)
+                ended.touch()
+        return folder
+
+    def _run(self, command, folder):
+        added = [f"paths.store={self.root / 'store'}", f"paths.mlflow={self.root / 'mlflow.db'}"]
+        added.append(f"paths.data={self.data.shared}")
+        added.append(f"hydra.{'sweep' if command.multirun else 'run'}.dir={folder}")
+        run = [sys.executable, "-m", "src.main", *sorted(command.flags), *self.words(command), *added]
+        done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=3000)
+        assert done.returncode == 0, (
+            f"{command.where}: {' '.join(run)}\n{done.stdout[-1000:]}{done.stderr[-3000:]}"
+        )
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    return Runs(tmp_path_factory.mktemp("documented"))
+    processes = tmp_path_factory.getbasetemp()
+    together = processes.parent if "PYTEST_XDIST_WORKER" in os.environ else processes
+    return Runs(together / "documented", MadeData(tmp_path_factory.mktemp("documented_data")))
 
 
 ALL = [command for command in commands("main") if "--help" not in command.flags]
