@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import torch
-from documented import ROOT, Command, commands
+from documented import ROOT, commands
 from documented_checks import check_of
 from documented_data import MadeData
 from filelock import FileLock
