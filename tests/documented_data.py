@@ -138,10 +138,16 @@ def in_the_wild(root: Path) -> Path:
     return root
 
 
-def ycb_video(root: Path) -> Path:
-    """Six scenes of YCB-Video that show the objects of the documentation and another, and which are key frames."""
+def ycb_video_sample(root: Path, scenes: int = 3) -> Path:
+    """Scenes of YCB-Video, two frames each, that show the objects of the documentation and another."""
     meshes = meshes_in_metres({"019_pitcher_base": "pitcher", "035_power_drill": "drill", "025_mug": "mug"})
-    write_ycb_video(root, photographs(meshes, 6, 2), meshes, CLASSES, hdf5=(3,))
+    write_ycb_video(root, photographs(meshes, scenes, 2), meshes, CLASSES, hdf5=(3,))
+    return root
+
+
+def ycb_video(root: Path) -> Path:
+    """Six scenes of YCB-Video, and which are key frames."""
+    ycb_video_sample(root, scenes=6)
     (root / "image_sets").mkdir()
     for name, scenes in (("train", range(4)), ("keyframe", range(4, 6))):
         lines = [f"{scene:04d}/{number:06d}\n" for scene in scenes for number in (1, 2)]
@@ -236,11 +242,12 @@ class MadeData:
 
     @property
     def shared(self) -> Path:
-        """A folder for ``paths.data``, with ycb/ and ycb_in_the_wild/ in it."""
+        """A folder for ``paths.data``, with ycb/, ycb_in_the_wild/ and ycb_video_sample/ in it."""
         self.localise("objects.root=../shared/ycb")
         root = self.made[ycb].parent
-        if in_the_wild not in self.made:
-            self.made[in_the_wild] = in_the_wild(root / "ycb_in_the_wild")
+        for make, folder in ((in_the_wild, "ycb_in_the_wild"), (ycb_video_sample, "ycb_video_sample")):
+            if make not in self.made:
+                self.made[make] = make(root / folder)
         return root
 
     def localise(self, word: str) -> str:

@@ -60,8 +60,8 @@ def results(experiment, method, seed, gap="disjoint", initial=4, target=1, learn
 
 def finished(ap, **arguments):
     """A run by AP: ``ap`` maps ns, learned and matched to that of can and of mug."""
-    held = results(**arguments)
-    return FinishedRun(held, {w: [matches(f, i) for i, f in enumerate(each)] for w, each in ap.items()})
+    made = results(**arguments)
+    return FinishedRun(made, {w: [matches(f, i) for i, f in enumerate(each)] for w, each in ap.items()})
 
 
 def setting(experiment="gap", gap="disjoint", target=1, methods=(("neural_sim", 0.75),), seeds=(0,), **more):

@@ -70,7 +70,8 @@ def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, sha
         parameters = {
             what: OmegaConf.to_container(node, resolve=True) for what, node in config.parameter.items()
         }
-        settings.append((config.name, config.gap, config.baseline.name, repr(parameters)))
+        varied = (repr(parameters), repr(config.training.real))
+        settings.append((config.name, config.gap, config.baseline.name, *varied))
     assert len(jobs) > 1 and len(set(settings)) == len(jobs)
     assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
 
@@ -123,9 +124,12 @@ def test_without_its_data_a_study_stops_before_its_first_job(name, tmp_path):
 def test_a_study_runs_and_its_results_go_on_the_page(name, shared, tmp_path):
     """At smoke scale on made data, its first seed and methods, and its first two cases."""
     store = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}", "scale=smoke"]
+    few = ["baseline=neural_sim,lts"]
     cut = {
         "interpretability": ["gap=uniform"],
         "ycb_large_scale": ["progress=false"],
+        "ycb_video_few_shot": ["training.real={mode: pretrain, count: 0},{mode: combined, count: 10}", *few],
+        "ycb_video_limited": ["training.real={mode: pretrain, fraction: 0.1}", *few],
         "ycb_in_the_wild": ["gap=disjoint", "wild={target: {dominant: 2}, start: {dominant: 7}}"],
     }.get(name, ["gap=disjoint"])
     _run("+experiment=" + name, "seed=0", *cut, *store, f"paths.data={shared}",
@@ -135,7 +139,8 @@ def test_a_study_runs_and_its_results_go_on_the_page(name, shared, tmp_path):
          f"hydra.run.dir={folder}")  # fmt: skip
     (row,) = json.loads((folder / "experiments.json").read_text())["rows"].values()
     assert row["ours"] and "not yet measured" not in (folder / "experiments.md").read_text()
-    assert name == "ycb_large_scale" or list((folder / "figures").glob(f"{name}_*.png"))
+    tables = ("ycb_large_scale", "ycb_video_few_shot", "ycb_video_limited")
+    assert name in tables or list((folder / "figures").glob(f"{name}_*.png"))
 
 
 def _run(*arguments):

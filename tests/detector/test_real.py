@@ -43,10 +43,18 @@ def test_too_few_photographs_are_refused(tools, photographs):
         Real("combined", count=5).chosen(given, 0)
 
 
+def test_fewer_photographs_than_asked_for_are_all_taken_where_that_is_allowed(tools, caplog):
+    taken = Real("combined", count=5, fewer="all").chosen(tools.images(4), 0)
+    assert len(taken) == 4 and "4 photographs in the place of 5" in caplog.text
+    with pytest.raises(ValueError, match="want 5 photographs or more"):
+        Real("combined", count=5, fewer="all").chosen(None, 0)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"mode": "both"}, r"real\.mode must be one of none, combined, pretrain, got 'both'"),
+        ({"fewer": "most"}, r"real\.fewer must be one of refuse, all, got 'most'"),
         ({"count": -1}, r"real\.count must be at least 0, got -1"),
         ({"count": 3, "fraction": 0.5}, "want count or fraction, got both"),
         ({"fraction": 1.5}, r"real\.fraction must lie in \(0, 1\], got 1.5"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +14,10 @@ from torch import Tensor
 
 from neural_sim.types import LabelledImages
 
+_log = logging.getLogger(__name__)
+
 Mode = Literal["none", "combined", "pretrain"]
+Fewer = Literal["refuse", "all"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,8 @@ class Real:
             has as many steps as without them. None: photographs are images like all others, once in every epoch.
         finetune: ``pretrain``: steps on photographs, as a fraction of those on synthetic images.
         finetune_learning_rate: its peak learning rate.
+        fewer: what happens where there are fewer photographs than ``count``: ``refuse``, or take ``all`` of them with
+            a warning.
 
     Raises:
         ValueError: any of these out of its range, or both numbers of photographs.
@@ -41,12 +47,14 @@ class Real:
     batch_fraction: float | None = 0.5
     finetune: float = 0.3
     finetune_learning_rate: float = 1e-3
+    fewer: Fewer = "refuse"
 
     def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise ValueError(
-                f"training.real.mode must be one of {', '.join(get_args(Mode))}, got {self.mode!r}"
-            )
+        for key, choices in (("mode", get_args(Mode)), ("fewer", get_args(Fewer))):
+            if getattr(self, key) not in choices:
+                raise ValueError(
+                    f"training.real.{key} must be one of {', '.join(choices)}, got {getattr(self, key)!r}"
+                )
         if self.count is not None and self.fraction is not None:
             raise ValueError(
                 f"training.real: want count or fraction, got both, {self.count} and {self.fraction}"
@@ -77,12 +85,17 @@ class Real:
         """Those that train: a random subset, the first of an order that depends on ``seed`` alone.
 
         Raises:
-            ValueError: fewer photographs than ``count``, or none at all.
+            ValueError: fewer photographs than ``count`` where that is refused, or none at all.
         """
         available = 0 if photographs is None else len(photographs)
         count = available if self.count is None else self.count
         if self.fraction is not None:
             count = max(1, round(self.fraction * available))
+        elif self.fewer == "all" and 0 < available < count:
+            _log.warning(
+                "training.real: %d photographs in the place of %d, there are no more", available, count
+            )
+            count = available
         if photographs is None or not 0 < count <= available:
             raise ValueError(
                 f"training.real: want {max(1, count)} photographs or more to train on, got {available}"

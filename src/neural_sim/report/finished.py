@@ -15,7 +15,6 @@ from neural_sim.report import logged
 from neural_sim.report.bootstrap import Matches, match
 from neural_sim.types import LabelledImages
 
-WHICH = ("ns", "learned", "matched")
 FILES = ("results.json", "detections.json")
 
 
@@ -56,7 +55,8 @@ class Candidate(Recorded):
 
 @dataclass(frozen=True)
 class FinishedRun(Recorded):
-    """One run's results.json, and the matches of its biased objects for each detector of ``WHICH``."""
+    """One run's results.json, and the matches of its biased objects for each of its detectors: ns, learned, matched,
+    and where photographs trained too, synthetic_only and real_only."""
 
     results: Mapping[str, Any]
     matches: Mapping[str, Sequence[Matches]]
@@ -94,8 +94,9 @@ def read_run(candidate: Candidate) -> FinishedRun:
     names, count = list(results["psi"]), stored["images"]
     truth = _images(stored["truth"], count)
     labels = [names.index(name) for name in results["biased"]]
-    detections = {which: _detections(stored[which], count) for which in WHICH}
-    return FinishedRun(results, {w: [match(detections[w], truth, label) for label in labels] for w in WHICH})
+    detections = {w: _detections(rows, count) for w, rows in stored.items() if w not in ("images", "truth")}
+    matches = {which: [match(own, truth, label) for label in labels] for which, own in detections.items()}
+    return FinishedRun(results, matches)
 
 
 def _detections(rows: Sequence[Mapping[str, Any]], count: int) -> list[dict[str, Tensor]]:

@@ -12,6 +12,7 @@ from neural_sim.report.compare import points
 from neural_sim.report.histograms import histogram_figure, histogram_summary, histogram_table, histograms
 from neural_sim.report.levels import Axis, levels_figure, levels_summary, levels_table
 from neural_sim.report.object_scores import MEAN, ObjectScores, called
+from neural_sim.report.photographs import photographs_summary, photographs_table
 from neural_sim.report.settings import Setting
 
 
@@ -84,6 +85,12 @@ def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed:
     return Shown(lines, "\n\n".join(parts))
 
 
+def _photographs(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+    """The paper's Table 2: rows are ways of training, columns numbers of photographs, ours and then the paper's."""
+    tables = [photographs_table(settings), *([] if paper is None else [paper.markdown()])]
+    return Shown(photographs_summary(settings), "\n\n".join(tables))
+
+
 def beside(scores: ObjectScores, paper: Paper | None) -> str:
     """AP of every object in points with 95 % intervals, beside the paper's."""
     columns = [] if paper is None else list(paper.columns)
@@ -130,6 +137,7 @@ LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None, int, int], Show
     "targets": _levels("target"),
     "objects": _objects,
     "histograms": _histograms,
+    "photographs": _photographs,
     "seconds": _seconds,
 }
 """By the name that a row of ``experiments.rows`` gives."""

@@ -16,6 +16,8 @@ MEAN = "mAP"
 """The name of the mean over the biased objects among them."""
 CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
 """The paper's names of methods."""
+WITHOUT = ("synthetic_only", "real_only")
+"""Detectors that are scored where photographs train too: on synthetic images alone, and on photographs alone."""
 
 
 def called(method: str) -> str:
@@ -27,7 +29,8 @@ def called(method: str) -> str:
 class ObjectScores:
     """``ap`` and ``ahead`` map a method, then an object or ``MEAN``, to an estimate in [0, 1]: the AP (0.50 to 0.95) on
     the test set, and the reference's AP minus the method's. ``methods`` begin with ns and end with matched, the
-    detectors trained on the initial and on the target's distribution."""
+    detectors trained on the initial and on the target's distribution. Where photographs train too, ``ap`` also has
+    ``WITHOUT``, of the reference's runs."""
 
     reference: str
     methods: tuple[str, ...]
@@ -58,15 +61,16 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
         raise ValueError(f"scores of {reference}: want a run of each method at each seed, lacking {missing}")
     methods = (BOUNDS[0], *reversed(learned), BOUNDS[1])
     objects = tuple(runs[0].results["biased"])
+    columns = (*methods, *(w for w in WITHOUT if all(w in table[reference, at].matches for at in seeds)))
     matches = [
-        [[own] for method in methods for own in _matches(table, reference, method, at)] for at in seeds
+        [[own] for column in columns for own in _matches(table, reference, column, at)] for at in seeds
     ]
-    shape = (-1, len(methods), len(objects))
+    shape = (-1, len(columns), len(objects))
     point = np.asarray([[average_precision(own) for (own,) in row] for row in matches]).mean(0)
     point = _with_mean(point.reshape(shape))[0]
     spread = _with_mean(resampled(matches, draws, seed).reshape(shape))
     rows, ours = (*objects, MEAN), methods.index(reference)
-    ap = {m: with_intervals(point[i], spread[:, i]) for i, m in enumerate(methods)}
+    ap = {column: with_intervals(point[i], spread[:, i]) for i, column in enumerate(columns)}
     ahead = {
         m: with_intervals(point[ours] - point[i], spread[:, ours] - spread[:, i])
         for i, m in enumerate(methods)
@@ -79,8 +83,9 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
 def _matches(
     table: Mapping[tuple[str, int], FinishedRun], reference: str, method: str, seed: int
 ) -> Sequence[Matches]:
-    """Of a method's detector at a seed. The reference's run stands for ns and matched, which all methods share."""
-    if method in BOUNDS:
+    """Of a method's detector at a seed. The reference's run stands for ns and matched, which all methods share, and for
+    ``WITHOUT``."""
+    if method in BOUNDS or method in WITHOUT:
         return table[reference, seed].matches[method]
     return table[method, seed].matches["learned"]
 

@@ -14,8 +14,9 @@ from neural_sim.report.identity import scored_values
 from neural_sim.report.object_scores import ObjectScores, object_scores
 from neural_sim.report.selection import Group, LeftOut, Selection
 
-AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b")
-"""Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects."""
+AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|fraction)$")
+"""Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and how
+many photographs train, and how."""
 
 
 @dataclass(frozen=True)
