@@ -1,4 +1,4 @@
-"""Sessions that set up all they need: ``nox -s demo``, ``tests``, ``slow``, ``lint``, ``types``, ``bench``."""
+"""Sessions that set up all they need, such as ``nox -s demo``; ``nox -l`` lists them."""
 
 import nox
 
@@ -51,6 +51,15 @@ def types(session: nox.Session) -> None:
     """Static types."""
     _install(session)
     session.run("pyright")
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation as a site, in outputs/site; a warning is an error."""
+    session.install("-r", "requirements.lock")
+    session.run(
+        "python", "-m", "mkdocs", "build", "--strict", *session.posargs, env={"NO_MKDOCS_2_WARNING": "1"}
+    )
 
 
 @nox.session
