@@ -99,7 +99,10 @@ def _preflight(folder, config):
     assert {one["name"] for one in report["foreseen"]} == set(report["names"])
     bins = config["parameter"]["pose"]["bins"]
     assert all(len(one["by_bin"]) == len(one["by_bin_error"]) == bins for one in report["foreseen"])
-    assert report["verdict"] in html.unescape((folder / "preflight.html").read_text())
+    page = html.unescape((folder / "preflight.html").read_text())
+    assert report["verdict"] in page and report["worth"] in page
+    counts = {gain["photographs"] for gain in report["labelled"]}
+    assert bool(counts) == bool(config["target"].get("train_fraction"))
 
 
 def _comparison(folder, config):

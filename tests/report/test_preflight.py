@@ -1,10 +1,12 @@
 """The verdict before an optimisation: what is significant over all objects, what is advised, and the page."""
 
+import dataclasses
 import re
 
 import torch
 
 from neural_sim.outer.foreseen import Foreseen
+from neural_sim.outer.labelled import Labelled
 from neural_sim.report.page.preflight_page import write_preflight_page
 from neural_sim.report.page.weak_bins import BinScore
 from neural_sim.report.preflight import Preflight
@@ -40,6 +42,18 @@ def test_the_summary_has_gains_weak_bins_and_advice():
     assert "weak: object 0 from bin 2, AP 20.0 on 10 images" in text
     assert "differs: box size" in text and "differs: contrast" not in text
     assert "'synthesis.sensor.blur=[1,1]'" in text and "distances times 0.50" in text
+
+
+def test_the_gain_is_told_in_labelled_photographs():
+    report = preflight(0.001, 0.5)
+    assert report.gain == 0.1 and "none are for training" in report.worth
+    counted = dataclasses.replace(report, labelled=(Labelled(10, 0.05, 0.01), Labelled(25, 0.2, None)))
+    assert counted.worth.startswith("A first step is worth about 15 of them.")
+    assert "10 lower it by 0.050 ± 0.010; 25 lower it by 0.200." in counted.summary()
+    few = dataclasses.replace(report, labelled=(Labelled(10, 0.05, 0.01),))
+    assert few.worth.startswith("A first step is worth more than 10 of them.")
+    hopeless = dataclasses.replace(preflight(0.5), labelled=few.labelled)
+    assert hopeless.worth.startswith("Labelled photographs in training")
 
 
 def test_the_page_is_self_contained(tmp_path):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from neural_sim.outer.foreseen import Foreseen
+from neural_sim.outer.labelled import Labelled, equivalent
 from neural_sim.report.page.verdict import listed
 from neural_sim.report.page.weak_bins import BinScore, weakest
 from neural_sim.target.mismatch import Mismatch
@@ -15,7 +16,8 @@ from neural_sim.target.mismatch import Mismatch
 class Preflight:
     """``foreseen``: gains of every object and factor, of which those count that are significant at ``level`` over all
     of them. ``bins``: AP of the initial distribution's detector by bin of the validation images. ``settings`` would
-    match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None: they agree)."""
+    match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None: they agree).
+    ``labelled``: what numbers of labelled photographs in training are worth; empty where none are for training."""
 
     experiment: str
     names: tuple[str, ...]
@@ -25,6 +27,7 @@ class Preflight:
     mismatches: tuple[Mismatch, ...]
     settings: Mapping[str, str]
     distance_factor: float | None
+    labelled: tuple[Labelled, ...] = ()
 
     @property
     def promising(self) -> list[Foreseen]:
@@ -46,15 +49,43 @@ class Preflight:
                 "would not know where to go."
             )
         names = list(dict.fromkeys(f.name for f in self.promising))
-        gain = sum(f.step for f in self.promising)
         return (
             f"Worth optimising: {listed(names)} would gain. A first step of the trust region lowers the outer loss by "
-            f"{gain:.3f} to first order."
+            f"{self.gain:.3f} to first order."
         )
+
+    @property
+    def gain(self) -> float:
+        """Expected fall of L_val by a first step of all promising objects and factors."""
+        return sum(f.step for f in self.promising)
+
+    @property
+    def worth(self) -> str:
+        """What the gain equals in labelled photographs, as a sentence."""
+        if not self.labelled:
+            return (
+                "What that equals in labelled photographs is not known: none are for training "
+                "(target.train_fraction, or target.train_per_object of rendered targets)."
+            )
+        tried = "; ".join(
+            f"{g.photographs} lower it by {g.fall:.3f}" + ("" if g.error is None else f" ± {g.error:.3f}")
+            for g in self.labelled
+        )
+        sentence = f"Labelled photographs in training, beside the initial distribution's images: {tried}."
+        if not self.promising:
+            return sentence
+        count = equivalent(self.labelled, self.gain)
+        most = max(g.photographs for g in self.labelled)
+        equal = f"more than {most}" if count is None else f"about {max(1, round(count))}"
+        return f"A first step is worth {equal} of them. {sentence}"
 
     def summary(self) -> str:
         """What is printed."""
-        lines = [self.verdict, f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin"]
+        lines = [
+            self.verdict,
+            self.worth,
+            f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin",
+        ]
         for f in self.foreseen:
             best = max(range(len(f.by_bin)), key=lambda b: f.by_bin[b])
             gain = f"{best + 1} ({f.by_bin[best]:+.4f} ± {f.by_bin_error[best]:.4f} for {f.moved:.0%} of its images)"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.foreseen import foresee
+from neural_sim.outer.labelled import labelled_gains
 from neural_sim.report.page.preflight_page import write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
 from neural_sim.report.preflight import Preflight
@@ -26,13 +28,16 @@ class PreflightStep:
     Args:
         trials: trainings whose derivatives are averaged.
         moved: fraction of an object's images that is moved to a bin for the gains by bin.
+        labelled: numbers of labelled photographs whose gain in training is measured beside it, where the target has a
+            part for training.
 
     Raises:
-        ValueError: no trial, or a fraction outside (0, 1].
+        ValueError: no trial, a fraction outside (0, 1], or a number of photographs below 1.
     """
 
     trials: int = 2
     moved: float = 0.15
+    labelled: Sequence[int] = (10, 25)
 
     needs = ("views", "field", "target_sets", "warm_start")
 
@@ -41,6 +46,8 @@ class PreflightStep:
             raise ValueError(f"preflight.trials must be at least 1, got {self.trials}")
         if not 0.0 < self.moved <= 1.0:
             raise ValueError(f"preflight.moved must lie in (0, 1], got {self.moved}")
+        if any(count < 1 for count in self.labelled):
+            raise ValueError(f"preflight.labelled: want numbers of at least 1, got {list(self.labelled)}")
 
     def run(self, context: Context) -> None:
         """preflight.json and preflight.html to the run's folder, a summary to the screen.
@@ -57,6 +64,9 @@ class PreflightStep:
             )
         outer = x.loop.outer
         foreseen = foresee(loop, self.trials, self.moved, outer.checks.radius)
+        photographs, labelled = results(graph.targets).train, []
+        if photographs is not None and self.labelled:
+            labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
         detections = graph.warm_start.build().predict(results(graph.warm_start).params, validation.images)
         images = graph.warm_start.images(results(graph.scene)).images.to("cpu")
         differ = mismatches(validation, images)
@@ -70,6 +80,7 @@ class PreflightStep:
             mismatches=tuple(differ),
             settings=matching_settings(validation, images, differ),
             distance_factor=distance_factor(differ),
+            labelled=tuple(labelled),
         )
         _write(context.folder / "preflight.json", report)
         page = write_preflight_page(report, validation, images, context.folder)
@@ -78,5 +89,5 @@ class PreflightStep:
 
 
 def _write(path: Path, report: Preflight) -> None:
-    document: dict[str, Any] = dataclasses.asdict(report) | {"verdict": report.verdict}
+    document: dict[str, Any] = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")
