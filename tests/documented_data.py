@@ -170,6 +170,14 @@ def backgrounds(root: Path) -> Path:
     return root
 
 
+def cutouts(root: Path) -> Path:
+    """Two half-transparent pictures."""
+    root.mkdir(parents=True)
+    for number, colour in enumerate(((200, 30, 30, 128), (30, 30, 200, 255))):
+        Image.new("RGBA", (40, 20), colour).save(root / f"{number}.png")
+    return root
+
+
 def captures(root: Path) -> Path:
     """Twelve photographs of each of two of the embedded objects, with masks."""
     root.mkdir(parents=True)
@@ -219,6 +227,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/wild.json": wild,
     "/data/blenderproc": blenderproc,
     "/data/backgrounds": backgrounds,
+    "/data/cutouts": cutouts,
     "/data/YCB_Video": ycb_video,
     "/data/ycbv": bop_scenes,
     "/data/photos": backgrounds,

@@ -153,6 +153,8 @@ def _identity(context: Context) -> dict[str, Any]:
     """What says which runs this one can be compared with."""
     graph, imaging = context.graph, context.experiment.imaging
     sources = {"background": imaging.synthesis.background, "target": imaging.target}
+    if imaging.synthesis.distractors.used:
+        sources["distractors"] = imaging.synthesis.distractors
     read = {name: source.digest() for name, source in sources.items() if hasattr(source, "digest")}
     scored, learned = graph.scores(graph.psi("initial"), "initial"), graph.learned
     code = {"scoring": scored.description["code"], "method": learned.description["code"]}

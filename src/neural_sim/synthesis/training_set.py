@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.synthesis.background import Background
 from neural_sim.synthesis.boxes import boxes_from_opacity
 from neural_sim.synthesis.compositing import apply_shift, composite, draw_shift
+from neural_sim.synthesis.distractors import Cover, Distractors
 from neural_sim.synthesis.layers import by_depth, stacked, visible_boxes
 from neural_sim.synthesis.layout import Layout, ObjectCount
 from neural_sim.synthesis.sensor import Sensor, SensorDraw, seen_by
@@ -25,18 +26,21 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Nuisance:
     """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU, one for each
-    object in an image; ``sensor`` is what the camera does to it (None: nothing)."""
+    object in an image; ``sensor`` is what the camera does to it (None: nothing); ``front`` is what hides the objects
+    (None: nothing)."""
 
     backgrounds: Float[Tensor, "n 3 h w"]
     shifts: Int[Tensor, "n *objects 2"]
     sensor: SensorDraw | None = None
+    front: Cover | None = None
 
     def __len__(self) -> int:
         return self.backgrounds.shape[0]
 
     def select(self, index: Tensor | slice) -> Nuisance:
         sensor = None if self.sensor is None else self.sensor.select(index)
-        return Nuisance(self.backgrounds[index], self.shifts[index], sensor)
+        front = None if self.front is None else self.front.select(index)
+        return Nuisance(self.backgrounds[index], self.shifts[index], sensor, front)
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,13 @@ class Synthesizer:
         min_visibility: smallest part of an object's pixels, of those within the image, that other objects leave visible
             for it to get a box.
         sensor: blur and noise of the camera.
+        distractors: things without a label, behind and in front of the objects.
         label_gradient: ``ignored`` is the paper's; ``differentiable`` lets boxes carry the derivative of their
             edges, so that the pathwise gradient sees that regression targets move with the object.
 
     Raises:
         ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, another label_gradient, a
-            range that is none; boxes that move, with several objects an image.
+            range that is none; boxes that move, with several objects an image or with things that hide them.
     """
 
     background: Background
@@ -68,6 +73,7 @@ class Synthesizer:
     objects_per_image: Sequence[int] = (1, 1)
     min_visibility: float = 0.1
     sensor: Sensor = field(default_factory=Sensor)
+    distractors: Distractors = field(default_factory=Distractors)
 
     def __post_init__(self) -> None:
         if not hasattr(self.background, "draw"):
@@ -88,10 +94,10 @@ class Synthesizer:
             raise ValueError(
                 f"synthesis.objects_per_image: want fewest and most, got {list(self.objects_per_image)}"
             )
-        if self.count.most > 1 and self.label_gradient == "differentiable":
+        if (self.count.most > 1 or self.distractors.hide) and self.label_gradient == "differentiable":
             raise ValueError(
-                "synthesis.label_gradient=differentiable wants one object an image: how a box moves with what hides it "
-                "is not derived"
+                "synthesis.label_gradient=differentiable wants one object an image and no distractors in front: how a "
+                "box moves with what hides it is not derived"
             )
 
     @property
@@ -118,7 +124,10 @@ class Synthesizer:
         backgrounds = self.background.draw(n, height, width, generator, device)
         shifts = draw_shift(n * (objects or 1), self.shift, height, width, generator)
         sensor = self.sensor.draw(n, height, width, generator, device)
-        return Nuisance(backgrounds, shifts if objects is None else shifts.view(n, objects, 2), sensor)
+        front, covers = None, self.distractors.draw(n, height, width, generator, device)
+        if covers is not None:
+            backgrounds, front = covers[0].over(backgrounds), covers[1] if self.distractors.hide else None
+        return Nuisance(backgrounds, shifts if objects is None else shifts.view(n, objects, 2), sensor, front)
 
     def compose(
         self,
@@ -135,9 +144,15 @@ class Synthesizer:
         an image without a box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
-        images = seen_by(composite(rgb, opacity, nuisance.backgrounds.to(rgb)), nuisance.sensor)
-        moving = self.label_gradient == "differentiable"
-        boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
+        images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
+        if nuisance.front is None:
+            moving = self.label_gradient == "differentiable"
+            boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
+        else:
+            images, alone = nuisance.front.over(images), opacity.detach()[:, None]
+            boxes, visible = self._boxes(alone, alone * _clear(nuisance.front, alone))
+            present = visible[:, 0]
+        images = seen_by(images, nuisance.sensor)
         labels = torch.where(present, label, -1)[:, None]
         labelled = LabelledImages(images, boxes, labels, bins.to(rgb.device))
         if _log.isEnabledFor(logging.DEBUG):  # counting makes the host wait for the device
@@ -167,11 +182,21 @@ class Synthesizer:
         rgb, opacity = rgb.gather(1, place[..., None].expand_as(rgb)), opacity.gather(1, place)
         labels = layout.labels.to(rgb.device).gather(1, nearest)
         images, visible = stacked(rgb, opacity, nuisance.backgrounds.to(rgb))
-        boxes, present = visible_boxes(
-            opacity.detach(), visible.detach(), self.threshold, self.minimum_area, self.min_visibility
-        )
+        if nuisance.front is not None:
+            images, visible = nuisance.front.over(images), visible * _clear(nuisance.front, visible)
+        boxes, present = self._boxes(opacity.detach(), visible.detach())
         labels = torch.where(present & (labels >= 0), labels, -1)
         return LabelledImages(seen_by(images, nuisance.sensor), boxes, labels, bins.to(rgb.device))
+
+    def _boxes(
+        self, opacity: Float[Tensor, "n layers h w"], visible: Float[Tensor, "n layers h w"]
+    ) -> tuple[Float[Tensor, "n layers 4"], Bool[Tensor, "n layers"]]:
+        return visible_boxes(opacity, visible, self.threshold, self.minimum_area, self.min_visibility)
+
+
+def _clear(front: Cover, like: Tensor) -> Float[Tensor, "n 1 h w"]:
+    """How much of what is behind can be seen."""
+    return (1.0 - front.opacity.to(like))[:, None]
 
 
 def images_without_boxes(images: LabelledImages) -> int:

@@ -112,11 +112,12 @@ class ImageSource:
         height, width, placed = self.camera.height, self.camera.width, self.drawn(number)
         device = self.scene.device(0)
         layers = [self._layer(item) for item in placed]
-        clear = torch.ones(height, width, device=device)
-        colour, depth = (
-            torch.zeros(height, width, 3, device=device),
-            torch.zeros(height, width, device=device),
-        )
+        generator, synthesizer = self.generator(number, "pixels"), self.scene.synthesizer
+        covers = synthesizer.distractors.draw(1, height, width, generator, device)
+        clear, depth = torch.ones(height, width, device=device), torch.zeros(height, width, device=device)
+        colour = torch.zeros(height, width, 3, device=device)
+        if covers is not None:  # what is in front hides pixels like an object without a mask
+            clear, colour = 1.0 - covers[1].opacity[0], covers[1].rgb[0].clone()
         full = [torch.zeros(height, width, dtype=torch.bool, device=device) for _ in placed]
         visible = [torch.zeros_like(mask) for mask in full]
 
@@ -135,19 +136,13 @@ class ImageSource:
             visible[index][there] = shown > MASK_OPACITY
             millimetres = layer.depth[inside] * self.millimetres[placed[index].label]
             depth[there] = torch.where(shown > MASK_OPACITY, millimetres, depth[there])
-        pixels = self._developed(colour, clear, number)
+        background = synthesizer.background.draw(1, height, width, generator, device)
+        background = background if covers is None else covers[0].over(background)
+        sensor = synthesizer.sensor.draw(1, height, width, generator, device)
+        pixels = _developed(seen_by(colour.movedim(-1, 0)[None] + clear * background, sensor)[0])
         parts = zip(placed, layers, full, visible, strict=True)
         shown_objects = tuple(self._shown(item, layer, *masks) for item, layer, *masks in parts)
         return ExportImage(pixels, depth.cpu().numpy(), shown_objects)
-
-    def _developed(self, colour: Tensor, clear: Tensor, number: int) -> UInt8[np.ndarray, "height width 3"]:
-        """Layers over their background, as the camera sees them."""
-        generator, synthesizer = self.generator(number, "pixels"), self.scene.synthesizer
-        (height, width), device = clear.shape, clear.device
-        background = synthesizer.background.draw(1, height, width, generator, device)
-        sensor = synthesizer.sensor.draw(1, height, width, generator, device)
-        image = seen_by(colour.movedim(-1, 0)[None] + clear * background, sensor)[0]
-        return image.clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8).movedim(0, -1).cpu().numpy()
 
     def _layer(self, item: DrawnObject) -> Layer:
         """One object alone, on the part of the plane that it may reach."""
@@ -173,6 +168,11 @@ class ImageSource:
         enough = max(synthesizer.minimum_area, 1.0, synthesizer.min_visibility * alone)
         masks = (part.cpu().numpy() for part in (full, visible))
         return ShownObject(item, *masks, pixels=int(mask.sum()), box=box, labelled=left >= enough)
+
+
+def _developed(image: Float[Tensor, "3 height width"]) -> UInt8[np.ndarray, "height width 3"]:
+    """In 8 bits."""
+    return image.clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8).movedim(0, -1).cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)

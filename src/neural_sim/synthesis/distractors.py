@@ -1,0 +1,171 @@
+"""Things that are no class, pasted behind and in front of the objects: cut-outs, pictures with an alpha channel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from neural_sim.objects.files import content_digest
+
+SUFFIXES = (".png", ".webp", ".tif", ".tiff")
+"""Of formats with an alpha channel."""
+
+
+@dataclass(frozen=True)
+class Cover:
+    """A layer over images: premultiplied colour, sRGB in [0, 1], and opacity."""
+
+    rgb: Float[Tensor, "n h w 3"]
+    opacity: Float[Tensor, "n h w"]
+
+    def select(self, index: Tensor | slice) -> Cover:
+        return Cover(self.rgb[index], self.opacity[index])
+
+    def over(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+        """The layer over images, in their type and on their device."""
+        rgb, opacity = self.rgb.to(images), self.opacity.to(images)
+        return rgb.movedim(-1, 1) + (1.0 - opacity)[:, None] * images
+
+
+@dataclass(frozen=True)
+class Distractors:
+    """Random cut-outs of a folder, at random places and sizes, behind the objects or in front of them.
+
+    Args:
+        root: a folder with pictures that have an alpha channel (png, webp, tif); None: no distractors.
+        count: fewest and most an image.
+        size: smallest and largest longer side, as a fraction of the image's shorter one.
+        front: probability of being in front of the objects, which it then hides.
+
+    Raises:
+        ValueError: no folder, no picture in it, a range that is none, or a probability outside [0, 1].
+    """
+
+    root: str | Path | None = None
+    count: Sequence[int] = (0, 3)
+    size: Sequence[float] = (0.15, 0.6)
+    front: float = 0.3
+
+    def __post_init__(self) -> None:
+        if len(self.count) != 2 or not 0 <= self.count[0] <= self.count[1]:
+            raise ValueError(f"synthesis.distractors.count: want 0 <= fewest <= most, got {list(self.count)}")
+        if len(self.size) != 2 or not 0.0 < self.size[0] <= self.size[1] <= 4.0:
+            raise ValueError(
+                f"synthesis.distractors.size: want 0 < smallest <= largest <= 4, got {list(self.size)}"
+            )
+        if not 0.0 <= self.front <= 1.0:
+            raise ValueError(f"synthesis.distractors.front must lie in [0, 1], got {self.front}")
+        if self._folder is not None and not self._folder.is_dir():
+            raise ValueError(f"synthesis.distractors.root: want a folder of pictures, got {self.root}")
+        if self._folder is not None and not self.files:
+            raise ValueError(f"synthesis.distractors.root: no picture ({', '.join(SUFFIXES)}) in {self.root}")
+
+    @property
+    def _folder(self) -> Path | None:
+        return None if self.root is None else Path(self.root).expanduser()
+
+    @property
+    def used(self) -> bool:
+        """Whether an image may have one."""
+        return self.root is not None and self.count[1] > 0
+
+    @property
+    def hide(self) -> bool:
+        """Whether one may be in front of objects."""
+        return self.used and self.front > 0.0
+
+    @cached_property
+    def files(self) -> list[Path]:
+        """The pictures, by name."""
+        if self._folder is None:
+            return []
+        return sorted(path for path in self._folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+
+    @cached_property
+    def _digest(self) -> str | None:
+        if self._folder is None:
+            return None
+        return content_digest({path.relative_to(self._folder).as_posix(): path for path in self.files})
+
+    def digest(self) -> str | None:
+        """SHA-256 of the pictures' names and contents, for store keys; None without a folder."""
+        return self._digest
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
+    ) -> tuple[Cover, Cover] | None:
+        """What is behind the objects of n images and what is in front of them; None, and no random number is drawn,
+        where there are no distractors.
+
+        Raises:
+            ValueError: a picture that cannot be read or has no alpha channel, with its file.
+        """
+        if not self.used:
+            return None
+        layers = np.zeros((2, n, height, width, 4), dtype=np.float32)
+        fewest, most = self.count
+        counts = torch.randint(fewest, most + 1, (n,), generator=generator).tolist()
+        chosen = torch.randint(len(self.files), (n, most), generator=generator).tolist()
+        uniform = torch.rand((n, most, 4), generator=generator, dtype=torch.float64).tolist()
+        for image, count in enumerate(counts):
+            for file, (size, across, down, side) in zip(chosen[image][:count], uniform[image], strict=False):
+                cutout = self._cutout(file, min(height, width) * self._side(size))
+                _paste(layers[int(side < self.front), image], cutout, across, down)
+        covers = torch.from_numpy(layers).to(device)
+        behind, front = (Cover(layer[..., :3], layer[..., 3]) for layer in covers)
+        return behind, front
+
+    def _side(self, u: float) -> float:
+        return self.size[0] + (self.size[1] - self.size[0]) * u
+
+    def _cutout(self, file: int, side: float) -> Float[np.ndarray, "h w 4"]:
+        """A picture whose longer side has about ``side`` pixels, premultiplied."""
+        picture = self._pictures.get(file)
+        if picture is None:
+            picture = self._pictures[file] = _read(self.files[file])
+        scale = side / max(picture.size)
+        size = max(1, round(scale * picture.width)), max(1, round(scale * picture.height))
+        # "RGBa" is premultiplied, so that the colour of clear pixels does not enter.
+        resized = picture.convert("RGBa").resize(
+            size, Image.Resampling.BOX if scale < 0.5 else Image.Resampling.BILINEAR
+        )
+        return np.asarray(resized, dtype=np.float32) / 255.0
+
+    @cached_property
+    def _pictures(self) -> dict[int, Image.Image]:
+        return {}
+
+
+def _read(path: Path) -> Image.Image:
+    try:
+        picture = Image.open(path)
+        picture.load()
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"{path}: not a readable picture ({error})") from error
+    if not picture.has_transparency_data:
+        raise ValueError(f"{path}: want a picture with an alpha channel, got mode {picture.mode}")
+    return picture.convert("RGBA")
+
+
+def _paste(
+    layer: Float[np.ndarray, "h w 4"], cutout: Float[np.ndarray, "a b 4"], across: float, down: float
+) -> None:
+    """A cut-out over a layer, in place, its centre at a fraction of the layer's width and height."""
+    height, width = layer.shape[:2]
+    high, wide = cutout.shape[:2]
+    left, top = round(across * width - 0.5 * wide), round(down * height - 0.5 * high)
+    x0, x1, y0, y1 = max(0, left), min(width, left + wide), max(0, top), min(height, top + high)
+    if x0 >= x1 or y0 >= y1:
+        return
+    part = cutout[y0 - top : y1 - top, x0 - left : x1 - left]
+    there = layer[y0:y1, x0:x1]
+    there *= 1.0 - part[..., 3:]
+    there += part
