@@ -8,7 +8,7 @@ nox.options.sessions = ["lint", "types", "tests"]
 
 
 def _install(session: nox.Session, editable: bool = True) -> None:
-    """The locked environment, which has the extra `onnx` too, then the project itself without resolving again."""
+    """The locked environment, extras included, then the project itself without resolving again."""
     session.install("-r", "requirements.lock")
     session.install("--no-deps", *(["-e"] if editable else []), ".")
     session.env["OMP_WAIT_POLICY"] = "PASSIVE"

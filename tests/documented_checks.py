@@ -12,7 +12,9 @@ from neural_sim.report.tracking import tracking_uri
 
 def check_of(config):
     """The check of a configuration, which takes the folder and the configuration."""
-    alone = {"predict": _predict, "export": _export, "preflight": _preflight}.get(config["stages"][0])
+    alone = {"predict": _predict, "export": _export, "preflight": _preflight, "viewer": _viewer}.get(
+        config["stages"][0]
+    )
     whole = _run if "report" in config["stages"] else _stored
     return alone or KINDS.get(next((key for key in KINDS if key in config), ""), whole)
 
@@ -103,6 +105,11 @@ def _preflight(folder, config):
     assert report["verdict"] in page and report["worth"] in page
     counts = {gain["photographs"] for gain in report["labelled"]}
     assert bool(counts) == bool(config["target"].get("train_fraction"))
+
+
+def _viewer(folder, config):
+    """usage.md, Looking at fields and bins; what the page shows is checked in tests/report/test_viewer.py."""
+    assert config["viewer"]["seconds"] == 1 and config["viewer"]["psi"] in ("initial", "learned")
 
 
 def _comparison(folder, config):

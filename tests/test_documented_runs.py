@@ -32,6 +32,10 @@ def _exports(command):
     return "stages=[export]" in command.overrides
 
 
+def _reads_psi(command):
+    return _exports(command) or "viewer.psi=learned" in command.overrides
+
+
 class Runs:
     """Runs commands once each, in folders of their own under one root, with one store and one MLflow, whichever of
     the test's processes asks first."""
@@ -44,6 +48,8 @@ class Runs:
         written = command.cut(1) if command.multirun else command.overrides
         kept = [self.data.localise(word) for word in written if not word.startswith("scale=")]
         few = ["export.count=3", "export.width=64", "export.height=48"] if _exports(command) else []
+        if "stages=[viewer]" in command.overrides:
+            kept.append("viewer.seconds=1")
         if few:  # into folders of the test's own
             kept = [f"export.folder={self.root / 'exported'}" if "folder=" in word else word for word in kept]
         return [*kept, *few, "scale=smoke"]
@@ -96,8 +102,8 @@ def test_a_documented_run_runs_and_leaves_what_it_promises(command, runs):
         pytest.skip("no CUDA device")
     if _compares(command):
         _run_what_is_compared(runs, set(configurations[0].compare.experiments))
-    if _exports(command):
-        _run_what_is_exported(runs, command)
+    if _reads_psi(command):
+        _run_what_was_learned(runs, command)
     folder = runs.folder(command)
     folders = [path.parent.parent for path in folder.glob("**/.hydra/config.yaml")]
     assert len(folders) == len(jobs)
@@ -118,9 +124,9 @@ def _run_what_is_compared(runs, experiments):
             runs.folder(command)
 
 
-def _run_what_is_exported(runs, command):
-    """A learned psi is that of the same command without an export."""
-    rest = [word for word in command.overrides if not word.startswith(("stages=", "export."))]
+def _run_what_was_learned(runs, command):
+    """A learned psi is that of the same command without its stage."""
+    rest = [word for word in command.overrides if not word.startswith(("stages=", "export.", "viewer."))]
     if not any(word.startswith("export.psi=") for word in command.overrides):
         runs.folder(next(other for other in ALL if other.overrides == rest and not other.multirun))
 

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from neural_sim.parameter.product import SceneDistribution
 
-KEY = "export.psi"
-
 
 def psi_of_file(
-    path: Path, distribution: SceneDistribution, names: Sequence[str]
+    path: Path, distribution: SceneDistribution, names: Sequence[str], key: str = "export.psi"
 ) -> Float[Tensor, "objects K"]:
     """The psi of a run's folder or its ``results.json`` (the learned one), or of an export's ``psi.json``.
+
+    ``key`` is the setting that named the file.
 
     Raises:
         ValueError: no such file, none of these, or one without an object or a factor, or with other bins.
@@ -27,18 +27,18 @@ def psi_of_file(
     file = path / "results.json" if path.is_dir() else path
     if not file.is_file():
         raise ValueError(
-            f"{KEY}: want learned, initial, target, a run's folder, its results.json or an export's psi.json, got "
+            f"{key}: want learned, initial, target, a run's folder, its results.json or an export's psi.json, got "
             f"{file}, which does not exist"
         )
     try:
-        held = json.loads(file.read_text(encoding="utf-8"))["psi"]
-        rows = [[_numbers(held, name, factor.name) for factor in distribution.factors] for name in names]
+        stored = json.loads(file.read_text(encoding="utf-8"))["psi"]
+        rows = [[_numbers(stored, name, factor.name) for factor in distribution.factors] for name in names]
     except KeyError as error:
         raise ValueError(
-            f"{KEY}: {file} has no psi of {error.args[0]}; want objects {list(names)} with {list(distribution.names)}"
+            f"{key}: {file} has no psi of {error.args[0]}; want objects {list(names)} with {list(distribution.names)}"
         ) from error
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{KEY}: {file} is no results.json or psi.json ({error})") from error
+        raise ValueError(f"{key}: {file} is no results.json or psi.json ({error})") from error
     psi = []
     for name, row in zip(names, rows, strict=True):
         parts = []
@@ -46,18 +46,18 @@ def psi_of_file(
             p = torch.tensor(numbers, dtype=torch.float64)
             if p.shape != (factor.size,) or not bool(p.isfinite().all()) or abs(float(p.sum()) - 1.0) > 1e-4:
                 raise ValueError(
-                    f"{KEY}: {file}: {name}.{factor.name}: want {factor.size} numbers that add up to 1, got {numbers}"
+                    f"{key}: {file}: {name}.{factor.name}: want {factor.size} numbers that add up to 1, got {numbers}"
                 )
             parts.append(factor.psi_of(p))
         psi.append(torch.cat(parts))
     return torch.stack(psi)
 
 
-def _numbers(held: Any, name: str, factor: str) -> list[float]:
+def _numbers(stored: Any, name: str, factor: str) -> list[float]:
     """Of ``results.json``, where a factor has an initial and a target distribution too, or of ``psi.json``."""
-    if name not in held:
+    if name not in stored:
         raise KeyError(name)
-    if factor not in held[name]:
+    if factor not in stored[name]:
         raise KeyError(f"{name}.{factor}")
-    numbers = held[name][factor]
+    numbers = stored[name][factor]
     return [float(value) for value in (numbers["learned"] if isinstance(numbers, dict) else numbers)]
