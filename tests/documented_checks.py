@@ -2,6 +2,7 @@
 
 import html
 import json
+import re
 from pathlib import Path
 
 from mlflow import MlflowClient
@@ -116,10 +117,10 @@ def _comparison(folder, config):
     written = json.loads((folder / "compare.json").read_text())
     tables = {table["setting"]: table for table in written["comparisons"]}
     text = (folder / "compare.md").read_text()
-    assert set(config["compare"]["experiments"]) <= set(tables)
+    assert set(config["compare"]["experiments"]) <= {setting.partition(",")[0] for setting in tables}
     for setting, table in tables.items():
         assert table["methods"][0] == config["compare"]["reference"] and len(table["methods"]) > 1
-        assert (folder / "figures" / f"{setting.replace(', ', '_')}.png").stat().st_size > 5000
+        assert (folder / "figures" / f"{re.sub('[, ]+', '_', setting)}.png").stat().st_size > 5000
         assert all(f"\n| {method} |" in text for method in table["methods"])
     assert "of the gap closed" in text
 

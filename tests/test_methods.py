@@ -57,10 +57,15 @@ def test_every_method_learns_every_parameter(folder, what):
         factors = next(iter(run["psi"].values()))
         assert ("illumination" in factors) == (what in ("illumination", "joint"))
         moved = any(psi["learned"] != psi["initial"] for own in run["psi"].values() for psi in own.values())
-        if run["method"] in HYPERGRADIENTS:  # images are few at smoke scale: all steps may be skipped or rejected
+        if (
+            run["method"] in HYPERGRADIENTS
+        ):  # images are few at smoke scale: all steps may be skipped or rejected
             steps = run["certificates"]
             assert moved == (steps["steps"] > steps["actions"].get("skipped", 0) + steps["rejected"])
-        elif run["method"] not in ("random_search", "bayes_opt"):  # searches may find nothing better than the start
+        elif run["method"] not in (
+            "random_search",
+            "bayes_opt",
+        ):  # searches may find nothing better than the start
             assert moved == (run["method"] != "ns")
         spent = run["curve"][-1]
         assert (spent["images"] > 0) == (run["method"] not in ("ns", "oracle"))

@@ -176,11 +176,16 @@ def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
     """A fraction in percentage points with its interval; with ``sure``, in bold where the interval excludes 0."""
     digits = 0 if unit else 1
-    text = f"{100 * estimate.value:.{digits}f}" + (f" {unit}" if unit else "")
+    text = _hundredfold(estimate.value, digits) + (f" {unit}" if unit else "")
     if estimate.low is None or estimate.high is None:
         return text
     text = f"**{text}**" if sure and estimate.certain else text
-    return f"{text} ({100 * estimate.low:.{digits}f} to {100 * estimate.high:.{digits}f})"
+    return f"{text} ({_hundredfold(estimate.low, digits)} to {_hundredfold(estimate.high, digits)})"
+
+
+def _hundredfold(value: float, digits: int) -> str:
+    """In hundredths, never as a negative zero."""
+    return f"{100 * value:z.{digits}f}"
 
 
 def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:

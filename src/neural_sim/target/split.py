@@ -56,10 +56,19 @@ def for_training(
 
     ``groups`` are those of all rows; no group is in both parts, see :func:`split`. Which rows are scored does not
     depend on the fraction.
+
+    Raises:
+        ValueError: rows of a single group, which cannot be split.
     """
     if fraction is None:
         return {"val": list(val)}
-    train, rest = split([groups[row] for row in val], fraction, generator, ("training", "validation"))
+    own = [groups[row] for row in val]
+    if len(set(own)) < 2:
+        raise ValueError(
+            f"target.train_fraction takes whole groups of the images that are not scored, and those are of one, "
+            f"{own[0]!r}; want a larger target.val_fraction, which is the part that is not scored, or smaller groups"
+        )
+    train, rest = split(own, fraction, generator, ("training", "validation"))
     return {"train": [val[row] for row in train.tolist()], "val": [val[row] for row in rest.tolist()]}
 
 
