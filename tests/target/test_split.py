@@ -91,5 +91,5 @@ def test_what_is_not_scored_is_divided_into_whole_groups() -> None:
     assert sorted(parts["train"] + parts["val"]) == val and len(parts["train"]) == 6
     assert not {groups[row] for row in parts["train"]} & {groups[row] for row in parts["val"]}
     assert for_training(val, groups, None, seeded(2)) == {"val": val}
-    with pytest.raises(ValueError, match="those are of one, 0; want a larger target.val_fraction"):
+    with pytest.raises(ValueError, match=r"those are of one, 0; want a larger target\.val_fraction"):
         for_training([0, 1, 2], groups, 0.4, seeded(2))

@@ -175,15 +175,15 @@ def _params(path: Path, weights: Mapping[str, Any], file: Path) -> Parameters:
 
 def _normalisation(detector: Detector) -> dict[str, list[float]] | None:
     """What the detector does to images in [0, 1], where it says so."""
-    held = getattr(detector, "normalisation", None)
-    return None if held is None else {key: list(values) for key, values in held.items()}
+    stored = getattr(detector, "normalisation", None)
+    return None if stored is None else {key: list(values) for key, values in stored.items()}
 
 
-def _check_normalisation(held: Any, detector: Detector, file: Path) -> None:
+def _check_normalisation(stored: Any, detector: Detector, file: Path) -> None:
     wanted = _normalisation(detector)
-    if held != wanted:
+    if stored != wanted:
         raise ValueError(
-            f"{file}: image.normalisation: want {wanted}, as this version's detector has it, got {held}"
+            f"{file}: image.normalisation: want {wanted}, as this version's detector has it, got {stored}"
         )
 
 

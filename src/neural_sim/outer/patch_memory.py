@@ -77,15 +77,15 @@ class PatchMemory:
         for label, name in enumerate(loop.scene.names):
             one = _Image.of(loop, label, estimator, seed)
             truth = one.forward()
-            held = one.peak(lambda one=one: one.render(tangents=True)) - one.output_mb()
+            megabytes = one.peak(lambda one=one: one.render(tangents=True)) - one.output_mb()
             spent = self._timed(one.forward, one.device)
-            rows.append(PatchCost(name, FORWARD, None, held, totals[ahead], *spent, 0.0))
+            rows.append(PatchCost(name, FORWARD, None, megabytes, totals[ahead], *spent, 0.0))
             for patch, other in reverse:
                 run = functools.partial(one.reverse, patch)
                 spent = self._timed(lambda one=one, run=run: (one.render(tangents=False), run()), one.device)
                 method = WHOLE if patch == pixels else f"reverse, patches of {patch}"
-                held, off = one.peak(run), _apart(run(), truth)
-                rows.append(PatchCost(name, method, patch, held, totals[other], *spent, off))
+                megabytes, off = one.peak(run), _apart(run(), truth)
+                rows.append(PatchCost(name, method, patch, megabytes, totals[other], *spent, off))
         return rows
 
     def _total(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> float:

@@ -27,12 +27,12 @@ def peak_bytes(run: Callable[[], object], device: torch.device | None = None) ->
         return torch.cuda.max_memory_allocated(device) - before
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
         run()
-    held, most = 0, 0
+    current, most = 0, 0
     kineto = record.profiler.kineto_results if record.profiler is not None else None
     events = [event for event in kineto.events() if event.name() == "[memory]"] if kineto is not None else []
     if not events:
         raise RuntimeError("the profiler recorded no allocation")
     for event in sorted(events, key=lambda event: event.start_ns()):
-        held += event.nbytes()  # pyright: ignore[reportAttributeAccessIssue]
-        most = max(most, held)
+        current += event.nbytes()  # pyright: ignore[reportAttributeAccessIssue]
+        most = max(most, current)
     return most

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 ONNX = "model.onnx"
 CHECKED = 50
-"""Test images on which onnxruntime is held against torch."""
+"""Test images on which onnxruntime is compared with torch."""
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ class HeldOut:
     scores: Mapping[str, Mapping[str, float]]
 
 
-def held_out_table(held: Sequence[HeldOut]) -> str:
+def held_out_table(objects: Sequence[HeldOut]) -> str:
     """Markdown: PSNR of whole images and of the object's pixels, by object and their mean."""
-    sources = list(held[0].scores)
+    sources = list(objects[0].scores)
     lines = [
         "PSNR on held-out views in dB, whole images over white, and of the pixels that show the object.",
         "",
@@ -34,7 +34,7 @@ def held_out_table(held: Sequence[HeldOut]) -> str:
     ]
     rows = {
         each.object: [each.scores[s][key] for s in sources for key in ("psnr", "psnr_foreground")]
-        for each in held
+        for each in objects
     }
     rows["mean"] = np.mean(list(rows.values()), 0).tolist()
     return "\n".join(
@@ -42,12 +42,12 @@ def held_out_table(held: Sequence[HeldOut]) -> str:
     )
 
 
-def held_out_figure(held: Sequence[HeldOut]) -> Figure:
+def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
     """A column for each object, a row for its view and for each source."""
-    rows = list(held[0].images)
-    figure = Figure(figsize=(1.6 * len(held) + 0.5, 1.75 * len(rows) + 0.5), layout="constrained")
-    grid = figure.subplots(len(rows), len(held), squeeze=False)
-    for column, each in enumerate(held):
+    rows = list(objects[0].images)
+    figure = Figure(figsize=(1.6 * len(objects) + 0.5, 1.75 * len(rows) + 0.5), layout="constrained")
+    grid = figure.subplots(len(rows), len(objects), squeeze=False)
+    for column, each in enumerate(objects):
         for line, name in enumerate(rows):
             axes = grid[line, column]
             axes.imshow(each.images[name].clamp(0.0, 1.0).cpu().numpy())

@@ -33,8 +33,8 @@ def view_size_for(
     nearest = drawn["distance"].low if "distance" in drawn else distribution.ranges["distance"][0]
     longest = drawn["magnification"].high if "magnification" in drawn else 1.0
     wanted = focal_length(camera) * longest * largest_radius / nearest  # pixels for a radius
-    held = focal_length(views.camera(1)) / views.distance_range[0]  # by each pixel of the views' side
-    return math.ceil(wanted / held)
+    seen = focal_length(views.camera(1)) / views.distance_range[0]  # by each pixel of the views' side
+    return math.ceil(wanted / seen)
 
 
 def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:

@@ -71,7 +71,7 @@ class SfmVsNerfStep:
             raise ValueError("sfm_vs_nerf: want views.held_out of at least 1, got 0")
         stages = tuple(ReconstructionStage(views, self.resolution) for views in graphs[0].views)
         meshes = self._meshes(graphs[0], stages, results)
-        held = [self._held_out(graphs[0], results, i, mesh) for i, mesh in enumerate(meshes)]
+        objects = [self._held_out(graphs[0], results, i, mesh) for i, mesh in enumerate(meshes)]
 
         def sources(graph: Graph) -> dict[str, DetectorStage]:
             nerf = graph.synthetic(graph.psi("target"), "images of the fields")
@@ -79,12 +79,12 @@ class SfmVsNerfStep:
             return {"nerf": nerf, "sfm": trained_on(nerf, ReconstructionDetectorStage, **more)}
 
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)
-        scores = {each.object: dict(each.scores) for each in held}
+        scores = {each.object: dict(each.scores) for each in objects}
         run = report_side_by_side(
             found, pairs(graphs[0], results, sources(graphs[0]), self.shown), names,
             "Detectors trained on images of fields (nerf) and of meshes reconstructed from the same views (sfm).",
             x.run.name, x.config, context.uri, context.folder, begun,
-            {"held_out": scores}, held_out_table(held), {"held_out": held_out_figure(held)},
+            {"held_out": scores}, held_out_table(objects), {"held_out": held_out_figure(objects)},
         )  # fmt: skip
         print(f"results: {context.folder}\n{run.where}")
 
@@ -102,14 +102,14 @@ class SfmVsNerfStep:
     def _held_out(self, graph: Graph, results: Results, label: int, mesh: Subject) -> HeldOut:
         """Held-out views of an object, as they are, by its field, and by its reconstruction."""
         views = results(graph.views[label])
-        held = views.select(torch.arange(len(views) - graph.views[label].held_out, len(views)))
+        unseen = views.select(torch.arange(len(views) - graph.views[label].held_out, len(views)))
         renderer = graph.experiment.imaging.renderer
         field = FieldSubject(mesh.name, results(graph.fields[label]).field, renderer=renderer)
         shown: Mapping[str, Subject] = {"nerf": field, "sfm": mesh}
-        rendered = {name: _premultiplied(each, held) for name, each in shown.items()}
-        scores = {name: compare(image, held.images) for name, image in rendered.items()}
-        alpha = held.images[..., 3:]
-        rendered = {"view": torch.cat([held.images[..., :3] * alpha, alpha], -1), **rendered}
+        rendered = {name: _premultiplied(each, unseen) for name, each in shown.items()}
+        scores = {name: compare(image, unseen.images) for name, image in rendered.items()}
+        alpha = unseen.images[..., 3:]
+        rendered = {"view": torch.cat([unseen.images[..., :3] * alpha, alpha], -1), **rendered}
         over_white = {name: image[0, ..., :3] + 1.0 - image[0, ..., 3:] for name, image in rendered.items()}
         return HeldOut(mesh.name, over_white, scores)
 

@@ -111,7 +111,7 @@ def condition_numbers(scope: Scope) -> Checks:
     residual as k^2 eps (Sleijpen, van der Vorst and Modersitzki 2000): beyond k = 1 / sqrt(eps) it may stop
     with STAGNATED instead, no worse than zero; LEAST_SQUARES would be a false claim here.
 
-    float32 is held against the float64 solution of the very same rounded system. Where its bound exceeds 1 no digit is
+    float32 is compared with the float64 solution of the very same rounded system. Where its bound exceeds 1 no digit is
     promised, and the claim must be honest: converged only if the float64 residual is below rtol and the rounding of
     one product, n eps |A| |x| / |b|.
     """
