@@ -161,7 +161,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
               "include the warm start, whose backbone every loop trains on; fields, which all methods share, and the "
               "labelled validation images are not counted. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
-              " iterations linear in log seconds.", ""]  # fmt: skip
+              "iterations linear in log seconds.", ""]  # fmt: skip
     lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]
     lines += ["|---|" + "---|" * (1 + len(c.methods))]
     return "\n".join(lines + _distances(c, runs))

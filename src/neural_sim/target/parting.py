@@ -63,8 +63,8 @@ class Parting:
     def _warn_of_duplicates(
         self, photos: Sequence[Looks], one: Sequence[int], other: Sequence[int], first: str, second: str
     ) -> None:
-        thumbnails = [torch.stack([photos[row].thumbnail for row in rows]) for rows in (one, other)]
-        duplicates = near_duplicates(*thumbnails)
+        left, right = (torch.stack([photos[row].thumbnail for row in rows]) for rows in (one, other))
+        duplicates = near_duplicates(left, right)
         if duplicates.test:
             _log.warning(
                 "%s: %d of %d %s images look like one of %s (%s like %s); if they are of one video, scene or "
