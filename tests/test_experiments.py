@@ -25,7 +25,7 @@ STUDIES = [name for name, text in FILES.items() if "MULTIRUN" in text]
 
 
 def labels(name, shared):
-    """What an experiment wants beside ``paths.data``, where it has no photographs of its own or they are not at hand."""
+    """What an experiment wants beside ``paths.data``, where that has no photographs for it."""
     given = {
         "detection_gallery": f"target.annotations={shared / 'ycb_in_the_wild' / 'annotations.json'}",
         "objectnet": f"target.root={shared / 'objectnet'}",
