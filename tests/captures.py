@@ -72,6 +72,7 @@ def capture(
     renderer: MeshRenderer | None = None,
     distance: tuple[float, float] = (2.8, 3.6),
     suffix: str = ".png",
+    distortion: dict[str, float] = DISTORTION,
 ) -> Made:
     """``count`` photographs under ``folder / name``; the object, of radius ``scale``, stands somewhere in a frame whose
     up is -y, as COLMAP's often is. ``pose_noise`` is the deviation of the written positions from the true ones in
@@ -93,7 +94,7 @@ def capture(
     poses[:, :3, :3] = poses[:, :3, :3] @ wobble
     focal = 1.15 * max(width, height)
     k = {"fl_x": focal, "fl_y": 0.98 * focal, "cx": 0.5 * width + 4.3, "cy": 0.5 * height - 3.1, "w": width,
-         "h": height, **DISTORTION}  # fmt: skip
+         "h": height, **distortion}  # fmt: skip
     mesh = item.mesh.copy()
     mesh.apply_transform(_similarity(scale * turned, centre))
     home = folder / name

@@ -13,6 +13,7 @@ import torch
 import trimesh
 from captures import capture
 from documented import PAGES, ROOT
+from made_photographs import co3d, objectnet, photographs_by_class
 from omegaconf import OmegaConf
 from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
@@ -232,6 +233,9 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycbv": bop_scenes,
     "/data/photos": backgrounds,
     "/data/val": coco_photographs,
+    "/data/by_class": photographs_by_class,
+    "/data/objectnet": objectnet,
+    "/data/co3d": co3d,
     "/data/shelf/captures": captures,
     "/data/shelf/labels.json": labels,
     "/data/shelf/new": backgrounds,
@@ -251,10 +255,15 @@ class MadeData:
 
     @property
     def shared(self) -> Path:
-        """A folder for ``paths.data``, with ycb/, ycb_in_the_wild/ and ycb_video_sample/ in it."""
+        """A folder for ``paths.data``, with ycb/, ycb_in_the_wild/, ycb_video_sample/ and objectnet/ in it."""
         self.localise("objects.root=../shared/ycb")
         root = self.made[ycb].parent
-        for make, folder in ((in_the_wild, "ycb_in_the_wild"), (ycb_video_sample, "ycb_video_sample")):
+        parts = (
+            (in_the_wild, "ycb_in_the_wild"),
+            (ycb_video_sample, "ycb_video_sample"),
+            (objectnet, "objectnet"),
+        )
+        for make, folder in parts:
             if make not in self.made:
                 self.made[make] = make(root / folder)
         return root

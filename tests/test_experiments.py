@@ -25,9 +25,12 @@ STUDIES = [name for name, text in FILES.items() if "MULTIRUN" in text]
 
 
 def labels(name, shared):
-    """What an experiment that has no photographs of its own wants beside ``paths.data``."""
-    given = f"target.annotations={shared / 'ycb_in_the_wild' / 'annotations.json'}"
-    return [given] if name == "detection_gallery" else []
+    """What an experiment wants beside ``paths.data``, where that has no photographs for it."""
+    given = {
+        "detection_gallery": f"target.annotations={shared / 'ycb_in_the_wild' / 'annotations.json'}",
+        "objectnet": f"target.root={shared / 'objectnet'}",
+    }
+    return [given[name]] if name in given else []
 
 
 def composed(*overrides):
@@ -105,6 +108,31 @@ def test_without_photographs_the_line_names_the_file_and_its_key(shared, tmp_pat
     ) as caught:
         made("+experiment=ycb_in_the_wild", f"paths.data={shared}", missing)
     assert "\n" not in str(caught.value)
+
+
+def test_without_photographs_by_class_the_line_names_the_folder_and_its_key(shared, tmp_path):
+    with pytest.raises(
+        UserError, match=rf"no such folder: {tmp_path}.*; put photographs there, a folder"
+    ) as caught:
+        made("+experiment=objectnet", f"paths.data={shared}", f"target.root={tmp_path / 'photos'}")
+    assert "\n" not in str(caught.value) and "target.root" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_classification_of_photographs_runs_and_its_results_go_on_the_page(shared, tmp_path):
+    store = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={tmp_path / 'mlflow.db'}", "scale=smoke"]
+    _run(
+        "+experiment=objectnet",
+        *store,
+        f"paths.data={shared}",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        "progress=false",
+    )
+    _run("+experiment=experiments_table", "experiments.only=[objectnet]", "experiments.draws=5", *store,
+         f"hydra.run.dir={tmp_path / 'page'}")  # fmt: skip
+    (row,) = json.loads((tmp_path / "page" / "experiments.json").read_text())["rows"].values()
+    assert "mean accuracy of NSO" in row["ours"][0]
+    assert "| mean accuracy |" in (tmp_path / "page" / "experiments.md").read_text()
 
 
 @pytest.mark.parametrize(

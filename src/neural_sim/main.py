@@ -71,6 +71,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         accelerator=plain["trainer"]["accelerator"],
         progress=plain["progress"],
         score_at=tuple(plain["score_at"]),
+        task=plain["task"],
     )
     images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
     imaging = Imaging(**images, camera=_camera(parts), distribution=_product(parameters, parts))

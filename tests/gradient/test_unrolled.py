@@ -8,6 +8,7 @@ import pytest
 import torch
 from recorded_training import DOUBLE, EXACT, NAMES, RULES, SHAPE, STEP, Micro, extrapolated
 
+from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.settings import Backbone, Head
@@ -60,6 +61,29 @@ def test_it_is_that_of_the_same_training_of_an_anchor_free_detector(rule, genera
     # SGD's derivative is small here, so that rounding wants a longer step; AdamW bends within a shorter one.
     step = STEP / 10 if isinstance(rule, AdamW) else 10 * STEP
     assert found == pytest.approx(extrapolated(outcome, step), rel=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
+@pytest.mark.parametrize("wanted", ["weights", "inputs"])
+def test_it_is_that_of_the_same_training_of_a_classifier(rule, wanted, generator):
+    """By the weights of images, and by their pooled features; the box says nothing and has no derivative."""
+    problem = Micro(detector=Classifier(3, 32, Backbone("micro")))
+    features, box = problem.cached.inputs
+    weight = torch.randn(8, generator=generator, dtype=DOUBLE)
+    move = torch.randn(features.shape, generator=generator, dtype=DOUBLE) * (wanted == "inputs")
+    found = problem.accumulated(rule, wanted=wanted)
+    along = float(found.images @ weight)
+    if wanted == "inputs":
+        along += float((found.inputs[0] * move).sum())
+        assert not found.inputs[1].any()
+
+    def outcome(step):
+        moved = Examples((features + step * move, box), problem.examples.losses)
+        weights = 1.0 + step * weight
+        examples = Examples(moved.inputs, lambda p, x, rows: weights[rows] * moved.losses(p, x, rows))
+        return problem.outer(problem.trained(rule, examples).end)
+
+    assert along == pytest.approx(extrapolated(outcome, 10 * STEP), rel=1e-6)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)

@@ -5,7 +5,9 @@ import torch
 from small_loop import TINY
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.smooth_accuracy import SmoothAccuracy
 from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.outer.objective import Objective
 from neural_sim.solver.flatten import flatten, unflatten
@@ -17,20 +19,21 @@ def made(scene, generator):
     """An objective in float64, and a detector's trained part after a little noise."""
 
     def make(kind):
-        detector = RetinaNet(**TINY)
+        detector = Classifier(2, 32) if kind == "accuracy" else RetinaNet(**TINY)
         images = scene.training_set(torch.zeros(2, 4), 5, generator).images
         backbone, trainable = detector.split(detector.init(generator))
         noisy = {
             k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double()
             for k, v in trainable.items()
         }
-        objective = Objective(CachedSet.of(detector, backbone, images), images, kind, SmoothAP())
+        smooth = SmoothAccuracy() if kind == "accuracy" else SmoothAP()
+        objective = Objective(CachedSet.of(detector, backbone, images), images, kind, smooth)
         return objective.double(), noisy
 
     return make
 
 
-@pytest.mark.parametrize("kind", ["loss", "average_precision"])
+@pytest.mark.parametrize("kind", ["loss", "average_precision", "accuracy"])
 def test_its_slope_is_that_of_central_differences(made, kind, generator):
     objective, params = made(kind)
     slope = gradient(objective.terms(), params)
@@ -45,8 +48,9 @@ def test_its_slope_is_that_of_central_differences(made, kind, generator):
     assert float(slope @ along) == pytest.approx((value(1e-6) - value(-1e-6)) / 2e-6, rel=1e-5)
 
 
-def test_scores_add_up_to_what_psi_lowers(made):
-    objective, params = made("average_precision")
+@pytest.mark.parametrize("kind", ["average_precision", "accuracy"])
+def test_scores_add_up_to_what_psi_lowers(made, kind):
+    objective, params = made(kind)
     with torch.no_grad():
         whole = float(sum(term(params) for term in objective.terms()))
     assert float(objective.scores(objective.outputs(params)).sum(1).mean()) == pytest.approx(

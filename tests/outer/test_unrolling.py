@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
@@ -161,10 +162,16 @@ def test_unrolling_wants_a_training_in_every_iteration(settings):
 
 
 @pytest.mark.parametrize("adjoint", ["unrolled", "implicit"])
-def test_an_anchor_free_detector_goes_through_the_same_loop(scene, adjoint):
-    """With the smooth AP as the objective, whose ranks count its centre-ness, and checked steps."""
-    estimator, generator = StratifiedEstimator(probes_per_bin=2), torch.Generator().manual_seed(0)
-    detector, psi = Fcos(2, 32, Backbone("micro"), Head(8, 1)), torch.zeros(2, 4)
+@pytest.mark.parametrize(
+    ("kind", "estimator"), [("fcos", ESTIMATORS[2]), *(("classifier", each) for each in ESTIMATORS)]
+)
+def test_detectors_of_other_kinds_go_through_the_same_loop(scene, adjoint, kind, estimator):
+    """With checked steps, and the smooth score as the objective: AP, whose ranks count FCOS's centre-ness, or a
+    classifier's accuracy."""
+    generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
+    detector = {
+        "fcos": Fcos(2, 32, Backbone("micro"), Head(8, 1)), "classifier": Classifier(2, 32, Backbone("micro")),
+    }[kind]  # fmt: skip
     settings = Outer(
         Mirror(),
         iterations=2,
@@ -172,6 +179,7 @@ def test_an_anchor_free_detector_goes_through_the_same_loop(scene, adjoint):
         epochs=2,
         pool_per_bin=2,
         adjoint=adjoint,
+        objective="accuracy" if kind == "classifier" else "average_precision",
         on_untrusted="keep",
     )
     inner = InnerLoop(

@@ -1,11 +1,12 @@
-"""AP from matches against faster-coco-eval, on random detections and on resampled sets."""
+"""AP from matches against faster-coco-eval, accuracy against torchmetrics', on random detections and resampled sets."""
 
 import numpy as np
 import pytest
 import torch
+from torchmetrics.classification import MulticlassAccuracy
 
 from neural_sim.detector.metrics import evaluate
-from neural_sim.report.bootstrap import average_precision, match
+from neural_sim.report.bootstrap import average_precision, class_score, match
 from neural_sim.types import LabelledImages
 
 
@@ -52,3 +53,19 @@ def test_no_boxes_is_nan_and_no_detections_is_zero():
     nothing = [{"boxes": torch.zeros(0, 4), "scores": torch.zeros(0), "labels": torch.zeros(0).long()}]
     assert average_precision(match(nothing, images, 0)) == 0.0
     assert np.isnan(average_precision(match(nothing, images, 1)))
+
+
+def test_accuracy_under_weights_is_torchmetrics_of_repeated_images(generator):
+    count, whole = 40, torch.tensor([[0.0, 0, 8, 8]])
+    truth, said = (torch.randint(0, 3, (count,), generator=generator) for _ in range(2))
+    boxes = torch.tensor([1.0, 1, 5, 5]).expand(count, 1, 4)
+    images = LabelledImages(torch.zeros(count, 3, 8, 8), boxes, truth[:, None], torch.zeros(count).long())
+    found = [{"boxes": whole, "scores": torch.ones(1), "labels": label[None]} for label in said]
+    times = torch.randint(0, 4, (count,), generator=generator)
+    index = torch.arange(count).repeat_interleave(times)
+    for rows, weights in ((torch.arange(count), None), (index, times.double().numpy())):
+        wanted = MulticlassAccuracy(3, average=None)(said[rows], truth[rows]).tolist()
+        ours = [class_score(match(found, images, label, "accuracy"), weights) for label in range(3)]
+        assert ours == pytest.approx(wanted, abs=1e-6)
+    assert np.isnan(class_score(match(found, images, 3, "accuracy")))
+    assert class_score(match(found, images, 0)) == average_precision(match(found, images, 0))

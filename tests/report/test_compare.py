@@ -100,6 +100,28 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
     assert own.status == "FINISHED" and {"compare.md", "compare.json", "figures"} <= own.files
 
 
+def test_classifiers_are_compared_by_accuracy(uri, tmp_path):
+    """Four of eight images are right, and six by the reference, whatever the boxes."""
+    for method, found in (("neural_sim", 6), ("lts", 4)):
+        run = tmp_path / method
+        run.mkdir()
+        held = results(method, 0, found / 8, score="accuracy")
+        (run / "results.json").write_text(json.dumps(held))
+        written = detections(found)
+        for row in written["learned"]:
+            row["bbox"] = [0.0, 0.0, 64.0, 64.0]
+        (run / "detections.json").write_text(json.dumps(written))
+        tracking.log_run(uri, "gap", method, {}, {}, {}, {}, run)
+    (comparison,) = Compare(("gap",), draws=20).compare(uri, 0, {}, tmp_path / "compare")
+    assert (comparison.ap["neural_sim"].value, comparison.ap["lts"].value) == (0.75, 0.5)
+    ahead = comparison.ahead["lts"]
+    assert ahead.value == 0.25 and 0.0 <= ahead.low < 0.25 < ahead.high <= 0.75
+    text, page = ((tmp_path / "compare" / name).read_text() for name in ("compare.md", "report.html"))
+    assert "Top-1 accuracy of mug in points" in text and "| method | accuracy |" in text
+    assert "neural_sim reaches 75.0 points of accuracy" in page
+    assert "AP" not in text and "<th>AP" not in page
+
+
 def test_two_ways_of_scoring_are_two_tables_whose_headings_say_how_they_differ(database, tmp_path):
     found = Compare(("gap",), reference="lts", draws=5).compare(database, 0, {"name": "compare"}, tmp_path)
     assert [comparison.methods for comparison in found] == [("lts",), ("lts", "neural_sim")]

@@ -77,6 +77,33 @@ def test_summary_names_every_method_and_object(results):
         assert word in text
 
 
+def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tmp_path):
+    scores = {"accuracy": 0.5, "per_class": {"a": 0.6, "b": float("nan")}}
+    point = {"iteration": 1, "images": 9, "seconds": 2.0, "ap": scores}
+    found = dataclasses.replace(results, score="accuracy", ap={"learned": scores}, curve=[point])
+    lines = found.summary().splitlines()
+    assert lines[0].startswith("accuracy on the test set") and lines[1].split() == [
+        "learned",
+        "60.0",
+        "nan",
+        "50.0",
+    ]
+    assert (
+        "accuracy on the validation images, learned: 25.0" in found.summary() and "AP" not in found.summary()
+    )
+    held = json.loads(write_results(found, tmp_path / "run").read_text())
+    assert held["score"] == "accuracy" and held["ap"]["learned"]["accuracy"] == 0.5
+    assert json.loads(write_results(results, tmp_path / "other").read_text())["score"] == "AP"
+    with live(uri, found) as run:
+        run.finish(found, tmp_path / "run")
+    (tracked,) = logged.runs(uri, "pose_gap")
+    metrics = MlflowClient(uri).get_run(tracked.run_id).data.metrics
+    assert metrics["evaluate/learned/accuracy"] == 0.5 and metrics["evaluate/learned/accuracy_a"] == 0.6
+    assert steps(uri, tracked.run_id, "curve/biased_accuracy_by_images") == {9: 0.6}
+    assert metrics["validation_accuracy"] == 0.25
+    assert not any("ap" in key.replace("/", "_").split("_") for key in metrics)
+
+
 def test_figures_are_written(results, tmp_path):
     images = LabelledImages(
         torch.rand(3, 3, 16, 16),

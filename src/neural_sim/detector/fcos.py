@@ -14,8 +14,9 @@ from torchvision.ops import clip_boxes_to_image
 from neural_sim.detector.backbones import group_norm
 from neural_sim.detector.losses import focal_loss
 from neural_sim.detector.network import fixed_anchors
+from neural_sim.detector.on_backbone import check_common
 from neural_sim.detector.protocol import Outputs
-from neural_sim.detector.pyramid import PyramidDetector, check_common
+from neural_sim.detector.pyramid import PyramidDetector
 from neural_sim.detector.settings import Anchors, Backbone, Detections, Head, Points, check
 from neural_sim.detector.targets import Targets, assign_points
 

@@ -15,7 +15,7 @@ def initialise(
 
     Convolutions with a bias start at standard deviation 0.01 in a predictor's ``head``, and the bias of its layer
     ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1); others keep the variance of their
-    input, as torchvision's do.
+    input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017, Sec. 5.1).
     """
     state = {name: value.detach().clone() for name, value in module.state_dict().items()}
     for name, part in module.named_modules():
@@ -28,6 +28,9 @@ def initialise(
             state[f"{prefix}weight"].normal_(0.0, std, generator=generator)
             if name.endswith(".cls_logits") and prior_probability is not None:
                 state[f"{prefix}bias"].fill_(-math.log((1 - prior_probability) / prior_probability))
+        elif isinstance(part, nn.Linear):
+            state[f"{prefix}weight"].normal_(0.0, 0.01, generator=generator)
+            state[f"{prefix}bias"].zero_()
         elif isinstance(part, nn.GroupNorm):
             state[f"{prefix}weight"].fill_(1.0)
             state[f"{prefix}bias"].zero_()

@@ -1,13 +1,18 @@
-"""Average precision by the COCO definitions."""
+"""What predictions are scored by: average precision by the COCO definitions, or top-1 accuracy."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import torch
+from jaxtyping import Int
 from torch import Tensor
 from torchmetrics.detection import MeanAveragePrecision
 
+from neural_sim.detector.classifier import class_of
+from neural_sim.detector.protocol import Score
 from neural_sim.types import LabelledImages
 
 
@@ -21,14 +26,52 @@ class AveragePrecision:
     per_class: dict[str, float]
     per_class_ap50: dict[str, float]
 
+    @property
+    def mean(self) -> float:
+        """Over classes."""
+        return self.ap
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """``accuracy`` is the mean over classes of the fraction of a class's images whose best class is right; by class
+    name, too. A class without an image is nan and stays out of the mean."""
+
+    accuracy: float
+    per_class: dict[str, float]
+
+    @property
+    def mean(self) -> float:
+        """Over classes."""
+        return self.accuracy
+
+
+TestScore = AveragePrecision | Accuracy
+IN_FULL: dict[Score, str] = {"AP": "AP (0.50 to 0.95)", "accuracy": "Top-1 accuracy"}
+"""Scores as tables call them."""
+
+
+def of_document(document: Mapping[str, Any]) -> TestScore:
+    """The score whose fields a document has, such as results.json or the store keeps."""
+    return AveragePrecision(**document) if "ap" in document else Accuracy(**document)
+
+
+def mean_of(document: Mapping[str, Any]) -> float:
+    """The mean over classes of such a document."""
+    return document["ap"] if "ap" in document else document["accuracy"]
+
 
 def evaluate(
-    predictions: Sequence[dict[str, Tensor]], images: LabelledImages, class_names: Sequence[str]
-) -> AveragePrecision:
-    """Average precision of ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
+    predictions: Sequence[dict[str, Tensor]],
+    images: LabelledImages,
+    class_names: Sequence[str],
+    score: Score = "AP",
+) -> TestScore:
+    """The score of ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
 
     Raises:
-        ValueError: where there are no images, predictions and images differ in number, or a label has no name.
+        ValueError: where there are no images, predictions and images differ in number, a label has no name, or an image
+            whose accuracy is asked for has objects of two classes.
     """
     if len(images) == 0:
         raise ValueError("evaluate: got no images, want at least one")
@@ -39,6 +82,8 @@ def evaluate(
     labels = images.labels[images.present]
     if labels.numel() and int(labels.max()) >= len(class_names):
         raise ValueError(f"evaluate: label {int(labels.max())} has no name among {list(class_names)}")
+    if score == "accuracy":
+        return _accuracy(predictions, images, class_names)
     truth = [
         {"boxes": boxes[present].float().cpu(), "labels": label[present].cpu()}
         for boxes, label, present in zip(images.boxes, images.labels, images.present, strict=True)
@@ -52,6 +97,21 @@ def evaluate(
         dict(zip(class_names, per_class, strict=True)),
         dict(zip(class_names, per_class_50, strict=True)),
     )
+
+
+def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:
+    """The class of each image's best prediction, -1 without one."""
+    best = [p["labels"][p["scores"].argmax()] if len(p["scores"]) else -1 for p in predictions]
+    return torch.tensor([int(label) for label in best])
+
+
+def _accuracy(
+    predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, class_names: Sequence[str]
+) -> Accuracy:
+    own, best = class_of(images.labels.cpu()), best_classes(predictions)
+    right = [(best == label)[own == label].double().mean() for label in range(len(class_names))]
+    per_class = [float(value) for value in right]  # the mean of nothing is nan
+    return Accuracy(_mean(per_class), dict(zip(class_names, per_class, strict=True)))
 
 
 def _single(value: Tensor) -> Tensor:

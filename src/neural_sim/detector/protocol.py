@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -16,7 +17,16 @@ from neural_sim.detector.settings import Detections
 from neural_sim.detector.targets import Targets
 
 Parameters = dict[str, Tensor]
+Score = Literal["AP", "accuracy"]
+"""What predictions are scored by: average precision (COCO's), or top-1 accuracy of each image's best class."""
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
+
+
+def score_of(make: Callable[..., Detector]) -> Score:
+    """What the detectors of a constructor, as ``conf/detector`` makes it, are scored by."""
+    while isinstance(make, functools.partial):
+        make = make.func
+    return getattr(make, "score", "AP")
 
 
 @dataclass(frozen=True)
@@ -45,13 +55,15 @@ class Detector(ABC):
     - ``detections``: which predictions are detections;
     - ``anchors_per_level``: how many anchors each level has, of which the best candidates are taken level by level;
       None: one level;
-    - ``normalisation``: what features do first to the channels of images, for model files.
+    - ``normalisation``: what features do first to the channels of images, for model files;
+    - ``score``: what its predictions are scored by.
 
     "Anchors" are the places that outputs belong to, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
     defines the abstract methods; docs/extending.md has an example.
     """
 
     normalisation: ClassVar[Mapping[str, tuple[float, ...]] | None] = None
+    score: ClassVar[Score] = "AP"
     num_classes: int
     image_size: tuple[int, int]
     proximal: float = 0.0

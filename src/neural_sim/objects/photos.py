@@ -48,11 +48,7 @@ class Photos:
         size: float | Mapping[str, float] | None = None,
     ) -> None:
         self.root = folder_of(root)
-        captures = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
-        if not captures:
-            raise ValueError(
-                f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
-            )
+        captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
         self.up, self.size = up, size
@@ -61,16 +57,26 @@ class Photos:
             self.radius(name)
         _ = self.captures  # errors in a file are raised here, not in a later stage
 
+    def _found(self) -> dict[str, Path]:
+        """The captures' folders below the root, by the names of their objects."""
+        captures = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
+        if not captures:
+            raise ValueError(
+                f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
+            )
+        return captures
+
+    def _read(self, name: str) -> Capture:
+        folder = self._folders[name]
+        return (read_transforms if has_transforms(folder) else read_colmap)(folder, name)
+
     def names(self) -> list[str]:
         return list(self._folders)
 
     @cached_property
     def captures(self) -> dict[str, Capture]:
         """Frames and cameras by object; photographs are not read."""
-        return {
-            name: (read_transforms if has_transforms(folder) else read_colmap)(folder, name)
-            for name, folder in self._folders.items()
-        }
+        return {name: self._read(name) for name in self._folders}
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of each capture's files, masks included, and of the options that apply to it."""

@@ -93,7 +93,7 @@ class InnerLoop:
         self._start = params
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
-        self.objective = Objective(self.validation, validation, settings.objective, settings.smooth_ap)
+        self.objective = Objective(self.validation, validation, settings.objective, settings.smooth)
         self.images = self.steps = self._numbers = 0
         self.common_numbers = False
         self.trajectory: Trajectory | None = None

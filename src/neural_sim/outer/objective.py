@@ -11,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Outputs, Parameters
+from neural_sim.detector.smooth_accuracy import SmoothAccuracy
 from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.outer.settings import ObjectiveKind
 from neural_sim.solver.hvp import Term
@@ -21,18 +22,18 @@ from neural_sim.types import LabelledImages
 class Objective:
     """L_val as a function of the parameters.
 
-    ``kind``: ``loss`` is the mean loss of the validation images (the paper's). ``average_precision`` is one minus the
-    mean over classes of the ``smooth`` average precision, plus ``smooth.loss`` times that loss. ``cached`` has the
-    validation images' features, ``images`` the same images' boxes.
+    ``kind``: ``loss`` is the mean loss of the validation images (the paper's). ``average_precision``, or ``accuracy``
+    for a classifier, is one minus the mean over classes of that ``smooth`` score, plus ``smooth.loss`` times that loss.
+    ``cached`` has the validation images' features, ``images`` the same images' boxes.
     """
 
     cached: CachedSet
     images: LabelledImages
     kind: ObjectiveKind
-    smooth: SmoothAP
+    smooth: SmoothAP | SmoothAccuracy
 
     def terms(self) -> list[Term]:
-        """L_val as a sum of terms; the smooth average precision, which ranks all images, is one."""
+        """L_val as a sum of terms; a smooth score, of which average precision ranks all images, is one."""
         if self.kind == "loss":
             return self.cached.mean_terms()
         return [lambda params: self.of_outputs(self.outputs(params))]
@@ -42,10 +43,10 @@ class Objective:
         loss = self.cached.detector.losses_of(outputs, self.cached.targets).mean()
         if self.kind == "loss":
             return loss
-        return 1.0 - self.smooth_ap(outputs).sum(1).nanmean() + self.smooth.loss * loss
+        return 1.0 - self.smooth_score(outputs).sum(1).nanmean() + self.smooth.loss * loss
 
-    def smooth_ap(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """Each image's contribution to the smooth average precision of every class; nan for a class without a box."""
+    def smooth_score(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
+        """Each image's contribution to the smooth score of every class; nan for a class without a box."""
         return self.smooth(self.cached.detector, outputs, self.images)
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
@@ -71,7 +72,7 @@ class Objective:
         parts = -shown * losses / shown.sum(1, keepdim=True)
         if self.kind == "loss":
             return parts
-        return self.smooth_ap(outputs).cpu() + self.smooth.loss * parts
+        return self.smooth_score(outputs).cpu() + self.smooth.loss * parts
 
     def double(self) -> Objective:
         """The same in float64."""

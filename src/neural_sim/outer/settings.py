@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from neural_sim.checks import at_least
+from neural_sim.detector.smooth_accuracy import SmoothAccuracy
 from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.significance import SMALLEST
 from neural_sim.parameter.update import Mirror, Update
 from neural_sim.renderer.nerf import Quality
 
-ObjectiveKind = Literal["average_precision", "loss"]
+ObjectiveKind = Literal["average_precision", "accuracy", "loss"]
 Start = Literal["previous", "warm", "fresh"]
 AdjointKind = Literal["implicit", "unrolled"]
 CertifyKind = Literal["response", "retrained"]
@@ -118,9 +119,9 @@ class Outer:
         adjoint: the hypergradient of a stationary point, by the solver (``implicit``, the paper's Eq. 2), or of the
             training that was run (``unrolled``). The latter wants ``train_first``, epochs and no ``certify=retrained``.
         unrolled: settings of the unrolled adjoint.
-        objective: L_val: one minus the smooth average precision of the validation images, or their ``loss`` (the
-            paper's).
-        smooth_ap: settings of that smooth average precision.
+        objective: L_val: one minus the smooth average precision of the validation images, or a classifier's smooth
+            ``accuracy``, or their ``loss`` (the paper's).
+        smooth_ap, smooth_accuracy: settings of that smooth average precision, and of that smooth accuracy.
         steps: ``checked``: in a trust region. Consecutive trainings use the same random numbers, and the last iteration
             only trains, to accept or reject the last step. ``free``: by ``update``.
         checks: settings of checked steps.
@@ -158,6 +159,7 @@ class Outer:
     unrolled: Unrolled = field(default_factory=Unrolled)
     objective: ObjectiveKind = "average_precision"
     smooth_ap: SmoothAP = field(default_factory=SmoothAP)
+    smooth_accuracy: SmoothAccuracy = field(default_factory=SmoothAccuracy)
     steps: StepKind = "checked"
     checks: Checks = field(default_factory=Checks)
     final_step: float = 0.1
@@ -208,3 +210,8 @@ class Outer:
                 "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and no certify=retrained, got "
                 f"{self.train_first}, {self.epochs} and certify_every={self.certify_every} of {self.certify}"
             )
+
+    @property
+    def smooth(self) -> SmoothAP | SmoothAccuracy:
+        """The smooth score of the objective; one of those where that is the loss."""
+        return self.smooth_accuracy if self.objective == "accuracy" else self.smooth_ap

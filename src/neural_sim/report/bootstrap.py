@@ -1,7 +1,8 @@
-"""Average precision under image weights: the same matches resampled, without evaluating anew.
+"""Average precision, or accuracy, under image weights: the same matches resampled, without evaluating anew.
 
 A detection's match depends on its own image only. Drawing images with replacement therefore only changes how often
-each detection and each box counts, and AP is a weighted sum over the detections in the order of their scores.
+each detection and each box counts, and AP is a weighted sum over the detections in the order of their scores. Accuracy
+is a weighted mean over images.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchvision.ops import box_iou
 
+from neural_sim.detector.metrics import best_classes
+from neural_sim.detector.protocol import Score
 from neural_sim.types import LabelledImages
 
 # In float32, as torchmetrics hands them on: a recall of exactly 0.28 falls on one side or the other of 0.28.
@@ -31,8 +34,26 @@ class Matches:
     boxes_per_image: Int[np.ndarray, "images"]
 
 
-def match(predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int) -> Matches:
-    """Greedy matching by COCO's rules: an image's best detection first, each to the free box it overlaps most."""
+@dataclass(frozen=True)
+class Hits:
+    """Images of one class (``boxes_per_image`` 1, else 0), and whether the best class of each image is this one."""
+
+    correct: Bool[np.ndarray, "images"]
+    boxes_per_image: Int[np.ndarray, "images"]
+
+
+Outcomes = Matches | Hits
+"""Of one class over a set, which its score is computed from."""
+
+
+def match(
+    predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
+) -> Outcomes:
+    """What a ``score`` of one class is computed from. For AP by COCO's rules: an image's best detection first, each to
+    the free box it overlaps most."""
+    if score == "accuracy":
+        own = (images.labels == label).any(1).cpu().numpy().astype(int)
+        return Hits((best_classes(predictions) == label).numpy(), own)
     rows, scores, correct, counts = [], [], [], []
     for index, detections in enumerate(predictions):
         truth = images.boxes[index][images.labels[index] == label]
@@ -58,6 +79,15 @@ def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, 
                 free[candidates.argmax()] = False
                 correct[d, t] = True
     return correct
+
+
+def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None = None) -> float:
+    """The score of one class; ``weights`` say how often each image counts. nan without a box."""
+    if isinstance(outcomes, Matches):
+        return average_precision(outcomes, weights)
+    shown = outcomes.boxes_per_image * (1.0 if weights is None else weights)
+    total = float(shown.sum())
+    return float((shown * outcomes.correct).sum() / total) if total else float("nan")
 
 
 def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | None = None) -> float:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+from neural_sim.detector.metrics import IN_FULL
 from neural_sim.report import figures, logged, tracking
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
@@ -62,7 +63,11 @@ class Compare:
         with tracking.opened(uri, "compare", ", ".join(labels), tags, tracking.flatten(config)) as tracked:
             comparisons, text, page = self._compared(chosen, seed, folder)
             tracked.log(
-                {f"{_slug(c)}/{method}/ap": c.ap[method].value for c in comparisons for method in c.methods}
+                {
+                    f"{_slug(c)}/{method}/{c.score.lower()}": c.ap[method].value
+                    for c in comparisons
+                    for method in c.methods
+                }
             )
             tracked.log_files(folder)
         print(text)
@@ -132,13 +137,13 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
     lines = [
         f"## {c.setting}" + (f": {heading}" if heading else ""),
         f"Seed{'s' if count > 1 else ''} {', '.join(map(str, c.seeds))}; "
-        f"AP (0.50 to 0.95) of {', '.join(runs[0].results['biased'])} in points, "
+        f"{IN_FULL[c.score]} of {', '.join(runs[0].results['biased'])} in points, "
         "with 95 % bootstrap intervals over seeds and test images"
         + (" (one seed: over images alone)." if count == 1 else "."),
         *_on_other_devices(runs),
         "",
-        f"| method | AP | of the gap closed | {c.reference} ahead by | area ahead by "
-        f"| AP after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
+        f"| method | {c.score} | of the gap closed | {c.reference} ahead by | area ahead by "
+        f"| {c.score} after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for bound in BOUNDS:
@@ -154,8 +159,9 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         )
     lines += ["", "Differences in bold exceed the spread: their interval leaves 0 out. Images, steps and seconds "
               "include the warm start, whose backbone every loop trains on; fields, which all methods share, and the "
-              "labelled validation images are not counted. AP at equal seconds: those of the cheapest method, between "
-              "scored iterations linear in log seconds.", ""]  # fmt: skip
+              "labelled validation images are not counted. "
+              f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
+              "iterations linear in log seconds.", ""]  # fmt: skip
     lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]
     lines += ["|---|" + "---|" * (1 + len(c.methods))]
     return "\n".join(lines + _distances(c, runs))

@@ -14,7 +14,7 @@ UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of pr
 
 
 def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
-    """The biased objects' AP against images and against seconds, a line a seed."""
+    """The biased objects' score against images and against seconds, a line a seed."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     figure.suptitle(comparison.setting, color=figures.INK, fontsize=11)
     for place, key in enumerate(("images", comparison.clock), 1):
@@ -42,7 +42,11 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
         # The start, where nothing is spent yet, has a place too.
         least = [p[key] for run in runs for p in run.results["curve"] if p[key] > 0]
         axes.set_xscale("symlog", linthresh=min(least, default=1))
-        axes.set(xlabel=f"{UNITS[key]} (log)", ylabel="AP of the biased objects (%)", xlim=(0, None))
+        axes.set(
+            xlabel=f"{UNITS[key]} (log)",
+            ylabel=f"{comparison.score} of the biased objects (%)",
+            xlim=(0, None),
+        )
         axes.grid(color=figures.GRID)
         figures.style(axes)
         handles = axes.get_legend_handles_labels()

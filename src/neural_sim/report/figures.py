@@ -12,6 +12,8 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.protocol import Score
 from neural_sim.parameter.distributions import merged
 from neural_sim.types import LabelledImages
 
@@ -114,15 +116,17 @@ def _titled(name: str, groups: Sequence[Sequence[int]]) -> str:
     return f"{name} ({', '.join(same)})" if same else name
 
 
-def ap_figure(ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str]) -> Figure:
-    """AP of every class for each training distribution; biased classes stand first, in bold."""
+def ap_figure(
+    ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str], score: Score = "AP"
+) -> Figure:
+    """AP (or accuracy) of every class for each training distribution; biased classes stand first, in bold."""
     order = [n for n in class_names if n in emphasised] + [n for n in class_names if n not in emphasised]
     labels = [*order, "mean"]
     figure = Figure(figsize=(1.1 * len(labels) + 1.6, 3.2), layout="constrained")
     axes = figure.add_subplot()
     width = 0.8 / max(1, len(ap))
     for i, (method, scores) in enumerate(ap.items()):
-        values = [100 * scores["per_class"].get(n, float("nan")) for n in order] + [100 * scores["ap"]]
+        values = [100 * scores["per_class"].get(n, float("nan")) for n in order] + [100 * mean_of(scores)]
         x = np.arange(len(labels)) + (i - (len(ap) - 1) / 2) * width
         axes.bar(x, values, 0.92 * width, color=METHOD_COLOURS.get(method, MUTED), label=method)
         for at, value in zip(x, values, strict=True):
@@ -131,7 +135,7 @@ def ap_figure(ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised:
     axes.set_xticks(range(len(labels)), labels)
     for tick, name in zip(axes.get_xticklabels(), labels, strict=True):
         tick.set_fontweight("bold" if name in emphasised else "normal")
-    axes.set(ylabel="AP on the test set (%)", ylim=(0, 105))
+    axes.set(ylabel=f"{score} on the test set (%)", ylim=(0, 105))
     axes.yaxis.grid(color=GRID)
     axes.set_axisbelow(True)
     style(axes)

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neural_sim.detector.protocol import Score
 from neural_sim.report import logged
-from neural_sim.report.bootstrap import Matches, match
+from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.types import LabelledImages
 
 FILES = ("results.json", "detections.json")
@@ -30,6 +31,11 @@ class Recorded:
     @property
     def seed(self) -> int:
         return self.results["seed"]
+
+    @property
+    def score(self) -> Score:
+        """What its detectors are scored by; runs of before there were classifiers do not say so."""
+        return self.results.get("score", "AP")
 
     @property
     def setting(self) -> str:
@@ -59,7 +65,7 @@ class FinishedRun(Recorded):
     and where photographs trained too, synthetic_only and real_only."""
 
     results: Mapping[str, Any]
-    matches: Mapping[str, Sequence[Matches]]
+    matches: Mapping[str, Sequence[Outcomes]]
 
     def spent(self, key: str) -> float:
         """What the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
@@ -95,7 +101,10 @@ def read_run(candidate: Candidate) -> FinishedRun:
     truth = _images(stored["truth"], count)
     labels = [names.index(name) for name in results["biased"]]
     detections = {w: _detections(rows, count) for w, rows in stored.items() if w not in ("images", "truth")}
-    matches = {which: [match(own, truth, label) for label in labels] for which, own in detections.items()}
+    matches = {
+        which: [match(own, truth, label, candidate.score) for label in labels]
+        for which, own in detections.items()
+    }
     return FinishedRun(results, matches)
 
 

@@ -70,17 +70,19 @@ def _histograms(settings: Sequence[Setting], paper: Paper | None, draws: int, se
 def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
     """The paper's Table 1: rows are objects, columns methods, ours and the paper's."""
     lines, parts = [], []
+    means = {"AP": MEAN, "accuracy": "mean accuracy"}
     for setting in settings:
-        scores = setting.scores
+        scores, mean = setting.scores, means[setting.runs[0].score]
         ahead = [
             f"{called(method)} by {points(own[MEAN])}"
             for method, own in scores.ahead.items()
             if method != "matched"
         ]
         ours = points(scores.ap[scores.reference][MEAN])
-        lines.append(f"{setting.group.label}: mAP of NSO {ours}; ahead of {', '.join(ahead)}")
+        lines.append(f"{setting.group.label}: {mean} of NSO {ours}; ahead of {', '.join(ahead)}")
         parts.append(
-            f"{setting.group.label}, seeds {', '.join(map(str, scores.seeds))}:\n\n" + beside(scores, paper)
+            f"{setting.group.label}, seeds {', '.join(map(str, scores.seeds))}:\n\n"
+            + beside(scores, paper, mean)
         )
     return Shown(lines, "\n\n".join(parts))
 
@@ -91,15 +93,18 @@ def _photographs(settings: Sequence[Setting], paper: Paper | None, draws: int, s
     return Shown(photographs_summary(settings), "\n\n".join(tables))
 
 
-def beside(scores: ObjectScores, paper: Paper | None) -> str:
-    """AP of every object in points with 95 % intervals, beside the paper's."""
+def beside(scores: ObjectScores, paper: Paper | None, mean: str = MEAN) -> str:
+    """The score of every object in points with 95 % intervals, beside the paper's."""
     columns = [] if paper is None else list(paper.columns)
     rows = {} if paper is None else paper.rows
     head = ["", *(f"{called(m)}, ours" for m in scores.methods), *(f"{name}, the paper" for name in columns)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for name in (MEAN, *scores.objects):
         theirs = rows.get(name, [None] * len(columns))
-        cells = [name, *(points(scores.ap[method][name]) for method in scores.methods)]
+        cells = [
+            mean if name == MEAN else name,
+            *(points(scores.ap[method][name]) for method in scores.methods),
+        ]
         lines.append("| " + " | ".join([*cells, *("" if v is None else f"{v:g}" for v in theirs)]) + " |")
     return "\n".join(lines)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from neural_sim.report.bootstrap import Matches, average_precision
+from neural_sim.report.bootstrap import Outcomes, class_score
 from neural_sim.report.finished import FinishedRun
 from neural_sim.report.statistics import BOUNDS, FIXED, Estimate, resampled, with_intervals
 
@@ -66,7 +66,7 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
         [[own] for column in columns for own in _matches(table, reference, column, at)] for at in seeds
     ]
     shape = (-1, len(columns), len(objects))
-    point = np.asarray([[average_precision(own) for (own,) in row] for row in matches]).mean(0)
+    point = np.asarray([[class_score(own) for (own,) in row] for row in matches]).mean(0)
     point = _with_mean(point.reshape(shape))[0]
     spread = _with_mean(resampled(matches, draws, seed).reshape(shape))
     rows, ours = (*objects, MEAN), methods.index(reference)
@@ -82,7 +82,7 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
 
 def _matches(
     table: Mapping[tuple[str, int], FinishedRun], reference: str, method: str, seed: int
-) -> Sequence[Matches]:
+) -> Sequence[Outcomes]:
     """Of a method's detector at a seed. The reference's run stands for ns and matched, which all methods share, and for
     ``WITHOUT``."""
     if method in BOUNDS or method in WITHOUT:

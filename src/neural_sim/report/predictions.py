@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from neural_sim.detector.metrics import AveragePrecision
+from neural_sim.detector.metrics import AveragePrecision, TestScore
 from neural_sim.report.figures import CLASS_COLOURS
 
 WRITABLE = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -74,17 +75,27 @@ def result_rows(
     ]
 
 
-def scores_document(ap: AveragePrecision, images: int) -> dict[str, Any]:
+def scores_document(scores: TestScore, images: int) -> dict[str, Any]:
     """The content of scores.json; classes without a true box are null."""
-    known = {name: value if value == value else None for name, value in ap.per_class.items()}
-    known_50 = {name: value if value == value else None for name, value in ap.per_class_ap50.items()}
-    mean, mean_50 = (value if value == value else None for value in (ap.ap, ap.ap50))
-    return {"images": images, "ap": mean, "ap50": mean_50, "per_class": known, "per_class_ap50": known_50}
+    return {"images": images, **_known(dataclasses.asdict(scores))}
 
 
-def scores_table(ap: AveragePrecision, images: int) -> str:
-    """AP by class in percent, as it is printed."""
-    lines = [f"{f'AP on {images} pictures':<24}{'AP':>8}{'AP50':>8}"]
-    for name, value in ap.per_class.items():
-        lines.append(f"{name[:23]:<24}{100 * value:>8.1f}{100 * ap.per_class_ap50[name]:>8.1f}")
-    return "\n".join([*lines, f"{'mean':<24}{100 * ap.ap:>8.1f}{100 * ap.ap50:>8.1f}"])
+def scores_table(scores: TestScore, images: int) -> str:
+    """The score by class in percent, as it is printed."""
+    if isinstance(scores, AveragePrecision):
+        name, columns = "AP", {"AP": scores.per_class, "AP50": scores.per_class_ap50}
+        means = [scores.ap, scores.ap50]
+    else:
+        name, columns, means = "accuracy", {"accuracy": scores.per_class}, [scores.accuracy]
+    lines = [f"{f'{name} on {images} pictures':<28}" + "".join(f"{column:>8}" for column in columns)]
+    rows = {of: [column[of] for column in columns.values()] for of in scores.per_class} | {"mean": means}
+    for of, row in rows.items():
+        lines.append(f"{of[:27]:<28}" + "".join(f"{100 * value:>8.1f}" for value in row))
+    return "\n".join(lines)
+
+
+def _known(tree: Any) -> Any:
+    """NaN as None, so that the file is JSON by the standard."""
+    if isinstance(tree, dict):
+        return {key: _known(value) for key, value in tree.items()}
+    return tree if tree == tree else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from neural_sim.detector.protocol import Score
 from neural_sim.outer.foreseen import Foreseen
 from neural_sim.outer.labelled import Labelled, equivalent
 from neural_sim.report.page.verdict import listed
@@ -15,9 +16,10 @@ from neural_sim.target.mismatch import Mismatch
 @dataclass(frozen=True)
 class Preflight:
     """``foreseen``: gains of every object and factor, of which those count that are significant at ``level`` over all
-    of them. ``bins``: AP of the initial distribution's detector by bin of the validation images. ``settings`` would
-    match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None: they agree).
-    ``labelled``: what numbers of labelled photographs in training are worth; empty where none are for training."""
+    of them. ``bins``: the ``score`` of the initial distribution's detector by bin of the validation images.
+    ``settings`` would match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None:
+    they agree). ``labelled``: what numbers of labelled photographs in training are worth; empty where none are for
+    training."""
 
     experiment: str
     names: tuple[str, ...]
@@ -28,6 +30,7 @@ class Preflight:
     settings: Mapping[str, str]
     distance_factor: float | None
     labelled: tuple[Labelled, ...] = ()
+    score: Score = "AP"
 
     @property
     def promising(self) -> list[Foreseen]:
@@ -94,7 +97,7 @@ class Preflight:
             )
         for score in weakest(self.bins):
             lines.append(
-                f"weak: {score.name} from bin {score.bin}, AP {100 * score.last:.1f} on {score.images} images"
+                f"weak: {score.name} from bin {score.bin}, {self.score} {100 * score.last:.1f} on {score.images} images"
             )
         for m in self.differing:
             lines.append(f"differs: {m.name}, target {m.target:.3g}, synthesised {m.synthesised:.3g}")

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from neural_sim.cameras import orbit
+from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.protocol import Score
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
 from neural_sim.report import figures
@@ -36,6 +38,7 @@ class RunResults:
     (from 1), by object and angle, whose views an object's symmetry makes the same; they are scored and drawn as one.
     ``real`` says how photographs trained (``mode``) and how many (``photographs``); empty without. ``ap`` then also has
     the scores of synthetic_only and real_only.
+    ``score`` is what detectors are scored by: AP, or accuracy, which ``ap`` then has.
     ``identity`` says which runs this one can be compared with, see :func:`identity.identity`.
     """
 
@@ -57,9 +60,10 @@ class RunResults:
     symmetric_bins: Mapping[str, Mapping[str, Sequence[Sequence[int]]]] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     real: Mapping[str, Any] = field(default_factory=dict)
+    score: Score = "AP"
 
     def document(self) -> dict[str, Any]:
-        """The content of results.json; numbers that do not exist (AP of an absent class) are null."""
+        """The content of results.json; numbers that do not exist (the score of an absent class) are null."""
         psi = {
             name: {
                 factor: {which: p[factor][label].tolist() for which, p in self.probabilities.items()}
@@ -77,6 +81,7 @@ class RunResults:
                 "psi": psi,
                 "total_variation": self.total_variations(),
                 "symmetric_bins": dict(self.symmetric_bins),
+                "score": self.score,
                 "ap": dict(self.ap),
                 "validation_ap": self.validation_ap,
                 "real": dict(self.real),
@@ -120,24 +125,26 @@ class RunResults:
 
     def summary(self) -> str:
         """The table printed at the end of a run."""
-        head = f"{'AP on the test set':<20}" + "".join(f"{name[:12]:>13}" for name in (*self.names, "mean"))
+        head = f"{f'{self.score} on the test set':<24}" + "".join(
+            f"{name[:12]:>13}" for name in (*self.names, "mean")
+        )
         lines = [head]
         for method, scores in self.ap.items():
-            values = [*(scores["per_class"][name] for name in self.names), scores["ap"]]
-            lines.append(f"{method:<20}" + "".join(f"{100 * value:>13.1f}" for value in values))
+            values = [*(scores["per_class"][name] for name in self.names), mean_of(scores)]
+            lines.append(f"{method:<24}" + "".join(f"{100 * value:>13.1f}" for value in values))
         if self.real:
             lines.append(
                 "trained on {photographs} photographs too (training.real.mode={mode})".format(**self.real)
             )
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
-            lines.append(f"AP on the validation images, learned: {score} (to choose settings by)")
+            lines.append(f"{self.score} on the validation images, learned: {score} (to choose settings by)")
         distances = self.total_variations()
         for factor in self.factors:
             lines.append(f"distance to target, {factor}")
             for which in ("initial", "learned"):
                 row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
-                lines.append(f"  {which:<18}{row}")
+                lines.append(f"  {which:<22}{row}")
         trust = untrusted(self.records)
         if trust["steps"]:
             lines.append(_trust_line(trust))
@@ -205,7 +212,11 @@ def write_figures(
         drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor, groups)
         paths.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
     if results.ap:
-        paths.append(figures.save(figures.ap_figure(results.ap, names, results.biased), folder / "ap.png"))
+        paths.append(
+            figures.save(
+                figures.ap_figure(results.ap, names, results.biased, results.score), folder / "ap.png"
+            )
+        )
     chosen = _spread(drawn, 32)
     grid = figures.image_grid(
         drawn.select(chosen), names, title="Training images drawn from the learned distribution"

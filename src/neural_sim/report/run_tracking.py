@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from neural_sim.detector.metrics import mean_of
 from neural_sim.report import tracking
 from neural_sim.report.pyfunc import log_detector
 from neural_sim.report.run import RunResults
@@ -95,13 +96,22 @@ def live_run(
         yield LiveRun(run, names)
 
 
+def _key(results: RunResults) -> str:
+    """The score's name in metrics."""
+    return results.score.lower()
+
+
 def _final(results: RunResults) -> dict[str, float]:
     metrics = dict(results.memory)
     if results.validation_ap is not None:
-        metrics["validation_ap"] = results.validation_ap
+        metrics[f"validation_{_key(results)}"] = results.validation_ap
     for which, scores in results.ap.items():
-        metrics |= {f"evaluate/{which}/ap": scores["ap"], f"evaluate/{which}/ap50": scores["ap50"]}
-        metrics |= {f"evaluate/{which}/ap_{name}": value for name, value in scores["per_class"].items()}
+        metrics |= {
+            f"evaluate/{which}/{key}": scores[key] for key in ("ap", "ap50", "accuracy") if key in scores
+        }
+        metrics |= {
+            f"evaluate/{which}/{_key(results)}_{name}": value for name, value in scores["per_class"].items()
+        }
     for name, factors in results.total_variations().items():
         for factor, distances in factors.items():
             metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
@@ -131,13 +141,16 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:
-    """AP of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by side."""
+    """The score of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by
+    side."""
     series: dict[str, dict[int, float]] = {}
     for point in results.curve:
-        scores = {"ap": point["ap"]["ap"]}
+        scores = {_key(results): mean_of(point["ap"])}
         if results.biased:
             per_class = point["ap"]["per_class"]
-            scores["biased_ap"] = sum(per_class[name] for name in results.biased) / len(results.biased)
+            scores[f"biased_{_key(results)}"] = sum(per_class[name] for name in results.biased) / len(
+                results.biased
+            )
         for by, (what, value) in itertools.product(("iteration", "images", "seconds"), scores.items()):
             series.setdefault(f"curve/{what}_by_{by}", {})[round(point[by])] = value
     return series

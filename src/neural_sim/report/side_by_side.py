@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from neural_sim.report import figures, tracking
-from neural_sim.report.bootstrap import Matches, average_precision
+from neural_sim.report.bootstrap import Outcomes, class_score
 from neural_sim.report.compare import points
 from neural_sim.report.figures import CLASS_COLOURS, GRID, INK
 from neural_sim.report.statistics import Estimate, mean_ap, resampled, with_intervals
@@ -36,7 +36,7 @@ class SideBySide:
 
 
 def side_by_side(
-    matches: Mapping[str, Sequence[Sequence[Sequence[Matches]]]],
+    matches: Mapping[str, Sequence[Sequence[Sequence[Outcomes]]]],
     sources: Sequence[str],
     classes: Sequence[str],
     seeds: Sequence[int],
@@ -56,7 +56,7 @@ def side_by_side(
         ahead[kind] = dict(zip(sources[1:], differences, strict=True))
         per_class[kind] = {
             source: {
-                name: float(np.mean([average_precision(row[column][label]) for row in rows]))
+                name: float(np.mean([class_score(row[column][label]) for row in rows]))
                 for label, name in enumerate(classes)
             }
             for column, source in enumerate(sources)

@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from neural_sim.report.bootstrap import Matches, average_precision
+from neural_sim.detector.protocol import Score
+from neural_sim.report.bootstrap import Outcomes, class_score
 from neural_sim.report.finished import FinishedRun
 
 BOUNDS = ("ns", "matched")
@@ -47,7 +48,7 @@ class Comparison:
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
     unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
     took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`. ``spent`` are means over seeds, the warm
-    start included.
+    start included. Where ``score`` is accuracy, that stands in the place of AP.
     """
 
     setting: str
@@ -62,6 +63,7 @@ class Comparison:
     at_equal_cost: Mapping[str, Estimate]
     equal_cost: float
     clock: Clock = "seconds"
+    score: Score = "AP"
 
 
 def compare(
@@ -97,17 +99,18 @@ def compare(
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
         {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
          for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock), clock,
+        runs[0].score,
     )  # fmt: skip
 
 
-def mean_ap(matches: Sequence[Matches], weights: Float[np.ndarray, "images"] | None = None) -> float:
+def mean_ap(matches: Sequence[Outcomes], weights: Float[np.ndarray, "images"] | None = None) -> float:
     """Mean over classes; those without a box among the weighted images stay out of it."""
-    known = [ap for m in matches if not math.isnan(ap := average_precision(m, weights))]
+    known = [ap for m in matches if not math.isnan(ap := class_score(m, weights))]
     return float(np.mean(known)) if known else math.nan
 
 
 def resampled(
-    matches: Sequence[Sequence[Sequence[Matches]]], draws: int, seed: int
+    matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int
 ) -> Float[np.ndarray, "draws columns"]:
     """Mean AP of each column of ``matches`` [seeds][columns][classes] under resampled seeds and images."""
     random, rows = np.random.default_rng(seed), []

@@ -45,6 +45,7 @@ class DetectionGalleryStep:
     def run(self, context: Context) -> None:
         """The figure, and every method's counts and AP; to the run's folder and MLflow."""
         x, begun = context.experiment, time.time()
+        x.check_boxes("detection_gallery")
         graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
         results = results_of_study(context)
         test = results(context.graph.targets).test

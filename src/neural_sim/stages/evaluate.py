@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
-from neural_sim.detector.metrics import AveragePrecision, evaluate
+from neural_sim.detector.metrics import TestScore, evaluate, of_document
 from neural_sim.stages.detector import TrainedStage
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
@@ -17,9 +17,9 @@ from neural_sim.stages.target_sets import TargetSetsStage
 
 @dataclass(frozen=True)
 class Scores:
-    """Average precision on a part of the target set, and every image's detections."""
+    """Average precision or accuracy on a part of the target set, and every image's detections."""
 
-    ap: AveragePrecision
+    ap: TestScore
     detections: list[dict[str, Tensor]]
 
 
@@ -40,11 +40,12 @@ class ScoresStage(Stage[Scores]):
 
     def make(self, results: Results) -> Scores:
         params, images = results(self.trained).params, getattr(results(self.targets), self.part)
-        detections = self.trained.build().predict(params, images.images)
-        return Scores(evaluate(detections, images, list(self.trained.names)), detections)
+        detector = self.trained.build()
+        detections = detector.predict(params, images.images)
+        return Scores(evaluate(detections, images, list(self.trained.names), detector.score), detections)
 
     def pack(self, value: Scores) -> dict[str, Any]:
         return {"ap": dataclasses.asdict(value.ap), "detections": value.detections}
 
     def unpack(self, stored: Mapping[str, Any]) -> Scores:
-        return Scores(AveragePrecision(**stored["ap"]), stored["detections"])
+        return Scores(of_document(stored["ap"]), stored["detections"])

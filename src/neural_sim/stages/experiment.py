@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.detector.protocol import Detector
+from neural_sim.detector.protocol import Detector, Score, score_of
 from neural_sim.detector.training import Training
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
@@ -23,10 +23,14 @@ from neural_sim.stages.psi import Method
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.types import PinholeCamera
 
+SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
+"""What a task's detectors are scored by."""
+
 
 @dataclass(frozen=True)
 class Run:
-    """What a run is called and where it works. ``score_at`` are parts of a method's iterations, in (0, 1]."""
+    """What a run is called and where it works. ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is
+    one of :data:`SCORES`."""
 
     name: str
     seed: int
@@ -35,6 +39,7 @@ class Run:
     accelerator: str = "cpu"
     progress: bool = False
     score_at: tuple[float, ...] = ()
+    task: str = "detection"
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,11 @@ class Loop:
 @dataclass(frozen=True)
 class Experiment:
     """All parts of a run; ``config`` is the configuration that they were built from, for reports alone, ``model`` what
-    the report writes of the final detector."""
+    the report writes of the final detector.
+
+    Raises:
+        ValueError: a detector, an objective or images that are not of the task.
+    """
 
     run: Run
     imaging: Imaging
@@ -74,3 +83,34 @@ class Experiment:
     loop: Loop
     config: dict[str, Any]
     model: ModelFiles
+
+    def __post_init__(self) -> None:
+        task, score, objective = self.run.task, self.score, self.loop.outer.objective
+        if score != SCORES.get(task):
+            choices = ", ".join(f"task={name} ({own})" for name, own in SCORES.items())
+            raise ValueError(
+                f"task={task} and a detector that is scored by {score} do not belong together: want {choices}, and "
+                "detector=classifier for accuracy"
+            )
+        wanted = {"AP": "average_precision", "accuracy": "accuracy"}[score]
+        if objective not in (wanted, "loss"):
+            raise ValueError(f"outer.objective: want {wanted} or loss for task={task}, got {objective}")
+        if score == "AP" and not getattr(self.imaging.target, "boxed", True):
+            raise ValueError(
+                f"target: its photographs have no boxes, want task=classification, got task={task}"
+            )
+        if score == "accuracy" and self.imaging.synthesis.several:
+            raise ValueError(
+                f"synthesis.objects_per_image: want [1, 1] for task={task}, whose images show one object each, got "
+                f"{list(self.imaging.synthesis.objects_per_image)}"
+            )
+
+    @property
+    def score(self) -> Score:
+        """What its detectors are scored by."""
+        return score_of(self.detector)
+
+    def check_boxes(self, key: str) -> None:
+        """Raises ``ValueError`` where there is no AP for a stage of this name."""
+        if self.score != "AP":
+            raise ValueError(f"{key} compares boxes: want task=detection, got task={self.run.task}")

@@ -88,8 +88,9 @@ class PredictStep:
         _write(folder / "coco_results.json", rows)
         if scored:
             ap = evaluate(
-                [found for found, _ in scored], without_pixels([t for _, t in scored]), saved.class_names
-            )
+                [found for found, _ in scored], without_pixels([t for _, t in scored]), saved.class_names,
+                saved.detector.score,
+            )  # fmt: skip
             _write(folder / "scores.json", scores_document(ap, len(scored)))
             print(scores_table(ap, len(scored)))
         print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")

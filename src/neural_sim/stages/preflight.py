@@ -76,11 +76,12 @@ class PreflightStep:
             names=tuple(names),
             foreseen=tuple(foreseen),
             level=level,
-            bins=tuple(bin_scores(names, {"ns": detections}, validation)),
+            bins=tuple(bin_scores(names, {"ns": detections}, validation, score=x.score)),
             mismatches=tuple(differ),
             settings=matching_settings(validation, images, differ),
             distance_factor=distance_factor(differ),
             labelled=tuple(labelled),
+            score=x.score,
         )
         _write(context.folder / "preflight.json", report)
         page = write_preflight_page(report, validation, images, context.folder)

@@ -125,6 +125,7 @@ def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:
         },
         identity=_identity(context),
         real=_real(context),
+        score=x.score,
     )
 
 

@@ -21,8 +21,13 @@ from neural_sim.types import LabelledImages
 
 
 def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
-    """The experiment's stages for the run's seed and those that follow it."""
+    """The experiment's stages for the run's seed and those that follow it.
+
+    Raises:
+        ValueError: a task other than detection.
+    """
     x = context.experiment
+    x.check_boxes("a comparison of sources of images")
     return [Graph(replace(x, run=replace(x.run, seed=x.run.seed + i))) for i in range(seeds)]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,8 +25,9 @@ from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.coco_file import labels_of_categories, read_coco
 from neural_sim.target.groups import groups_of
 from neural_sim.target.letterbox import letterbox
-from neural_sim.target.near_duplicates import near_duplicates, thumbnail
-from neural_sim.target.split import check_fraction, for_training, joined, split
+from neural_sim.target.near_duplicates import thumbnail
+from neural_sim.target.parting import Looks, Parting
+from neural_sim.target.split import check_fraction
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -189,23 +188,15 @@ class CocoTarget:
                 f"annotation is beyond the {first.bins} of {first.name}"
             )
         read = self._photos(list(objects), camera.height, camera.width)
-        photos = [item.photo for item in read]
-        pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
-        groups = joined(self._groups, pixels)  # a photograph that is listed twice is one
         generator = torch.Generator().manual_seed(seed)
-        val, test = (part.tolist() for part in split(groups, self.val_fraction, generator))
-        parts = {**for_training(val, groups, self.train_fraction, generator), "test": test}
-        if self.split_by is None:
-            thumbnails = torch.stack([item.thumbnail for item in read])
-            for first_part, second_part in itertools.combinations(parts, 2):
-                self._warn_of_duplicates(thumbnails, parts, first_part, second_part)
-        else:
-            _log.info(
-                "%s: target.split_by=%s makes %d groups; val has %d of %d images (val_fraction %g), train %d",
-                self._file, self.split_by, len(set(self._groups)), len(parts["val"]), len(photos),
-                self.val_fraction, len(parts.get("train", ())),
-            )  # fmt: skip
-        images = assemble(photos)
+        looks = [
+            Looks(str(entry["file_name"]), group, item.photo.image, item.thumbnail)
+            for entry, group, item in zip(self._entries, self._groups, read, strict=True)
+        ]
+        parts = Parting(self.val_fraction, self.train_fraction, self.split_by, self._file).parts(
+            looks, generator
+        )
+        images = assemble([item.photo for item in read])
         chosen = {part: torch.tensor(rows) for part, rows in parts.items()}
         if self.match_bins:
             if first is None:
@@ -241,20 +232,6 @@ class CocoTarget:
         if dropped:
             _log.warning("%s: %d boxes shorter than %g px dropped", self._file, dropped, self.minimum_side)
         return read
-
-    def _warn_of_duplicates(
-        self, thumbnails: Tensor, parts: Mapping[str, list[int]], first: str, second: str
-    ) -> None:
-        """Warn: where one frame of a video trained a detector or steered psi, AP on the next frame says little."""
-        duplicates = near_duplicates(thumbnails[parts[first]], thumbnails[parts[second]])
-        if duplicates.test:
-            names = [str(self._entries[parts[part][i[0]]]["file_name"])
-                     for part, i in ((second, duplicates.test), (first, duplicates.val))]  # fmt: skip
-            _log.warning(
-                "%s: %d of %d %s images look like one of %s (%s like %s); if they are of one video, scene or "
-                "capture, keep them together by target.split_by",
-                self._file, len(duplicates.test), duplicates.compared, second, first, *names,
-            )  # fmt: skip
 
     def _photo(
         self,

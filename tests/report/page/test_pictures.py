@@ -31,6 +31,11 @@ def test_right_is_the_right_class_in_the_right_place_among_the_best():
     assert not pictures.right(found(), *truth((A, 0)))
 
 
+def test_a_class_alone_is_right_where_accuracy_is_the_score():
+    assert pictures.right(found((B, 0, 0.9)), *truth((A, 0)), "accuracy")
+    assert not pictures.right(found((A, 1, 0.9)), *truth((A, 0)), "accuracy")
+
+
 def test_every_object_wants_a_detection_of_its_own():
     both = truth((A, 0), (A + 1.0, 0))
     assert not pictures.right(found((A, 0, 0.9), (B, 0, 0.8)), *both)  # one detection overlaps both objects

@@ -103,6 +103,23 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
     assert "Lost (" not in page and 'title="pose: p = 0.01; expected fall of the outer loss 0.100; ' in page
 
 
+def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
+    """An image is right by its class, wherever its box."""
+    moved = {}
+    for which, hits in {"ns": 1, "learned": 3, "matched": 4}.items():
+        wrong = [int(i % 4 >= hits) for i in range(IMAGES)]
+        pairs = zip(shown.detections[which], wrong, strict=True)
+        moved[which] = [each | {"labels": (each["labels"] + off) % 2} for each, off in pairs]
+    scores = {which: {"accuracy": 0.5, "per_class": s["per_class"]} for which, s in results.ap.items()}
+    points = [{**point, "ap": scores["ns"]} for point in results.curve]
+    found = dataclasses.replace(results, score="accuracy", ap=scores, curve=points)
+    page = write_run_page(found, dataclasses.replace(shown, detections=moved), COMMANDS, tmp_path).read_text()
+    assert "gives 50.0 points of accuracy more on mug" in page and "Accuracy on the test set" in page
+    assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
+    text = re.sub(r'src="[^"]*"', "", page)
+    assert "the best class is the right one" in text and not re.search(r"\bAP\b|average precision", text)
+
+
 def test_a_run_without_scores_and_without_steps_says_so(results, shown, tmp_path):
     bare = dataclasses.replace(results, ap={}, curve=(), records=[])
     page = write_run_page(bare, dataclasses.replace(shown, detections={}), {}, tmp_path).read_text()

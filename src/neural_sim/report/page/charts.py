@@ -11,6 +11,7 @@ import matplotlib
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from neural_sim.detector.protocol import Score
 from neural_sim.report import figures
 
 
@@ -40,9 +41,14 @@ def psi_chart(
     return data_uri(figure)
 
 
-def curve_chart(curve: Sequence[Mapping[str, Any]], names: Sequence[str], bounds: Mapping[str, float]) -> str:
-    """The mean AP of the classes ``names`` against the method's seconds; ``bounds`` are AP of other detectors by
-    name, drawn as lines. AP as fractions."""
+def curve_chart(
+    curve: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    bounds: Mapping[str, float],
+    score: Score = "AP",
+) -> str:
+    """The mean score of the classes ``names`` against the method's seconds; ``bounds`` are scores of other detectors by
+    name, drawn as lines. Scores as fractions."""
     figure = Figure(figsize=(6.2, 2.9), layout="constrained")
     axes = figure.add_subplot()
     seconds = [point["seconds"] for point in curve]
@@ -55,7 +61,7 @@ def curve_chart(curve: Sequence[Mapping[str, Any]], names: Sequence[str], bounds
         axes.axhline(100.0 * value, color=figures.MUTED, linestyle="--", linewidth=1)
         axes.annotate(name, (1.0, 100.0 * value), xycoords=("axes fraction", "data"), ha="right", va="bottom",
                       fontsize=8, color=figures.MUTED)  # fmt: skip
-    axes.set(xlabel="seconds of the method, its warm start included", ylabel="AP (%)", xlim=(0, None))
+    axes.set(xlabel="seconds of the method, its warm start included", ylabel=f"{score} (%)", xlim=(0, None))
     axes.margins(y=0.2)
     axes.grid(color=figures.GRID)
     figures.style(axes)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from neural_sim.detector.metrics import IN_FULL
 from neural_sim.report.page import charts, render
-from neural_sim.report.page.verdict import interval, listed
+from neural_sim.report.page.verdict import POINTS, interval, listed
 from neural_sim.report.statistics import Comparison
 
 FILE = "report.html"
@@ -36,6 +37,11 @@ class Section:
         return verdict(self.comparison)
 
     @property
+    def in_full(self) -> str:
+        """The score's name."""
+        return IN_FULL[self.comparison.score]
+
+    @property
     def longest(self) -> float:
         """The largest AP of the table, to which bars are drawn."""
         return max((estimate.value for estimate in self.comparison.ap.values()), default=1.0) or 1.0
@@ -45,7 +51,8 @@ def verdict(comparison: Comparison) -> str:
     """Whom the reference method is ahead of by AP at the end, with intervals; methods whose interval includes 0 are
     named as not told apart."""
     c = comparison
-    head = f"{c.reference} reaches {100 * c.ap[c.reference].value:.1f} AP ({interval(c.ap[c.reference])})"
+    reached = c.ap[c.reference]
+    head = f"{c.reference} reaches {100 * reached.value:.1f} {POINTS[c.score]} ({interval(reached)})"
     groups = {
         "ahead of": [m for m, e in c.ahead.items() if e.certain and e.value > 0.0],
         "behind": [m for m, e in c.ahead.items() if e.certain and e.value < 0.0],

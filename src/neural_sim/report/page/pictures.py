@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torchvision.ops import box_iou
 
+from neural_sim.detector.protocol import Score
 from neural_sim.report.figures import CLASS_COLOURS
 from neural_sim.types import LabelledImages
 
@@ -61,16 +62,19 @@ def detected(
     return pictures
 
 
-def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor) -> bool:
+def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor, score: Score = "AP") -> bool:
     """Whether an image's best detections, as many as it has objects, are these objects: each of the right class, with
-    an overlap of ``OVERLAP``. Without objects, whether nothing scores ``SHOWN``."""
+    an overlap of ``OVERLAP``, or for accuracy of the right class alone. Without objects, whether nothing scores
+    ``SHOWN``."""
     best = _best(detections, len(boxes))
     if not len(boxes):
         return not len(best["scores"])
     if len(best["boxes"]) < len(boxes):
         return False
     same = best["labels"][:, None] == labels[None, :]
-    hits = ((box_iou(best["boxes"].float(), boxes.float()) >= OVERLAP) & same).numpy()
+    if score == "AP":
+        same &= box_iou(best["boxes"].float(), boxes.float()) >= OVERLAP
+    hits = same.numpy()
     return bool(hits[linear_sum_assignment(hits, maximize=True)].all())
 
 

@@ -20,7 +20,12 @@ def percent(value: float | None) -> str:
     return "–" if value is None or value != value else f"{100.0 * value:.1f}"
 
 
-_pages.filters["percent"] = percent
+def capital(text: str) -> str:
+    """With a first capital; the rest stays, as in AP."""
+    return text[:1].upper() + text[1:]
+
+
+_pages.filters |= {"percent": percent, "capital": capital}
 
 
 def page(template: str, **values: Any) -> str:

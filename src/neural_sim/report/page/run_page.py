@@ -9,11 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from neural_sim.detector.metrics import mean_of
+from neural_sim.detector.protocol import Score
 from neural_sim.outer.certificate import untrusted
 from neural_sim.report.page import charts, pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
-from neural_sim.report.page.verdict import Gain, Resampled, listed, verdict
+from neural_sim.report.page.verdict import POINTS, Gain, Resampled, listed, verdict
 from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
 from neural_sim.report.run import RunResults
 from neural_sim.types import LabelledImages
@@ -58,7 +60,7 @@ class FactorCharts:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """AP of a class, fractions by which detector (None: the test set lacks the class)."""
+    """AP (or accuracy) of a class, fractions by which detector (None: the test set lacks the class)."""
 
     name: str
     biased: bool
@@ -74,14 +76,15 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
     aim = list(results.biased) or names
     gains = _gains(results, aim, shown) if scored else {}
     both = {which: shown.detections[which] for which in ("ns", "learned")} if scored else {}
-    scores = bin_scores(names, both, shown.test) if scored else []
+    scores = bin_scores(names, both, shown.test, score=results.score) if scored else []
     path = folder / FILE
     path.write_text(
         render.page(
             "run.html",
             title=f"{results.experiment}: {results.method}, seed {results.seed}",
             results=results,
-            verdict=verdict(gains.get("aim")),
+            verdict=verdict(gains.get("aim"), results.score),
+            points=POINTS[results.score],
             outcome=gains["aim"].outcome if gains else "not scored",
             others=gains.get("others"),
             lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
@@ -91,7 +94,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
             aim=listed(aim),
             before=_training(shown.before, results),
             after=_training(shown.after, results),
-            examples=_examples(shown, names) if scored else {},
+            examples=_examples(shown, names, results.score) if scored else {},
             steps=step_rows(results.records, names),
             trust=untrusted(results.records),
             bins=by_object(scores),
@@ -108,7 +111,7 @@ def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, G
     """Of the objects that the run is about, of all others, and of each of these that certainly lost."""
     names = list(results.names)
     same = all(_same(results, label) for label in range(len(names)))
-    scores = Resampled.of(shown.detections, shown.test, len(names))
+    scores = Resampled.of(shown.detections, shown.test, len(names), score=results.score)
     present = [names[label] for label in scores.present]
 
     def gain(of: Sequence[str]) -> Gain:
@@ -156,7 +159,7 @@ def _score_rows(results: RunResults) -> list[ScoreRow]:
 
     order = sorted(results.names, key=lambda name: name not in results.biased)
     rows = [row(name, {w: s["per_class"][name] for w, s in results.ap.items()}) for name in order]
-    return [*rows, row("mean", {w: s["ap"] for w, s in results.ap.items()})] if results.ap else []
+    return [*rows, row("mean", {w: mean_of(s) for w, s in results.ap.items()})] if results.ap else []
 
 
 def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
@@ -166,7 +169,7 @@ def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
     if "matched" in results.ap:
         per_class = results.ap["matched"]["per_class"]
         bounds = {"matched": sum(per_class[name] for name in aim) / len(aim)}
-    return charts.curve_chart(results.curve, list(aim), bounds)
+    return charts.curve_chart(results.curve, list(aim), bounds, results.score)
 
 
 def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
@@ -179,13 +182,15 @@ def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
     return pictures.labelled(images, rows, results.names)
 
 
-def _examples(shown: Shown, names: Sequence[str]) -> dict[str, list[Picture]]:
+def _examples(shown: Shown, names: Sequence[str], score: Score) -> dict[str, list[Picture]]:
     """Test images by what the training on the learned distribution changed, a few of each kind spread over the set."""
     test, kinds = shown.test, {"won": [], "lost": [], "still wrong": [], "right": []}
     for row in range(len(test)):
         own = test.labels[row] >= 0
         truth = test.boxes[row][own], test.labels[row][own]
-        before, after = (pictures.right(shown.detections[which][row], *truth) for which in ("ns", "learned"))
+        before, after = (
+            pictures.right(shown.detections[which][row], *truth, score) for which in ("ns", "learned")
+        )
         kind = ("right" if before else "won") if after else ("lost" if before else "still wrong")
         kinds[kind].append(row)
     found = {}

@@ -10,18 +10,21 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.report.bootstrap import average_precision, match
+from neural_sim.detector.protocol import Score
+from neural_sim.report.bootstrap import class_score, match
 from neural_sim.report.statistics import Estimate, with_intervals
 from neural_sim.types import LabelledImages
 
 Outcome = Literal["better", "worse", "no difference", "not scored"]
 WHICH: tuple[str, ...] = ("ns", "learned", "matched")
 PERCENT = 100.0
+POINTS: dict[Score, str] = {"AP": "AP", "accuracy": "points of accuracy"}
+"""The unit of a score in a sentence."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """AP of a set of classes, as fractions.
+    """AP (or accuracy) of a set of classes, as fractions.
 
     ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % bootstrap intervals over test images.
     ``room`` is None where matched and ns are one distribution.
@@ -49,7 +52,8 @@ class Gain:
 
 @dataclass(frozen=True)
 class Resampled:
-    """AP of every class by the detections of ns, learned and matched on one test set, and under resampled images.
+    """AP (or accuracy) of every class by the detections of ns, learned and matched on one test set, and under resampled
+    images.
 
     ``point`` is [3, classes], ``spread`` [draws, 3, classes]; nan for a class without a box.
     """
@@ -63,13 +67,16 @@ class Resampled:
         test: LabelledImages,
         classes: int,
         draws: int = 200,
+        score: Score = "AP",
     ) -> Resampled:
         """All classes under the same resampled images, so that differences between any of them are paired."""
-        matches = [[match(detections[which], test, label) for label in range(classes)] for which in WHICH]
+        matches = [
+            [match(detections[which], test, label, score) for label in range(classes)] for which in WHICH
+        ]
         random, count = np.random.default_rng(0), len(test)
 
         def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[float]]:
-            return [[average_precision(m, weights) for m in row] for row in matches]
+            return [[class_score(m, weights) for m in row] for row in matches]
 
         weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
         return Resampled(np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights]))
@@ -113,21 +120,23 @@ def negated(estimate: Estimate) -> Estimate:
     return Estimate(-estimate.value, low, high)
 
 
-def verdict(gain: Gain | None) -> str:
-    """One sentence for the top of the page."""
+def verdict(gain: Gain | None, score: Score = "AP") -> str:
+    """One sentence for the top of the page; ``score`` is what ``gain`` is of."""
     if gain is None:
         return "The detectors were not scored on test images, so whether it worked is not known."
     points, bounds, who = PERCENT * gain.gain.value, interval(gain.gain), listed(gain.names)
+    change = f"{abs(points):.1f} {POINTS[score]}"
     reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
     if gain.outcome == "better":
-        text = (
-            f"It worked: training on the learned distribution gives {points:.1f} AP more on {who} ({bounds})"
-        )
+        text = f"It worked: training on the learned distribution gives {change} more on {who} ({bounds})"
         return f"{text}, from {reached}{_of_the_room(gain)}."
     if gain.outcome == "worse":
         bounds = interval(negated(gain.gain))
-        return f"It made things worse: training on the learned distribution costs {-points:.1f} AP on {who} ({bounds})."
-    text = f"No difference can be told: the learned distribution changes the AP of {who} by {points:+.1f} ({bounds})"
+        return (
+            f"It made things worse: training on the learned distribution costs {change} on {who} ({bounds})."
+        )
+    changes = f"changes the {score} of {who} by {points:+.1f}"
+    text = f"No difference can be told: the learned distribution {changes} ({bounds})"
     return f"{text}{_of_the_room(gain)}."
 
 

@@ -1,4 +1,4 @@
-"""AP by the bin of the target images: where the detector is still weak."""
+"""AP, or accuracy, by the bin of the target images: where the detector is still weak."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from neural_sim.report.bootstrap import average_precision, match
+from neural_sim.detector.protocol import Score
+from neural_sim.report.bootstrap import class_score, match
 from neural_sim.types import LabelledImages
 
 
 @dataclass(frozen=True)
 class BinScore:
-    """AP (a fraction) of an object on the images that show it from one bin (from 1), by detector, the one in question
-    last.
+    """AP or accuracy (a fraction) of an object on the images that show it from one bin (from 1), by detector, the one
+    in question last.
 
     ``fraction`` is the part of the object's images that are from this bin.
     """
@@ -48,12 +49,13 @@ def bin_scores(
     detections: Mapping[str, Sequence[Mapping[str, Tensor]]],
     test: LabelledImages,
     at_least: int = 5,
+    score: Score = "AP",
 ) -> list[BinScore]:
     """Every object's bins with ``at_least`` images or more, by the detections of each detector. Images of unknown bins
     are left out."""
     scores = []
     for label, name in enumerate(names):
-        matches = {which: match(found, test, label) for which, found in detections.items()}
+        matches = {which: match(found, test, label, score) for which, found in detections.items()}
         shown = _bins_shown(test, label)
         total = int(shown.any(-1).sum())
         for column in range(shown.shape[1]):
@@ -61,7 +63,7 @@ def bin_scores(
             count = int(rows.sum())
             if count >= at_least:
                 weights = rows.double().numpy()
-                ap = {which: average_precision(m, weights) for which, m in matches.items()}
+                ap = {which: class_score(m, weights) for which, m in matches.items()}
                 scores.append(BinScore(name, column + 1, count, count / total, ap))
     return scores
 

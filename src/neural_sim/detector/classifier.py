@@ -1,0 +1,110 @@
+"""A classifier: a backbone, global average pooling, one linear layer.
+
+It is a detector of one anchor, the whole image, whose box nobody learns: its loss is the cross-entropy of the image's
+class, and its one detection is the best class, with its softmax probability as the score.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from neural_sim.detector.on_backbone import BackboneDetector, check_common
+from neural_sim.detector.protocol import Outputs, Parameters, Score
+from neural_sim.detector.settings import ARCHITECTURES, Backbone, Detections, check
+from neural_sim.detector.targets import IGNORED, Targets
+
+
+class Classifier(BackboneDetector):
+    """Classifies images of one size, each of which shows one object. An image without an object (label -1) has no
+    loss.
+
+    See :class:`BackboneDetector` for the arguments, which it checks.
+    """
+
+    score: ClassVar[Score] = "accuracy"
+    detections = Detections(score_threshold=0.0, limit=1, candidates=1)
+
+    def __init__(
+        self,
+        num_classes: int,
+        image_size: int | tuple[int, int] = 96,
+        backbone: Backbone = Backbone(),
+        activation: str = "silu",
+        proximal: float = 0.0,
+    ) -> None:
+        check_common(num_classes, activation, proximal)
+        check("detector", num_classes=(num_classes, num_classes >= 2, "at least 2, for a classifier"))
+        last = ARCHITECTURES[backbone.architecture][-1]
+        super().__init__(num_classes, image_size, backbone, (last,), activation, proximal)
+        self._predictor = nn.Sequential(OrderedDict(head=nn.Linear(self._widths[0], num_classes)))
+
+    def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
+        """The backbone's last map, averaged over the image, [n, c].
+
+        Raises:
+            ValueError: where the images are not of the classifier's size.
+        """
+        (maps,) = super().features(backbone, images)
+        return (maps.mean((2, 3)),)
+
+    def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
+        """Logits [n, 1, classes], and for the box a code of zeros [n, 1, 4], which says nothing."""
+        logits = functional_call(self._predictor, trainable, (features[0],), strict=True)[:, None]
+        return logits, logits.new_zeros((*logits.shape[:2], 4))
+
+    def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
+        """The class of each image's boxes, ``IGNORED`` without one.
+
+        Raises:
+            ValueError: where a label is not below ``num_classes``, or an image shows objects of two classes.
+        """
+        self.check_labels(labels)
+        own = class_of(labels)
+        classes = torch.where(own >= 0, own, IGNORED)[:, None]
+        return Targets(classes, boxes.new_zeros((len(classes), 1, 4)))
+
+    def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
+        """Cross-entropy of each image's class, 0 for an image without one."""
+        logits, labels = outputs[0][:, 0], targets.labels
+        wanted = logits.gather(1, labels.clamp(min=0))[:, 0]
+        return (logits.logsumexp(1) - wanted) * (labels[:, 0] >= 0)
+
+    def ranking(self, outputs: Outputs) -> Float[Tensor, "n 1 classes"]:
+        """The logits of softmax probabilities, log p / (1 - p)."""
+        logits = outputs[0]
+        itself = torch.eye(logits.shape[-1], dtype=torch.bool, device=logits.device)
+        others = torch.where(itself, -torch.inf, logits[..., None, :]).logsumexp(-1)
+        return logits - others
+
+    def decode(
+        self, code: Float[Tensor, "*n 4"], anchor: Int[Tensor, "m"] | None = None
+    ) -> Float[Tensor, "*n 4"]:
+        """The whole image."""
+        height, width = self.image_size
+        return torch.zeros_like(code) + code.new_tensor([0.0, 0.0, width, height])
+
+
+def class_of(labels: Int[Tensor, "n boxes"]) -> Int[Tensor, "n"]:
+    """The class of each image, -1 for an image without a box.
+
+    Raises:
+        ValueError: an image with boxes of two classes.
+    """
+    if labels.shape[1] == 0:
+        return labels.new_full((len(labels),), -1)
+    own = labels.amax(1)
+    mixed = ((labels >= 0) & (labels != own[:, None])).any(1)
+    if bool(mixed.any()):
+        row = int(mixed.nonzero()[0])
+        raise ValueError(
+            f"classifier: want objects of one class in an image, got {sorted(set(labels[row].tolist()) - {-1})} in "
+            f"image {row}; a detector (task=detection) takes several"
+        )
+    return own

@@ -1,0 +1,118 @@
+"""What detectors on a backbone have in common: initial values, which of them are trained, features of images.
+
+The modules here are only the network's shape. Their values always come in as an argument, so that training losses can
+be differentiated any number of times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, build_backbone
+from neural_sim.detector.initialise import initialise
+from neural_sim.detector.network import NormalisedBackbone
+from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.detector.settings import SAVED, Backbone, check
+
+
+class BackboneDetector(Detector):
+    """A detector whose images go through a backbone. A subclass sets ``_predictor``, the network on its features.
+
+    ``normalisation`` is what the backbone does first to the channels (red, green, blue) of images in [0, 1].
+
+    Args:
+        num_classes: classes, from 0, without a background class.
+        image_size: (height, width) in pixels, or one number for a square.
+        backbone: its settings.
+        strides: of its maps that are features.
+        activation: ``silu`` or ``relu`` (torchvision's own).
+        proximal: see :class:`Detector`.
+        prior: foreground probability that the untrained predictor gives; None: it has no such output.
+    """
+
+    normalisation: ClassVar[dict[str, tuple[float, ...]]] = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
+    _predictor: nn.Module
+
+    def __init__(
+        self,
+        num_classes: int,
+        image_size: int | tuple[int, int],
+        backbone: Backbone,
+        strides: Sequence[int],
+        activation: str,
+        proximal: float,
+        prior: float | None = None,
+    ) -> None:
+        self.num_classes = num_classes
+        height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+        self.image_size = (height, width)
+        self.proximal, self._settings, self._prior = proximal, backbone, prior
+        body = build_backbone(backbone.architecture, tuple(strides), activation, backbone.weights)
+        self._backbone = NormalisedBackbone(body)
+        self._widths = [body.channels[stride] for stride in strides]
+
+    def init(self, generator: torch.Generator) -> Parameters:
+        """Fresh parameters in float32 on the CPU; pretrained backbones keep their weights.
+
+        The dictionary also holds a frozen batch normalisation's statistics, so that it is complete.
+
+        Raises:
+            ValueError: a detector of a model file, whose parameters are there.
+        """
+        if self._settings.weights == SAVED:
+            raise ValueError(
+                f"detector.backbone.weights: {SAVED!r} is for detectors that are read from a model file; want null, "
+                "a file or a name of torchvision's"
+            )
+        backbone = self._backbone.state_dict()
+        if self._settings.weights is None:
+            backbone = initialise(self._backbone, generator)
+        predictor = initialise(self._predictor, generator, self._prior)
+        return {name: value.detach().clone() for name, value in {**backbone, **predictor}.items()}
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of all parameters, by name."""
+        state = {**self._backbone.state_dict(), **self._predictor.state_dict()}
+        return {name: tuple(value.shape) for name, value in state.items()}
+
+    def learnable(self, params: Parameters) -> list[str]:
+        """Names of everything that a full training changes: all but frozen statistics or a frozen backbone."""
+        learned = (self._predictor,) if self._settings.freeze else (self._backbone, self._predictor)
+        names = {n for module in learned for n, _ in module.named_parameters()}
+        return [name for name in params if name in names]
+
+    def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
+        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
+
+        Raises:
+            ValueError: where the images are not of the detector's size.
+        """
+        if tuple(images.shape[-3:]) != (3, *self.image_size):
+            raise ValueError(
+                f"detector: images want shape [n, 3, {self.image_size}], got {tuple(images.shape)}"
+            )
+        dtype = next(value.dtype for value in backbone.values() if value.is_floating_point())
+        return functional_call(self._backbone, backbone, (images.to(dtype),), strict=True)
+
+    def check_labels(self, labels: Tensor) -> None:
+        """Raises ``ValueError`` where a label is not below ``num_classes``."""
+        if labels.numel() and int(labels.max()) >= self.num_classes:
+            raise ValueError(f"assign: labels want to be below {self.num_classes}, got {int(labels.max())}")
+
+
+def check_common(num_classes: int, activation: str, proximal: float) -> None:
+    """Raises ``ValueError`` for one of these that is out of its range."""
+    check(
+        "detector",
+        num_classes=(num_classes, num_classes >= 1, "at least 1"),
+        activation=(activation, activation in ACTIVATIONS, f"one of {tuple(ACTIVATIONS)}"),
+        proximal=(proximal, 0 <= proximal < math.inf, "finite and at least 0"),
+    )
