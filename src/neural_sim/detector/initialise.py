@@ -15,7 +15,7 @@ def initialise(
 
     Convolutions with a bias start at standard deviation 0.01 in a predictor's ``head``, and the bias of its layer
     ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1); others keep the variance of their
-    input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017, Sec. 5.1).
+    input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017).
     """
     state = {name: value.detach().clone() for name, value in module.state_dict().items()}
     for name, part in module.named_modules():
