@@ -274,6 +274,8 @@ class MadeData:
         Raises ``AssertionError`` for a path that stands for no data.
         """
         key, equals, value = word.rpartition("=")
+        if value.startswith("../shared/") and value not in MAKERS:
+            return f"{key}{equals}{self.shared / value.removeprefix('../shared/')}"
         if value in MAKERS:
             make = MAKERS[value]
             if make not in self.made:
