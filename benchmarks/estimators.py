@@ -31,14 +31,14 @@ from estimator_runs import (  # the modules beside this one
     run_stratified,
 )
 from jaxtyping import Float
-from machine import machine
-from section import replace_section
 from torch import Tensor
 from worlds import WORLDS, Truth, hard_truth, make_world
 
 from neural_sim.cameras import orbit
 from neural_sim.gradient.pathwise import contract, draw_cotangents
 from neural_sim.outer.frozen import FrozenLoop
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.synthesis.motion import pose_rates
 from neural_sim.types import Maps, PinholeCamera
 

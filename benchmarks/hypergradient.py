@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 from field import fit, load_objects, training_views  # the benchmark beside this one
-from machine import add_device, machine
+from machine import add_device
 from torch import Tensor
 
 from neural_sim import cameras
@@ -31,6 +31,7 @@ from neural_sim.field.training import field_from_state, field_state
 from neural_sim.gradient.pathwise import contract
 from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.report.machine import machine
 from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
-from machine import add_device, machine
+from machine import add_device
 
 from neural_sim import cameras
 from neural_sim.devices import synchronise
@@ -24,6 +24,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer, Quality
+from neural_sim.report.machine import machine
 from neural_sim.types import PinholeCamera, PosedViews, Rays
 
 

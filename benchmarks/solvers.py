@@ -21,8 +21,6 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from machine import machine
-from section import replace_section
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
@@ -37,6 +35,8 @@ from neural_sim.outer.retrained import BinnedProblem, as_double, centred_cosine,
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import LinearSolver
 from neural_sim.solver.cg import ConjugateGradient
