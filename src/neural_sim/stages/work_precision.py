@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from neural_sim.field.base import RadianceField
 from neural_sim.outer.frozen import FrozenLoop
@@ -17,17 +18,32 @@ from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.machine import machine
 from neural_sim.report.work_precision import document, track, write, write_docs
+from neural_sim.report.work_precision_loop import Loops
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.context import Context
+from neural_sim.stages.report import run_results
 from neural_sim.stages.temperatures import frozen_loop
 from neural_sim.types import PosedViews
+from neural_sim.work_precision.derivative import Derivative
+from neural_sim.work_precision.estimator import Estimators
+from neural_sim.work_precision.field import Fields
+from neural_sim.work_precision.hypergradient import Hypergradients
 from neural_sim.work_precision.quadrature import Quadrature
+from neural_sim.work_precision.renderer import Renderer
 from neural_sim.work_precision.series import Clock, Series, Timing
+from neural_sim.work_precision.solver import Solver
 from neural_sim.work_precision.suite import Family, WorkPrecision
 
 _log = logging.getLogger(__name__)
-FAMILIES = ("quadrature",)
+FAMILIES = ("quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop")
 """In the order of the loop; each is a key of the stage's settings."""
+FITTED = ("views", "field")
+STARTED = (*FITTED, "target_sets", "warm_start")
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "renderer": FITTED, "field": ("views",), "hypergradient": STARTED, "estimator": STARTED, "derivative": FITTED,
+    "loop": (*STARTED, "psi", "evaluate"),
+}  # fmt: skip
+"""Stages that run before a family."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +84,16 @@ class RunWorld:
     def outer(self) -> Outer:
         return self.context.experiment.loop.outer
 
+    @property
+    def uri(self) -> str:
+        return self.context.uri
+
+    @property
+    def results(self) -> Mapping[str, Any]:
+        graph, results = self.context.graph, self.context.results
+        scores = {name: results(stage) for name, stage in graph.compared(results(graph.learned)).items()}
+        return run_results(self.context, scores, symmetric=False).document()
+
     def simulator(self, outer: Outer, solver: AdjointSolver, seed: int) -> SimulatorModule:
         """The psi loop. Raises ``ValueError`` for a method that does not follow the hypergradient."""
         stage = self.context.graph.learned
@@ -101,13 +127,27 @@ class WorkPrecisionStep:
     clock: Clock = "cpu_seconds"
     docs: str | None = None
     quadrature: Quadrature = field(default_factory=Quadrature)
+    renderer: Renderer = field(default_factory=Renderer)
+    fits: Fields = field(default_factory=Fields)
+    solver: Solver = field(default_factory=Solver)
+    hypergradient: Hypergradients = field(default_factory=Hypergradients)
+    estimator: Estimators = field(default_factory=Estimators)
+    derivative: Derivative = field(default_factory=Derivative)
+    loop: Loops = field(default_factory=Loops)
 
     def __post_init__(self) -> None:
         _ = self.suite  # raises for families and the clock
 
     @property
+    def needs(self) -> tuple[str, ...]:
+        """Stages that run before."""
+        return tuple(dict.fromkeys(stage for name in self.families for stage in NEEDS.get(name, ())))
+
+    @property
     def suite(self) -> WorkPrecision:
-        settings: dict[str, Family] = {name: getattr(self, name) for name in FAMILIES}
+        settings: dict[str, Family] = {
+            name: getattr(self, "fits" if name == "field" else name) for name in FAMILIES
+        }
         return WorkPrecision(self.families, settings, Timing(self.repeats, self.clock))
 
     def run(self, context: Context) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.field.base import RadianceField
+from neural_sim.field.rendering import render_samples
 from neural_sim.gradient.pathwise import contract
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.motion import RIGID, pose_rates
@@ -71,33 +72,46 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
 def forward(of: Case) -> Float[Tensor, "m"]:
     """By forward mode, in the pass that renders."""
     moved = of.renderer.render_with_tangents(of.field, of.camera, of.pose, of.rates)[1]
-    return torch.cat(list(contract({str(i): tangent for i, tangent in enumerate(moved)}, of.cotangent).values()))
+    return torch.cat(
+        list(contract({str(i): tangent for i, tangent in enumerate(moved)}, of.cotangent).values())
+    )
 
 
 def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
-    """By reverse mode, ``patch`` rays at a time, after a pass that renders (``gradient.pathwise.draw_cotangents``, for a
-    camera that moves linearly in any number of numbers)."""
+    """By reverse mode, ``patch`` rays at a time, after a pass that renders (``gradient.pathwise.draw_cotangents``, for
+    a camera that moves linearly in any number of numbers)."""
     of.renderer.render(of.field, of.camera, of.pose)
     rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
     total = of.pose.new_zeros(len(of.rates))
     for pixels in torch.arange(len(opacity), device=of.pose.device).split(patch):
         numbers = torch.zeros_like(total, requires_grad=True)
         rendered = of.renderer.render_rays(of.field, of.rays(numbers, pixels))
-        (part,) = torch.autograd.grad(rendered, numbers, (rgb[pixels], opacity[pixels]), materialize_grads=True)
+        (part,) = torch.autograd.grad(
+            rendered, numbers, (rgb[pixels], opacity[pixels]), materialize_grads=True
+        )
         total += part
     return total
 
 
 @torch.no_grad()
-def difference(of: Case, step: float) -> Float[Tensor, "m"]:
-    """By central differences of renders of all rays, two for each number."""
+def difference(of: Case, step: float, same: bool) -> Float[Tensor, "m"]:
+    """By central differences of renders of all rays, two for each number.
+
+    ``same``: at the samples of the unmoved camera, as the derivatives have it. Otherwise each render chooses its own,
+    so that samples behind the termination come and go, in jumps that no small step removes.
+    """
+    field = of.field.with_step(of.renderer.step)
     pixels = torch.arange(of.camera.width * of.camera.height, device=of.pose.device)
     rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
+    samples = field.sample(of.rays(of.pose.new_zeros(len(of.rates)), pixels), of.renderer.termination)
     found = []
     for moved in torch.eye(len(of.rates)).to(of.pose) * step:
         sides = []
         for sign in (1.0, -1.0):
-            colour, alpha = of.renderer.render_rays(of.field, of.rays(sign * moved, pixels))
+            rays = of.rays(sign * moved, pixels)
+            colour, alpha = (
+                render_samples(field, rays, samples) if same else of.renderer.render_rays(of.field, rays)
+            )
             sides.append((colour * rgb).sum() + (alpha * opacity).sum())
         found.append((sides[0] - sides[1]) / (2.0 * step))
     return torch.stack(found)
@@ -147,7 +161,12 @@ class Derivative:
                 "reverse mode of the whole image in float64."
             )
             yield Series(
-                f"derivative/by {count}", "relative error of the derivative", tuple(points), (), note, timing.clock
+                f"derivative/by {count}",
+                "relative error of the derivative",
+                tuple(points),
+                (),
+                note,
+                timing.clock,
             )
 
     def ways(self, of: Case, precise: Case) -> Iterator[tuple[str, str, Case, Way]]:
@@ -159,10 +178,12 @@ class Derivative:
             if patch < self.size**2:
                 yield f"reverse, patches of {patch}", "reverse", of, lambda one, p=patch: reverse(one, p)
         yield "reverse, whole", "reverse", of, lambda one: reverse(one, self.size**2)
-        for name, one in (("float32", of), ("float64", precise)):
+        for line, one, same in (
+            ("differences", of, True), ("differences in float64", precise, True),
+            ("differences of new renders in float64", precise, False),
+        ):  # fmt: skip
             for step in self.steps:
-                line = f"differences, {name}"
-                yield f"{line}, {step:g}", line, one, lambda case, h=step: difference(case, h)
+                yield f"{line}, {step:g}", line, one, lambda case, h=step, s=same: difference(case, h, s)
 
     def _point(self, name: str, line: str, of: Case, way: Way, truth: Tensor, timing: Timing) -> Point:
         error = float((way(of).double() - truth).norm() / truth.norm())

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -35,7 +34,9 @@ class Left:
     samples: float
 
 
-def variants(renderer: NerfRenderer, terminations: Sequence[float], steps: Sequence[float]) -> dict[str, NerfRenderer]:
+def variants(
+    renderer: NerfRenderer, terminations: Sequence[float], steps: Sequence[float]
+) -> dict[str, NerfRenderer]:
     """Renderers by ``line, setting``: the qualities, the run's own with one omission undone, and with other values."""
     own: dict[str, object] = {"termination": renderer.termination, "step": renderer.step}
     own |= {"cull": renderer.cull, "skip_empty": renderer.skip_empty}
@@ -109,8 +110,13 @@ class Renderer:
             f"Images of {self.size} x {self.size} pixels from {len(poses)} views of {', '.join(world.names)}, against "
             "renders with nothing left out, at the field's own step; seconds are an image's."
         )
-        for kind, label in (("opacity", "mean error of opacity"), ("colour", "root mean square error of colour")):
-            points = tuple(self._point(name, row, kind, world.renderer.quality) for name, row in found.items())
+        for kind, label in (
+            ("opacity", "mean error of opacity"),
+            ("colour", "root mean square error of colour"),
+        ):
+            points = tuple(
+                self._point(name, row, kind, world.renderer.quality) for name, row in found.items()
+            )
             yield Series(f"renderer/{kind}", label, points, (), note, timing.clock)
 
     def _means(
@@ -122,10 +128,18 @@ class Renderer:
             device = next(field.parameters()).device
             at = poses.to(device)
             seconds, memory = timing.of(lambda f=field, p=at: renderer.render(f, camera, p), device)
-            rows.append({**vars(left_out(field, renderer, camera, at)), "seconds": seconds / len(at), "memory": memory})
+            memory = math.nan if memory is None else memory
+            rows.append(
+                {
+                    **vars(left_out(field, renderer, camera, at)),
+                    "seconds": seconds / len(at),
+                    "memory": memory,
+                }
+            )
         return {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
 
     def _point(self, name: str, row: Mapping[str, float], kind: str, quality: str) -> Point:
         detail = f"{row['cast']:.0%} of the pixels, {row['samples']:.1f} samples a ray that hits"
         default = name == f"quality, {quality}"
-        return Point(name, row[kind], row["seconds"], row["memory"], default, name.partition(",")[0], detail)
+        memory = None if math.isnan(row["memory"]) else row["memory"]
+        return Point(name, row[kind], row["seconds"], memory, default, name.partition(",")[0], detail)

@@ -7,18 +7,21 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 
 from neural_sim.devices import synchronise
 from neural_sim.outer.peak_memory import peak_bytes
 
+T = TypeVar("T")
 Clock = Literal["cpu_seconds", "seconds"]
 """Processor time of all threads, which other work on the machine hardly changes, or time on the wall."""
 CLEARLY = 0.9
 """Part of a default's time below which another setting of no larger error beats it: timings vary by some percent."""
-SHORTEST = 0.02
+RECORDED = 0.1
+"""Seconds up to which a run's memory is measured: the record of a longer run's allocations takes gigabytes."""
+SHORTEST = 0.05
 """Seconds that a timed run takes at least; shorter ones are repeated within it."""
 
 
@@ -154,25 +157,24 @@ class Timing:
             synchronise(device)
         return time.process_time() if self.clock == "cpu_seconds" else time.perf_counter()
 
-    def once(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, object]:
+    def once(self, run: Callable[[], T], device: torch.device | None = None) -> tuple[float, T]:
         """Seconds of one run, for what takes long; its result."""
         begun = self.now(device)
         value = run()
         return self.now(device) - begun, value
 
-    def of(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, float]:
+    def of(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, float | None]:
         """Seconds and memory (MiB) of ``run``; the run whose memory is measured does not count for the seconds.
 
-        One that takes less than ``SHORTEST`` is run as often as fills that, which gives its mean.
+        One that takes less than ``SHORTEST`` is run as often as fills that, which gives its mean. Memory is None for
+        one that takes longer than ``RECORDED``.
         """
-        memory = peak_bytes(run, device) / 2**20
         first = self.once(run, device)[0]
+        memory = peak_bytes(run, device) / 2**20 if first < RECORDED else None
         times = math.ceil(SHORTEST / max(first, 1e-5))
 
         def several() -> None:
             for _ in range(times):
                 run()
 
-        if times == 1 and self.repeats == 1:
-            return first, memory
         return statistics.median(self.once(several, device)[0] / times for _ in range(self.repeats)), memory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from neural_sim.field.base import RadianceField
 from neural_sim.outer.frozen import FrozenLoop
@@ -61,6 +61,16 @@ class World(Protocol):
     @property
     def outer(self) -> Outer:
         """The psi loop's own settings."""
+        ...
+
+    @property
+    def uri(self) -> str:
+        """Of the MLflow store."""
+        ...
+
+    @property
+    def results(self) -> Mapping[str, Any]:
+        """The content of the run's own results.json, after its psi loop and evaluation."""
         ...
 
 
