@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from neural_sim.report import figures, tracking
 from neural_sim.report.section import replace_section
@@ -147,6 +148,11 @@ def figure(series: Series) -> Figure:
     axes.grid(color=figures.GRID)
     axes.set_axisbelow(True)
     figures.style(axes)
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if high < 100.0 * low:  # fewer than two powers of ten, which would be the only labels
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
     axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0),
                 title="filled: optimal", title_fontsize=7)  # fmt: skip
     return made

@@ -37,6 +37,8 @@ from neural_sim.work_precision.suite import Family, WorkPrecision
 _log = logging.getLogger(__name__)
 FAMILIES = ("quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop")
 """In the order of the loop; each is a key of the stage's settings."""
+COMMAND = "python -m src.main +experiment=work_precision"
+"""What a documentation page says that makes its sections; they are to be made at its scale, quick."""
 FITTED = ("views", "field")
 STARTED = (*FITTED, "target_sets", "warm_start")
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -167,12 +169,7 @@ class WorkPrecisionStep:
         held = document(found, machine(), [])
         print(write(found, held, context.folder))
         if self.docs is not None:
-            write_docs(held, Path(self.docs), _command(config))
+            write_docs(held, Path(self.docs), COMMAND)
         run = track(found, config, context.uri, context.folder, begun)
         print(f"{time.time() - begun:.0f} s\nresults: {context.folder}\n{run.where}")
         context.returned = 0.0
-
-
-def _command(config: dict) -> str:
-    families = ",".join(config["work_precision"]["families"])
-    return f"python -m src.main +experiment=work_precision 'work_precision.families=[{families}]'"

@@ -134,7 +134,7 @@ class Derivative:
     size: int = 64
     numbers: tuple[int, ...] = (1, 12)
     patches: tuple[int, ...] = (64, 512)
-    steps: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4)
+    steps: tuple[float, ...] = (1e-2, 1e-4, 1e-6)
 
     def __post_init__(self) -> None:
         positive = (self.size, *self.patches, *self.steps)

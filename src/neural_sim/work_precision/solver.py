@@ -26,6 +26,8 @@ from neural_sim.work_precision.suite import World
 
 UNKNOWNS = 200
 """Of the linear systems of a given condition number."""
+Setting = tuple[str, str, AdjointSolver, bool]
+"""Its name, its line, the solver, whether it is the project's own."""
 TIGHT = 1e-12
 """Relative residual that a solve by steps is asked for, so that its steps end it."""
 
@@ -76,8 +78,8 @@ class Solver:
         detector: makes the detector of the solves, small enough for a dense Hessian.
         timed: makes the detector whose Hessian products are timed.
         default: the project's own among ``solvers``.
-        rtols: relative residuals of solves by the default solver with its own damping.
-        steps: of the solves with a fixed damping.
+        rtols: relative residuals of solves that choose their own damping, beside the configured one.
+        steps: of the solves with a given damping.
         factors: of the damping that the default chooses; a series each.
         conditions: condition numbers of linear systems; a series each.
         images: of ``timed``, at ``size`` pixels a side.
@@ -126,25 +128,38 @@ class Solver:
         random = torch.Generator().manual_seed(seed)
         chosen = own.damping.choose(own.operator(terms, params), b, random).value
         spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
+        problem_of = (terms, params, b)
+        yield self._solves(
+            "damping of its own", list(self._own()), *problem_of, oracle, chosen, spent, timing, seed,
+            " Each chooses its lambda itself, from products that count; a solve starts from these.",
+        )  # fmt: skip
         for factor in self.factors:
             value = factor * chosen
-            settings, truth = list(self._settings(value, own if factor == 1.0 else None)), oracle.solve(value)
-            points = [self._point(*each, terms, params, b, truth, timing, seed) for each in settings]
-            low, high = (float(oracle.values[place]) + value for place in (0, -1))
-            condition = high / low if low > 0.0 else math.inf
-            note = (
-                f"(H + lambda I)^-1 dL_val/dtheta of a detector of {b.numel()} trained numbers after its training, "
-                f"float64, lambda = {value:.3g}, {factor:g} times what the default chooses (eigenvalues {low:.2g} to "
-                f"{high:.3g}, condition {condition:.3g}); against the dense matrix, whose eigenvalues take "
-                f"{spent:.3g} s."
+            named = f"lambda {value:.3g} given"
+            more = f" This lambda, {factor:g} times what the default chooses, is given; no product is spent on it."
+            yield self._solves(
+                named, list(self._given(value)), *problem_of, oracle, value, spent, timing, seed, more
             )
-            name = f"solver/lambda {value:.3g}"
-            yield Series(name, "relative error of the product", tuple(points), (), note, timing.clock)
 
-    def _settings(
-        self, value: float, own: AdjointSolver | None
-    ) -> Iterator[tuple[str, str, AdjointSolver, bool]]:
-        """Setting, line, solver, whether it is the default. ``own``: also with the damping that it chooses itself."""
+    def _solves(
+        self, name: str, settings: Sequence[Setting], terms: Sequence[Term], params: Parameters, b: Tensor,
+        oracle: Oracle, value: float, spent: float, timing: Timing, seed: int, more: str,
+    ) -> Series:  # fmt: skip
+        truth = oracle.solve(value)
+        points = [self._point(*each, terms, params, b, truth, timing, seed) for each in settings]
+        low, high = (float(oracle.values[place]) + value for place in (0, -1))
+        condition = high / low if low > 0.0 else math.inf
+        note = (
+            f"(H + lambda I)^-1 dL_val/dtheta of a detector of {b.numel()} trained numbers after its training, "
+            f"float64, lambda = {value:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); against "
+            f"the dense matrix, whose eigenvalues take {spent:.3g} s.{more}"
+        )
+        return Series(
+            f"solver/{name}", "relative error of the product", tuple(points), (), note, timing.clock
+        )
+
+    def _given(self, value: float) -> Iterator[Setting]:
+        """By steps, with a lambda that is given."""
         fixed = FixedDamping(value, 0)
         for name, solver in self.solvers.items():
             once = name == "identity"  # takes no steps
@@ -156,16 +171,22 @@ class Solver:
                     replace(solver, damping=fixed, rtol=TIGHT, max_steps=steps, max_raises=0),
                     False,
                 )
-        base = replace(self.solvers[self.default], damping=fixed, rtol=TIGHT, max_raises=0)
-        for product, how in PRODUCTS.items():
-            if how.of(base) != base:
-                for steps in self.steps:
-                    line = f"{self.default}, {product}"
-                    yield f"{line}, {steps} steps", line, how.of(replace(base, max_steps=steps)), False
-        if own is not None:
-            line = f"{self.default}, its own damping"
-            for rtol in sorted({*self.rtols, own.rtol}, reverse=True):
-                yield f"{line}, rtol {rtol:g}", line, replace(own, rtol=rtol), rtol == own.rtol
+
+    def _own(self) -> Iterator[Setting]:
+        """By tolerance, as configured, with the damping that each chooses; and the default by other products."""
+        own = self.solvers[self.default]
+        others = {
+            f"{self.default}, {how}": PRODUCTS[how].of(own)
+            for how in PRODUCTS
+            if PRODUCTS[how].of(own) != own
+        }
+        for name, solver in {**self.solvers, **others}.items():
+            for rtol in (
+                [solver.rtol] if name == "identity" else sorted({*self.rtols, solver.rtol}, reverse=True)
+            ):
+                default = name == self.default and rtol == solver.rtol
+                named = name if name == "identity" else f"{name}, rtol {rtol:g}"
+                yield named, name, replace(solver, rtol=rtol), default
 
     def _point(
         self, name: str, line: str, solver: AdjointSolver, default: bool, terms: Sequence[Term], params: Parameters,
