@@ -7,7 +7,6 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +57,11 @@ class RunWorld:
     def names(self) -> tuple[str, ...]:
         return self.context.graph.names
 
-    @cached_property
+    @property
     def fields(self) -> Sequence[RadianceField]:
         return [self.context.results(stage).field for stage in self.context.graph.fields]
 
-    @cached_property
+    @property
     def views(self) -> PosedViews:
         return self.context.results(self.context.graph.views[0])
 
@@ -75,10 +74,6 @@ class RunWorld:
         return self.context.experiment.imaging.renderer
 
     @property
-    def size(self) -> int:
-        return self.context.experiment.training.image_size
-
-    @cached_property
     def loop(self) -> FrozenLoop:
         return frozen_loop(self.context, self.context.experiment.run.seed)
 

@@ -17,7 +17,7 @@ from neural_sim.work_precision.series import Series, Timing
 
 
 class World(Protocol):
-    """What a run makes for the families, each when it is first asked for."""
+    """What a run makes for the families, each when it is asked for."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -42,11 +42,6 @@ class World(Protocol):
     @property
     def renderer(self) -> NerfRenderer:
         """The run's own."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Pixels a side of synthesised images."""
         ...
 
     @property
