@@ -55,7 +55,7 @@ def test_the_tables_are_written_from_the_json_alone():
     )
     assert "| draft | 0.1 | 1 | 2 | yes | few samples |" in text
     assert "Order of quality for steps of 0.1 to 0.01 radii: 1.98, in theory 2." in text
-    assert "final, is not Pareto-optimal: clever has 1 times less error and takes 0.50 of the time." in text
+    assert "final, is not Pareto-optimal: clever has the same error and takes 0.50 of the time." in text
     assert "field" not in text and "a processor" in text
 
 

@@ -105,7 +105,10 @@ def _order(order: Row) -> str:
 
 
 def _overtaken(each: Row) -> str:
-    less = "no error" if each["error_ratio"] is None else f"{each['error_ratio']:.2g} times less error"
+    ratio = each["error_ratio"]
+    less = (
+        "no error" if ratio is None else "the same error" if ratio < 1.01 else f"{ratio:.2g} times less error"
+    )
     faster = (
         f"takes {1.0 / each['seconds_ratio']:.2f} of the time" if each["seconds_ratio"] else "takes no time"
     )

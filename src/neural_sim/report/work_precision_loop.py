@@ -65,6 +65,8 @@ def series(
             )
             error = 1.0 - fmean(biased_ap(point, run) for point, run in points)
             spent = fmean(point[clock] for point, _ in points)
+            if spent <= 0.0:  # the start, before any work
+                continue
             scored.append(
                 Point(
                     setting,
