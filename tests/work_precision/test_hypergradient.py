@@ -61,6 +61,18 @@ def test_a_derivative_that_is_the_response_has_no_error(monkeypatch):
     assert series.points[0].error == pytest.approx(0.0, abs=1e-12)
 
 
+def test_ways_see_the_same_images_probes_and_training():
+    """So that exact products and central differences of gradients differ by rounding alone."""
+    loop, named = simulator(OUTER, SOLVER, 0), ways(OUTER, SOLVER)
+    first, again = (slopes(loop, named[DEFAULT])[0] for _ in range(2))
+    assert torch.equal(first, again)
+    exact, differences = (
+        slopes(loop, named[f"unrolled, {how}"])[0] for how in ("exact products", "central differences")
+    )
+    # Central differences in float32 are known to eps^(2/3) = 2e-5 of the gradients' scale, step by step.
+    assert float((exact - differences).norm() / exact.norm()) < 0.05
+
+
 def test_correlation_of_known_vectors():
     up, still = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[1.0, 1.0, 1.0]])
     assert correlation(up, -up) == pytest.approx(-1.0) and correlation(up, still) == 0.0

@@ -114,10 +114,15 @@ class Hypergradients:
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
-    """The rise of an object's score by the part of its images that moves to each bin, by a derivative; its seconds. The
-    loop's own random numbers are common to all ways."""
+    """The rise of an object's score by the part of its images that moves to each bin, by a derivative; its seconds.
+
+    Images, training and probes are the same for all ways: the loop's common random numbers, and its generator anew.
+    """
     inner = copy.copy(loop.inner)
-    inner.settings = way.outer
+    inner.settings, inner.generator = (
+        way.outer,
+        torch.Generator().manual_seed(loop.inner.generator.initial_seed()),
+    )
     other = SimulatorModule(inner, loop.psi.detach().clone(), loop.estimator, way.solver)
     found = other.derivative()
     p = torch.cat([*loop.scene.distribution.probabilities(loop.psi.detach()).values()], -1)
