@@ -64,7 +64,9 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """The benchmarks: tables on the screen, JSON under outputs/benchmarks."""
+    """Error against run time, and the other benchmarks: tables on the screen, JSON under outputs."""
     _install(session)
-    for name in session.posargs or ["field", "render", "hypergradient", "outer", "left_out"]:
+    if not session.posargs:
+        session.run("python", "-m", "src.main", "+experiment=work_precision")
+    for name in session.posargs or ["field", "render", "outer", "left_out"]:
         session.run("python", f"benchmarks/{name}.py")

@@ -17,7 +17,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from scipy.stats import f_oneway, skew
-from section import replace_section
 from torch import Tensor
 from torch.nn.functional import one_hot
 from worlds import make_world
@@ -30,6 +29,7 @@ from neural_sim.gradient.stratified import stratified
 from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.report.section import replace_section
 
 DOUBLE = torch.float64
 BINS, LIGHTS, IMAGES, LEVEL = 8, 6, 50, 0.05

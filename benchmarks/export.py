@@ -17,12 +17,13 @@ from pathlib import Path
 
 import torch
 from field import fit, load_objects, training_views  # the benchmark beside this one
-from machine import machine, memory_mb
+from machine import memory_mb
 
 from neural_sim.cameras import reframed
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.report.machine import machine
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export.dataset import ImageWriter
 from neural_sim.synthesis.export.images import ImageSource

@@ -20,14 +20,14 @@ import torch
 from foretold_report import WAYS, report
 from hydra import compose, initialize_config_dir
 from jaxtyping import Float
-from machine import machine
-from section import replace_section
 from torch import Tensor
 
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import response
 from neural_sim.outer.retrained import centred_cosine
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.context import Context
 

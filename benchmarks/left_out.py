@@ -19,7 +19,6 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from machine import machine
 from render import measure as measure_render
 from render import variants
 from tolerance import State, shortened, state
@@ -29,6 +28,7 @@ from neural_sim.field.pool import build_pool
 from neural_sim.gradient.mixed import scores
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.probing import ProbeSet
+from neural_sim.report.machine import machine
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator
 from neural_sim.stages.context import Context

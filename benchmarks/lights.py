@@ -15,8 +15,6 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from machine import machine
-from section import replace_section
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative
@@ -24,6 +22,8 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.inner import InnerLoop
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.stages.context import Context
 
 WAY = (0.0, 0.2, 0.4, 0.7, 1.0)

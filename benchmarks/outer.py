@@ -21,12 +21,13 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from machine import add_device, forget_peak, gpu, machine
+from machine import add_device, forget_peak
 
 from neural_sim.devices import placed, synchronise
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.report.machine import gpu, machine
 from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import Scene
 

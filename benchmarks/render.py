@@ -16,15 +16,15 @@ from pathlib import Path
 
 import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
-from machine import add_device, machine
+from machine import add_device
 
-from neural_sim import cameras
 from neural_sim.devices import synchronise
 from neural_sim.field.base import RadianceField
-from neural_sim.field.pixels import seen_pixels
 from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer, Quality
-from neural_sim.types import PinholeCamera, PosedViews, Rays
+from neural_sim.report.machine import machine
+from neural_sim.types import PinholeCamera, PosedViews
+from neural_sim.work_precision.renderer import left_out
 
 
 def variants(qualities: list[Quality], undo: bool) -> dict[str, NerfRenderer]:
@@ -44,7 +44,7 @@ def measure(
 ) -> dict[str, float]:
     device = next(field.parameters()).device
     camera, pose = PinholeCamera(size, size, math.radians(40.0)), views.camera_to_world[-HELD_OUT:].to(device)
-    rgb, opacity = renderer.render(field, camera, pose)
+    renderer.render(field, camera, pose)
     synchronise(device)
     seconds, processor = [], []
     for _ in range(repeats):
@@ -53,24 +53,17 @@ def measure(
         synchronise(device)
         seconds.append((time.perf_counter() - begun) / len(pose))
         processor.append((time.process_time() - worked) / len(pose))
-    every_rgb, every_opacity = renderer.render(field, camera, pose, exact=True)
-    shown = (opacity > 0.01) | (every_opacity > 0.01)
-    bundle = cameras.rays(camera, pose[:1])
-    rays = Rays(bundle.origins.reshape(-1, 3), bundle.directions.reshape(-1, 3))
-    samples = field.with_step(renderer.step).sample(rays, renderer.termination)
-    hit = int((samples.starts.diff() > 0).sum())
-    cast = sum(len(seen.pixel) for seen in seen_pixels(field, camera, pose, 65536, renderer.cull))
+    lost = left_out(field, renderer, camera, pose)
     return {
         "size": size,
         "milliseconds": 1e3 * statistics.median(seconds),
         "cpu_milliseconds": 1e3 * statistics.median(processor),
         "images_per_second": 1.0 / statistics.median(seconds),
         "peak_megabytes": peak_bytes(lambda: renderer.render(field, camera, pose), device) / 2**20,
-        "rays_cast": cast / (len(pose) * size * size),
-        "rays_hit": hit / len(rays.origins),
-        "samples_per_hit_ray": len(samples) / max(hit, 1),
-        "opacity_error": float((opacity - every_opacity).abs()[shown].mean()),
-        "colour_psnr": -10.0 * math.log10(float((rgb - every_rgb).square().mean()) + 1e-20),
+        "rays_cast": lost.cast,
+        "samples_per_hit_ray": lost.samples,
+        "opacity_error": lost.opacity,
+        "colour_psnr": -20.0 * math.log10(lost.colour + 1e-10),
     }
 
 
@@ -91,7 +84,7 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     rows = []
     print(
-        f"{'object':24}{'size':>5} {'variant':13}{'ms':>7}{'cpu ms':>8}{'MB':>7}{'cast':>6}{'hit':>6}{'smp/ray':>8}"
+        f"{'object':24}{'size':>5} {'variant':13}{'ms':>7}{'cpu ms':>8}{'MB':>7}{'cast':>6}{'smp/ray':>8}"
         f"{'opacity err':>12}{'psnr':>7}"
     )
     for item in load_objects(arguments.root, arguments.names):
@@ -103,7 +96,7 @@ def main() -> None:
                 rows.append({"object": item.name, "variant": name, **row})
                 print(
                     f"{item.name:24}{size:5} {name:13}{row['milliseconds']:7.1f}{row['cpu_milliseconds']:8.1f}"
-                    f"{row['peak_megabytes']:7.1f}{row['rays_cast']:6.2f}{row['rays_hit']:6.2f}"
+                    f"{row['peak_megabytes']:7.1f}{row['rays_cast']:6.2f}"
                     f"{row['samples_per_hit_ray']:8.1f}{row['opacity_error']:12.2e}{row['colour_psnr']:7.1f}",
                     flush=True,
                 )

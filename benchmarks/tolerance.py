@@ -16,8 +16,6 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from jaxtyping import Float
-from machine import machine
-from section import replace_section
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
@@ -26,6 +24,8 @@ from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.probing import ProbeSet
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import Krylov, lanczos

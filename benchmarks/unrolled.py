@@ -19,8 +19,6 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from jaxtyping import Float, Int
-from machine import machine
-from section import replace_section
 from torch import Tensor
 from unrolled_report import centred, report
 from worlds import SMALL
@@ -34,6 +32,8 @@ from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
 from neural_sim.main import build, conf_directory
+from neural_sim.report.machine import machine
+from neural_sim.report.section import replace_section
 from neural_sim.solver.hvp import gradient
 from neural_sim.stages.context import Context
 from neural_sim.synthesis.pool import ImagePool

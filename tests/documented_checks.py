@@ -207,7 +207,26 @@ def _stress(folder, config):
     assert held and (folder / "stress.md").stat().st_size > 1000
 
 
-KINDS = {"stress": _stress, "compare": _comparison, "interpolation": _interpolation,
+def _work_precision(folder, config):
+    """usage.md, Error against run time."""
+    held = json.loads((folder / "work_precision.json").read_text())
+    families = {name.split("/")[0] for name in held["measured"]}
+    assert families == set(config["work_precision"]["families"])
+    wanted = {"name", "setting", "error", "error_kind", "seconds", "memory_mb", "default", "pareto"}
+    assert all(wanted <= set(row) for row in held["series"])
+    for name in held["measured"]:
+        assert any(row["pareto"] for row in held["series"] if row["name"] == name)
+    assert len(list((folder / "figures").glob("*.png"))) == len(held["measured"])
+    if "quadrature" in families:
+        smooth = {o["line"]: o for o in held["orders"] if o["name"] == "quadrature/smooth, opacity"}
+        assert (
+            abs(smooth["midpoint"]["observed"] - 2.0) < 0.1
+            and abs(smooth["jittered"]["observed"] - 1.5) < 0.3
+        )
+    assert (folder / "work_precision.md").stat().st_size > 1000
+
+
+KINDS = {"work_precision": _work_precision, "stress": _stress, "compare": _comparison, "interpolation": _interpolation,
              "temperatures": _temperatures, "patch_memory": _patch_memory,
              "nerf_vs_mesh": _nerf_vs_mesh, "sfm_vs_nerf": _sfm_vs_nerf, "samples_gallery": _samples_gallery,
              "detection_gallery": _detection_gallery, "experiments": _experiments}  # fmt: skip

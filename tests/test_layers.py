@@ -7,8 +7,8 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = ("types", "checks", "digests", "configuration", "cameras", "devices", "objects", "field", "renderer",
-         "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "stress", "report",
-         "stages", "main")  # fmt: skip
+         "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "stress",
+         "work_precision", "report", "stages", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -53,6 +53,7 @@ def test_heavy_libraries_stay_in_their_rooms():
                 "detection_gallery",
                 "reconstruction",
                 "levels",
+                "work_precision",
                 "histograms",
                 "layouts",
             )

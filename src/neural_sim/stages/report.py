@@ -39,7 +39,7 @@ def write_report(context: Context) -> None:
     if "evaluate" in context.stages:
         compared = graph.compared(learned).items()
         scores = {called: results(stage) for called, stage in compared}
-    report = _results(context, scores)
+    report = run_results(context, scores)
     rendered = graph.synthetic(learned.last, "learned").images(results(graph.scene))
     drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
     detections = scores["learned"].detections if scores else []
@@ -97,8 +97,8 @@ def _write_model(context: Context, test: LabelledImages) -> None:
         print(f"model: {uri}")
 
 
-def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:
-    """What there is to report: a run without evaluation has no AP."""
+def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool = True) -> RunResults:
+    """What there is to report: a run without evaluation has no AP. ``symmetric``: with the bins that look the same."""
     x, graph, results = context.experiment, context.graph, context.results
     distribution, learned = x.imaging.distribution, results(graph.learned)
     psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.psi("target")}
@@ -121,7 +121,9 @@ def _results(context: Context, scores: Mapping[str, Scores]) -> RunResults:
         config=x.config,
         curve=_curve(context) if scores else (),
         symmetric_bins={
-            name: {angle: results(graph.symmetry(name, angle)) for angle in angles} for name in graph.names
+            name: {angle: results(graph.symmetry(name, angle)) for angle in angles}
+            for name in graph.names
+            if symmetric
         },
         identity=_identity(context),
         real=_real(context),

@@ -1,0 +1,65 @@
+"""A detector small enough for its dense Hessian, trained on two objects: where solvers meet their oracle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.module import Optimisation
+from neural_sim.detector.protocol import Detector
+from neural_sim.detector.training import train_detector
+from neural_sim.field.grid import GridField
+from neural_sim.gradient.base import Probes
+from neural_sim.outer.retrained import BinnedProblem, as_double
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.solver.hvp import Term
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.types import LabelledImages, PinholeCamera
+
+BINS = 4
+PSI = torch.tensor([[0.0, 1.0, 0.0, -0.5], [0.5, 0.0, 1.5, 0.0]], dtype=torch.float64)
+SIZE = 32
+
+
+def small_scene() -> Scene:
+    """Two textured blocks before clutter, 32 px."""
+
+    def block(seed: int) -> GridField:
+        field = GridField().eval()
+        field.reset(torch.ones(4, 4, 4, dtype=torch.bool), torch.full((3,), -0.6), 0.3)
+        noise = torch.randn(field.table.shape, generator=torch.Generator().manual_seed(seed))
+        with torch.no_grad():
+            field.table.copy_(noise + 1.0)
+        return field.requires_grad_(False)
+
+    camera = PinholeCamera(SIZE, SIZE, math.radians(40.0))
+    synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
+    distribution = SceneDistribution.of([Pose(bins=BINS)])
+    return Scene(("a", "b"), (block(1), block(2)), NerfRenderer(), camera, synthesizer, distribution)
+
+
+def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[BinnedProblem, list[Term]]:
+    """The detector after a training on ``images`` of each object, on one image of every bin and object; and L_val. Both
+    in float64. ``anchor`` has the trained parameters."""
+    generator, scene = torch.Generator().manual_seed(0), small_scene()
+    detector = make(num_classes=2, image_size=SIZE)
+    drawn = scene.training_set(PSI, images, generator).images
+    validation = scene.training_set(PSI.flip(-1), 8, generator).images
+    probes = [scene.probes(label, "pose", 1, PSI, generator)[0] for label in range(2)]
+    params, _ = train_detector(
+        detector, detector.init(generator), drawn, generator,
+        Optimisation(40, batch_size=16, learning_rate=1e-2, weight_decay=1e-2),
+    )  # fmt: skip
+    backbone, warm = detector.split(params)
+    held = CachedSet.of(detector, backbone, LabelledImages.concatenate(probes)).double()
+    bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
+    factor = scene.distribution.factors[0]
+    problem = BinnedProblem(held.losses, bins, factor.log_probabilities, 0.0, as_double(warm))
+    return problem, CachedSet.of(detector, backbone, validation).double().mean_terms()
