@@ -172,6 +172,7 @@ def _choices():
     for group in (
         "objects",
         "field",
+        "task",
         "detector",
         "solver",
         "solver/damping",
@@ -188,6 +189,8 @@ def _choices():
 @pytest.mark.parametrize(("group", "choice"), list(_choices()))
 def test_every_choice_of_every_group_builds(group, choice, tmp_path):
     overrides = [f"{group}={choice}"]
+    if choice.startswith("classifier"):
+        overrides.insert(0, "task=classification")
     text = (CONF / group / f"{choice}.yaml").read_text()
     config = _config(*overrides)
     if "???" in text:

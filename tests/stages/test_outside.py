@@ -62,7 +62,7 @@ def test_its_settings_are_checked_like_all_others(tmp_path, plugin):
 def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin):
     with pytest.raises(UserError) as caught:
         context(tmp_path, "+count={_target_: my_stage.Count}", "stages=[views,fields]")
-    known = "views, field, target_sets, warm_start, psi, evaluate, report, preflight, predict, export, count"
+    known = "views, field, target_sets, warm_start, psi, evaluate, report, preflight, predict, export, viewer, count"
     assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}"
 
 
