@@ -33,7 +33,7 @@ def equivalent_bins(
     what the factor does not draw is at the middle of its range.
     """
     count = next(f.bins for f in distribution.binned if f.name == factor)
-    views = [_views(item, distribution, factor, camera, b, samples) for b in range(count)]
+    views = _views(item, distribution, factor, camera, count, samples)
     groups: list[list[int]] = []
     for b in range(count):
         home = next((group for group in groups if _same(views[group[0]][0], views[b], tolerance)), None)
@@ -49,20 +49,24 @@ def _views(
     distribution: SceneDistribution,
     factor: str,
     camera: PinholeCamera,
-    bin_index: int,
+    bins: int,
     samples: int,
-) -> list[Float[Tensor, "samples h w 4"]]:
-    """Views of one bin under every alignment."""
+) -> Float[Tensor, "bins alignments samples h w 4"]:
+    """Premultiplied views of every bin under every alignment, of one render: a mesh's texture is prepared once."""
     offsets = (torch.arange(samples) + 0.5) / samples
     other = torch.linspace(0.1, 0.9, samples)[torch.arange(samples) * 5 % samples]
     turns = (0.0, 0.5) if _second_goes_round(distribution, factor) else (0.0,)
     radius = (distribution.radii({item.name: item.radius}) or (1.0,))[0]
-    made = []
-    for within, second, turn in itertools.product((offsets, 1.0 - offsets), (other, 1.0 - other), turns):
-        draw = _at(distribution, factor, bin_index, within, (second + turn) % 1.0)
-        rgba = item.render(camera, orbit(draw.phi, draw.rho, draw.distance, radius=radius))
-        made.append(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1))
-    return made
+    aligned = list(itertools.product((offsets, 1.0 - offsets), (other, 1.0 - other), turns))
+    draws = [
+        _at(distribution, factor, b, within, (second + turn) % 1.0)
+        for b in range(bins)
+        for within, second, turn in aligned
+    ]
+    poses = torch.cat([orbit(draw.phi, draw.rho, draw.distance, radius=radius) for draw in draws])
+    rgba = item.render(camera, poses)
+    premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
+    return premultiplied.unflatten(0, (bins, len(aligned), samples))
 
 
 def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:
@@ -95,7 +99,7 @@ def _at(
     return distribution.at_bins(bins, SceneNoise(still, uniform))
 
 
-def _same(reference: Tensor, candidates: list[Tensor], tolerance: float) -> bool:
+def _same(reference: Tensor, candidates: Tensor, tolerance: float) -> bool:
     return any(_difference(reference, candidate) < tolerance for candidate in candidates)
 
 
