@@ -12,8 +12,8 @@ from neural_sim.report.settings import Setting
 from neural_sim.report.statistics import Estimate
 
 NONE = "none"
-WAYS = {"pretrain": "synthetic, then photographs", "combined": "both together", NONE: "synthetic alone"}
-"""By ``training.real.mode``."""
+WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}
+"""By ``training.real.mode``, in the order of a table's rows."""
 ALONE = "photographs alone"
 
 
@@ -58,7 +58,7 @@ def photographs_table(settings: Sequence[Setting]) -> str:
 
 def _rank(setting: Setting) -> tuple[int, int]:
     """Settings of all methods come first, so that methods are in one order."""
-    return [NONE, *WAYS].index(_mode(setting)), -len(setting.scores.methods)
+    return list(WAYS).index(_mode(setting)), -len(setting.scores.methods)
 
 
 def _mode(setting: Setting) -> str:

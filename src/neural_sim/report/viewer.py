@@ -173,12 +173,14 @@ class Viewer:
         self.above = gui.add_slider("boxes above", 0.0, 1.0, 0.05, 0.3)
         self.image = gui.add_image(self.picture(), label="render and detections")
         self.bins = gui.add_markdown("")
-        for one in (self.object, self.which, self.factor):
-            one.on_update(lambda _: self.show_object())
+        self.object.on_update(lambda _: self.show_object())
+        for one in (self.which, self.factor):
+            one.on_update(lambda _: self.show_bins())
         for one in self._sliders:
             one.on_update(lambda _: self.show_picture())
         self.frustums: list[Any] = []
-        self.show_object()
+        self.show_field()
+        self.show_bins()
 
     @property
     def _sliders(self) -> list[Any]:
@@ -207,21 +209,30 @@ class Viewer:
         self.image.image = self.picture()
 
     def show_object(self) -> None:
-        """The field and the cameras of the chosen object, distribution and factor, and a new render."""
+        """All of the chosen object: its field, the cameras, and a new render."""
+        self.show_field()
+        self.show_bins()
+        self.show_picture()
+
+    def show_field(self) -> None:
+        """The points of the chosen object."""
         points, colours = self.shots.cloud(self.label)
         self.server.scene.add_point_cloud("/field", points, colours, point_size=0.02)
+
+    def show_bins(self) -> None:
+        """The cameras of the chosen object, distribution and factor, and the bins' probabilities."""
         for frustum in self.frustums:
             frustum.remove()
         self.frustums = []
-        if self.factor.value is not None:
-            shown = self.shots.bin_cameras(self.label, self.which.value, self.factor.value)
-            most = max(each.p for each in shown)
-            self.frustums = [self._frustum(i, each, most) for i, each in enumerate(shown)]
-            rows = {each.bin + 1: each.p for each in shown}
-            self.bins.content = "| bin | p |\n|---|---|\n" + "\n".join(
-                f"| {b} | {p:.3f} |" for b, p in rows.items()
-            )
-        self.show_picture()
+        if self.factor.value is None:
+            return
+        shown = self.shots.bin_cameras(self.label, self.which.value, self.factor.value)
+        most = max(each.p for each in shown)
+        self.frustums = [self._frustum(i, each, most) for i, each in enumerate(shown)]
+        rows = {each.bin + 1: each.p for each in shown}
+        self.bins.content = "| bin | p |\n|---|---|\n" + "\n".join(
+            f"| {b} | {p:.3f} |" for b, p in rows.items()
+        )
 
     def _frustum(self, number: int, each: BinCamera, most: float) -> Any:
         camera = self.shots.scene.camera
