@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import pytest
 import torch
@@ -206,6 +207,22 @@ def test_adjoint_solves_the_damped_system(network, damping, generator):
     torch.testing.assert_close(adjoint.doubled, doubled, rtol=1e-7, atol=1e-8)
 
 
+@dataclass(frozen=True)
+class Counting(AdjointSolver):
+    """Keeps a record of every Hessian product, whatever asked for it."""
+
+    products: list[int] = field(default_factory=list)
+
+    def operator(self, terms, params):
+        product = super().operator(terms, params)
+
+        def counted(vector):
+            self.products.append(1)
+            return product(vector)
+
+        return counted
+
+
 def test_damping_is_raised_until_conjugate_gradients_hold(generator):
     """One negative eigenvalue among very many near zero: too few Lanczos steps do not see it."""
     values = torch.cat(
@@ -215,8 +232,10 @@ def test_damping_is_raised_until_conjugate_gradients_hold(generator):
     terms = [lambda p: 0.5 * (values * p["w"].square()).sum()]
     b = torch.randn(400, generator=generator, dtype=DOUBLE)
     damping = LanczosDamping(max_condition=1e3, lanczos_steps=2)
-    adjoint = AdjointSolver(ConjugateGradient(), damping, rtol=1e-8).solve(terms, params, b, None, generator)
+    solver = Counting(ConjugateGradient(), damping, rtol=1e-8, sensitivity=True)
+    adjoint = solver.solve(terms, params, b, None, generator)
     assert adjoint.damping_raises >= 1
+    assert adjoint.solution.products + adjoint.damping.spectrum.products == len(solver.products)
     assert adjoint.solution.status is Status.CONVERGED
     torch.testing.assert_close(adjoint.vector, b / (values + adjoint.damping.value), rtol=1e-6, atol=1e-7)
     fixed = AdjointSolver(ConjugateGradient(), FixedDamping(0.1, 0), rtol=1e-8).solve(

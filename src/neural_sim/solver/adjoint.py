@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Adjoint:
     """The solution and its damping. ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at
-    twice the final lambda, None unless asked for.
+    twice the final lambda, None unless asked for. The solution's ``products`` are those of all these solves.
     """
 
     solution: Solution
@@ -83,10 +83,11 @@ class AdjointSolver:
                 break
             logger.info("damping: negative curvature met; lambda %.3g -> %.3g", damped.value, raised.value)
             damped, damping_raises = raised, damping_raises + 1
-            solution = self._solve(operator, damped, b, solution.value)
+            solution = _after(solution, self._solve(operator, damped, b, solution.value))
         doubled = None
         if self.sensitivity:
-            doubled = self._solve(operator, damped, b, solution.value, 2.0).value
+            twice = self._solve(operator, damped, b, solution.value, 2.0)
+            doubled, solution = twice.value, _after(twice, solution)
         return Adjoint(solution, damped, damping_raises, doubled, time.perf_counter() - began)
 
     def _solve(
@@ -100,3 +101,8 @@ class AdjointSolver:
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
         """Products with the undamped Hessian."""
         return HessianOperator(terms, params, self.mode, self.retain_graph)
+
+
+def _after(other: Solution, solution: Solution) -> Solution:
+    """The solution with the products of another solve added to its own."""
+    return replace(solution, products=other.products + solution.products)

@@ -200,6 +200,8 @@ class Solver:
         products = found.solution.products + (spectrum.products if spectrum else 0)
         seconds, memory = timing.of(solve)
         detail = f"{products} products, {found.solution.status.name.lower().replace('_', ' ')}"
+        if found.damping_raises:  # it solved another system than the oracle did
+            detail += f", lambda raised to {found.damping.value:.3g}"
         return Point(name, relative(found.solution.value, oracle), seconds, memory, default, line, detail)
 
     def _system(self, condition: float, timing: Timing, seed: int) -> Series:
