@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +17,7 @@ Corners = tuple[Direction, Direction]
 Box = list[list[float]] | None
 
 
+@runtime_checkable
 class SceneMaskMaker(Protocol):
     """Computes masks from photographs and cameras alone."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from neural_sim.field.scene.fitting import ScenePixels
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.plane import Plane, refitted, supporting_plane
-from neural_sim.field.scene.region import Region, cell_centres, connected_region
+from neural_sim.field.scene.region import GROUND, Region, cell_centres, connected_region
 from neural_sim.field.scene.space import Frame, expand
 from neural_sim.field.scene.surface import seen_surface
 from neural_sim.objects.capture import Capture
@@ -103,7 +103,7 @@ def _boxed(
         plane = None  # the box is below it: it is no plane that the object stands on
     centres = expand(cell_centres(grid.resolution))
     inside: Bool[Tensor, "cells"] = ((centres > low) & (centres < high)).all(-1)
-    region = Region(inside, grid.resolution, plane, 0.5 * grid.edge)
+    region = Region(inside, grid.resolution, plane, GROUND * grid.edge)
     solid = inside & (largest > FAINT)
     if plane is not None:
         solid &= plane.height(centres) > 0.0

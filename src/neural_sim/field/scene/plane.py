@@ -26,8 +26,8 @@ STANDING = 0.02
 """Smallest fraction of the points nearby that stand on a supporting plane."""
 CAMERAS = 0.9
 """Smallest fraction of the cameras above a supporting plane."""
-WIDER = 1.25
-"""Least spread of a supporting plane's points, relative to what stands on it: a cut through an object has as much."""
+SHOWING = 0.5
+"""Most points just below a supporting plane, relative to those on it: of an object that it cuts as many are there."""
 ATTEMPTS = 4
 JUST = 4.0
 """Points below a plane by 1 to so many tolerances speak against it: nothing shows through what an object stands on."""
@@ -147,7 +147,10 @@ def _supports(
         return False
     if float((plane.height(cameras.double()) > 0.0).float().mean()) < CAMERAS:
         return False
-    return _spread(near[on], plane) > WIDER * _spread(standing, plane)
+    just_below = (height < -tolerance) & (height > -JUST * tolerance)
+    if float(just_below.sum()) > SHOWING * float(on.sum()):
+        return False
+    return _spread(near[on], plane) > _spread(standing, plane)
 
 
 def _spread(points: Float[Tensor, "n 3"], plane: Plane) -> float:

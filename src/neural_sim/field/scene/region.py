@@ -29,7 +29,7 @@ EMPTIER = 0.5
 """Largest density of solid cells about an object, relative to its own."""
 APART = 1.0
 """Height in cells above the plane from which on cells connect: below it the plane's own roughness does."""
-GROUND = 0.3
+GROUND = 1.0
 """Height in cells above the plane from which on samples are the object's."""
 
 
