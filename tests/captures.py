@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import trimesh
 from PIL import Image
+from scenes import Room
 from scipy.spatial.transform import Rotation
 from torch.nn import functional
 
@@ -73,14 +74,19 @@ def capture(
     distance: tuple[float, float] = (2.8, 3.6),
     suffix: str = ".png",
     distortion: dict[str, float] = DISTORTION,
+    angles: tuple[float, float] = (0.25, 0.65),
+    room: Room | None = None,
 ) -> Made:
     """``count`` photographs under ``folder / name``; the object, of radius ``scale``, stands somewhere in a frame whose
     up is -y, as COLMAP's often is. ``pose_noise`` is the deviation of the written positions from the true ones in
-    distances, ``exposure`` that of log brightness."""
+    distances, ``exposure`` that of log brightness. ``angles`` are those of the cameras from above, in units of pi.
+
+    Behind the object are clutter that differs from photograph to photograph, or a ``room``, the same in all; then masks
+    are written into ``truth``, where nothing looks for them."""
     generator, rng = torch.Generator().manual_seed(3), np.random.default_rng(3)
     item = item or Procedural([name]).load()[0]
     uniform = torch.rand(3, count, generator=generator, dtype=torch.float64)
-    phi = 0.25 * math.pi + 0.4 * math.pi * uniform[0]
+    phi = math.pi * (angles[0] + (angles[1] - angles[0]) * uniform[0])
     turn = 2.0 * math.pi * (torch.arange(count) + uniform[1]) / count
     far = distance[0] + (distance[1] - distance[0]) * uniform[2]
     own = orbit(phi, turn, far).numpy()
@@ -99,19 +105,23 @@ def capture(
     mesh.apply_transform(_similarity(scale * turned, centre))
     home = folder / name
     (home / "images").mkdir(parents=True)
-    (home / "masks").mkdir()
+    truth = home / ("masks" if room is None else "truth")
+    truth.mkdir()
     photos = _photographs(
         mesh, item, poses, k, renderer or RaycastRenderer(2), _similarity(scale * turned, centre)
     )
-    walls = ProceduralClutter().draw(count, height, width, generator)
+    walls = ProceduralClutter().draw(count, height, width, generator).movedim(1, -1).numpy()
+    if room is not None:
+        walls = _behind(room, np.linalg.inv(_similarity(scale * turned, centre)) @ poses, k)
     for number, rgba in enumerate(photos):
         gain = math.exp(exposure * float(rng.normal()))
         colour, alpha = (rgba[..., :3] * gain).clip(0.0, 1.0), rgba[..., 3:]
         if masks == "alpha":
             pixels = np.concatenate([colour, alpha], -1)
         else:
-            pixels = alpha * colour + (1.0 - alpha) * walls[number].movedim(0, -1).numpy()
-            _save(alpha[..., 0], home / "masks" / f"{number:03d}.png")
+            gains = 1.0 if room is None else gain
+            pixels = alpha * colour + (1.0 - alpha) * (gains * walls[number]).clip(0.0, 1.0)
+            _save(alpha[..., 0], truth / f"{number:03d}.png")
         _save(pixels, home / "images" / f"{number:03d}{suffix}")
     written = poses.copy()
     step = pose_noise * scale * far.mean().item()
@@ -146,6 +156,23 @@ def colmap_text(folder: Path, names: list[str], poses: np.ndarray, k: dict[str, 
         lines += [f"{number} {numbers} 1 {name}", ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     (folder / "points3D.txt").write_text("# none\n")
+
+
+def _behind(room: Room, poses: np.ndarray, k: dict[str, float]) -> np.ndarray:
+    """What a lens sees of a room, of poses in its frame (their axes of any length): the mean of four rays a pixel."""
+    width, height = int(k["w"]), int(k["h"])
+    seen = np.zeros((len(poses), height * width, 3))
+    for dx, dy in ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)):
+        u, v = np.meshgrid(
+            (np.arange(width) + dx - k["cx"]) / k["fl_x"], (np.arange(height) + dy - k["cy"]) / k["fl_y"]
+        )
+        x, y = undistorted(u, v, k)
+        local = np.stack([x, -y, -np.ones_like(x)], -1).reshape(-1, 3)
+        for number, pose in enumerate(poses):
+            directions = local @ pose[:3, :3].T
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            seen[number] += 0.25 * room.colours(np.broadcast_to(pose[:3, 3], directions.shape), directions)
+    return seen.reshape(len(poses), height, width, 3)
 
 
 def _photographs(mesh, item, poses, k, renderer, to_world) -> list[np.ndarray]:

@@ -3,10 +3,13 @@
 import json
 
 import pytest
+import torch
 from captures import capture
 from PIL import Image
 
 from neural_sim.objects.photos import Photos
+from neural_sim.objects.pictures import Pictures
+from neural_sim.objects.scene_masks import box_of
 
 KINDS = ("transforms", "colmap_text", "colmap_binary")
 
@@ -101,7 +104,9 @@ def test_what_is_wrong_with_masks_is_named(made, tmp_path):
     def gone(document, home):
         (home / "masks" / "002.png").unlink()
 
-    with pytest.raises(ValueError, match=r"002\.png: nothing says which of its pixels are the object's"):
+    with pytest.raises(
+        ValueError, match=r"002\.png: nothing says which of its pixels are the object's.*masks=scene"
+    ):
         Photos(broken(made, tmp_path / "gone", gone)).placement("can")
 
     def empty(document, home):
@@ -128,11 +133,56 @@ def test_a_model_that_colmap_cannot_read_is_named(made, tmp_path):
         ({"up": [0, 0]}, r"objects\.up"),
         ({"size": -1.0}, r"objects\.size: want metres above 0 for can, got -1"),
         ({"names": ["mug"]}, r"objects\.names: 'mug' is not in"),
+        ({"masks": "scene"}, r"objects\.masks=scene: want objects\.scene, which computes masks, got none"),
+        (
+            {"box": [[0, 0, 0], [1, 1, 1]]},
+            r"objects\.box wants objects\.masks=scene, got objects\.masks=auto",
+        ),
     ],
 )
 def test_bad_options_are_refused(made, options, message):
     with pytest.raises(ValueError, match=message):
         Photos(made["transforms"].folder.parent, **options)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        3.0,
+        [[0, 0, 0]],
+        [[0, 0], [1, 1]],
+        [[0, 0, 0], [1, 1, float("nan")]],
+        [[0, 0, 0], [1, -1, 1]],
+        [[0, 0, "0"], [1, 1, 1]],
+        {"can": [0, 1]},
+    ],
+)
+def test_bad_boxes_are_refused(box):
+    with pytest.raises(
+        ValueError, match=r"objects\.box: want \[\[x0, y0, z0\], \[x1, y1, z1\]\] .* for can, got"
+    ):
+        box_of(box, "can")
+
+
+def test_a_box_is_everyones_or_one_objects():
+    corners = [[0, 0, 0], [1, 2, 3]]
+    assert box_of(corners, "can") == ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)) == box_of({"can": corners}, "can")
+    assert box_of({"can": corners}, "mug") is None is box_of(None, "mug")
+
+
+def test_computed_masks_are_resized_and_as_many_as_photographs(made):
+    capture = Photos(made["transforms"].folder.parent).captures["can"]
+    with pytest.raises(ValueError, match=r"objects\.masks=scene: want 16 computed masks .* of can, got 1"):
+        Pictures(capture, "scene", (torch.ones(3, 4),))
+    with pytest.raises(ValueError, match=r"objects\.masks=auto: want 0 computed masks"):
+        Pictures(capture, "auto", (torch.ones(3, 4),))
+    masks = tuple(torch.full((15, 20), number / 16.0) for number in range(16))
+    pictures = Pictures(capture, "scene", masks)
+    # Sharpened about a half: 0.25 is nothing, 0.75 all, and 0.4375 lies between.
+    for number, alpha in ((4, 0.0), (7, 0.25), (12, 1.0)):
+        rgba = pictures.rgba(capture.frames[number])
+        assert rgba.shape == (150, 200, 4)
+        torch.testing.assert_close(rgba[..., 3], torch.full((150, 200), alpha))
 
 
 def test_folders_without_captures_are_refused(tmp_path):

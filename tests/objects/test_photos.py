@@ -63,6 +63,34 @@ def test_a_fisheye_measures_angles_and_a_divisor_divides():
     )
 
 
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(200, 150, 210.0, 190.0, 104.0, 71.0),
+        Lens(200, 150, 210.0, 190.0, 104.0, 71.0, (-0.12, 0.05), (), (0.002, -0.003)),
+        Lens(200, 150, 210.0, 190.0, 104.0, 71.0, (0.1, 0.02), (0.2, 0.01, 0.001), (0.002, -0.003)),
+        Lens(200, 150, 90.0, 80.0, 104.0, 71.0, (0.03, -0.002), fisheye=True),
+    ],
+)
+def test_directions_of_pixels_project_to_them(lens):
+    x, y = torch.meshgrid(torch.linspace(0.5, 199.5, 17), torch.linspace(0.5, 149.5, 13), indexing="xy")
+    pixel = torch.stack([x, y], -1).double()
+    directions, seen = lens.directions(pixel)
+    assert seen.all()
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(13, 17, dtype=torch.float64))
+    back, visible = lens.project(3.0 * directions)
+    assert visible.all()
+    torch.testing.assert_close(back, pixel, atol=1e-6, rtol=0.0)
+
+
+def test_pixels_that_no_direction_reaches_are_not_seen():
+    """r - 0.3 r^3 is at most 2/3 of the radius at which it turns back."""
+    lens = Lens(100, 80, 50.0, 50.0, 50.0, 40.0, (-0.3,))
+    highest = 50.0 * 2.0 / 3.0 / math.sqrt(3 * 0.3)
+    pixel = torch.tensor([[50.0 + 0.98 * highest, 40.0], [50.0 + 1.02 * highest, 40.0]], dtype=torch.float64)
+    assert lens.directions(pixel)[1].tolist() == [True, False]
+
+
 def test_a_lens_sees_nothing_behind_or_where_its_polynomial_turns_back():
     lens = Lens(100, 80, 50.0, 40.0, 50.0, 40.0, (-0.3,))
     turning = 1.0 / math.sqrt(3 * 0.3)  # d/dr (r - 0.3 r^3) = 0

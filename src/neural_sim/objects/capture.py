@@ -14,6 +14,10 @@ ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity: files round to six digits, and pose optimisers drift."""
 WIDEST = 3.0
 """Tangent of the largest angle off the axis at which a perspective lens's distortion is examined."""
+FARTHEST = 1e3
+"""Tangent of the largest angle off the axis that a pixel of a perspective lens is taken to have."""
+BISECTIONS = 64
+REPETITIONS = 12
 
 
 @dataclass(frozen=True)
@@ -60,19 +64,45 @@ class Lens:
         along = torch.atan(radius) if self.fisheye else radius
         seen = ahead & (along < self._reach())
         ratio = torch.where(radius > 1e-12, along / radius.clamp_min(1e-12), torch.ones_like(radius))
+        undistorted = plane
         plane = plane * (ratio * self._scale(along.square()))[..., None]
         if not self.fisheye and any(self.tangential):
-            x, y = (
-                torch.stack([local[..., 0], -local[..., 1]], -1) / depth.clamp_min(1e-9)[..., None]
-            ).unbind(-1)
-            (p1, p2), square = self.tangential, x * x + y * y
-            moved = (
-                2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
-                p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
-            )
-            plane = plane + torch.stack(moved, -1)
+            plane = plane + self._shift(undistorted)
         focal = plane.new_tensor([self.fx, self.fy])
         return plane * focal + plane.new_tensor([self.cx, self.cy]), seen
+
+    def directions(self, pixel: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+        """Inverse of :meth:`project`: unit directions in the camera's OpenGL frame, and which pixels have one.
+
+        The radius is found by bisection, which no distortion leads astray; the small tangential term by repetition.
+        """
+        target = (pixel - pixel.new_tensor([self.cx, self.cy])) / pixel.new_tensor([self.fx, self.fy])
+        reach = min(self._reach(), 0.5 * np.pi if self.fisheye else FARTHEST)
+        plane = target
+        for _ in range(REPETITIONS if any(self.tangential) and not self.fisheye else 1):
+            goal = target - self._shift(plane)
+            length = goal.norm(dim=-1)
+            low, high = torch.zeros_like(length), torch.full_like(length, reach)
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                beyond = middle * self._scale(middle.square()) > length
+                low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
+            along = 0.5 * (low + high)
+            radius = torch.tan(along.clamp_max(0.5 * np.pi - 1e-6)) if self.fisheye else along
+            plane = goal * (radius / length.clamp_min(1e-12))[..., None]
+        seen = reach * self._scale(along.new_tensor(reach**2)) > length
+        local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], -1)
+        return local / local.norm(dim=-1, keepdim=True), seen
+
+    def _shift(self, plane: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+        """The tangential term."""
+        (p1, p2), (x, y) = self.tangential, plane.unbind(-1)
+        square = x * x + y * y
+        moved = (
+            2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+            p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
+        return torch.stack(moved, -1)
 
     def _scale(self, square: Tensor) -> Tensor:
         return _polynomial(self.radial, square) / _polynomial(self.divisor, square)

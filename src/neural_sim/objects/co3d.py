@@ -19,6 +19,7 @@ import numpy as np
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.objects.photos import Photos, Up
 from neural_sim.objects.pictures import Masks
+from neural_sim.objects.scene_masks import Box, SceneMaskMaker
 from neural_sim.objects.transforms_json import image_size
 
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
@@ -35,7 +36,7 @@ class Co3d(Photos):
         names: categories; null: all.
         sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
             the highest ``viewpoint_quality_score``, of those without one the longest.
-        masks, up, size: see :class:`Photos`.
+        masks, up, size, box, scene: see :class:`Photos`.
 
     Raises:
         ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
@@ -50,9 +51,11 @@ class Co3d(Photos):
         masks: Masks = "auto",
         up: Up | Mapping[str, Up] = None,
         size: float | Mapping[str, float] | None = None,
+        box: Box | Mapping[str, Box] = None,
+        scene: SceneMaskMaker | None = None,
     ) -> None:
         self.sequences = dict(sequences or {})
-        super().__init__(root, names, masks, up, size)
+        super().__init__(root, names, masks, up, size, box, scene)
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
             raise ValueError(f"objects.sequences: {strange} are no objects, these are {self.names()}")

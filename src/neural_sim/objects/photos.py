@@ -8,12 +8,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from neural_sim.objects.capture import Capture, Frame
 from neural_sim.objects.colmap import model_folder, read_colmap
 from neural_sim.objects.files import choose, content_digest, folder_of
 from neural_sim.objects.pictures import Masks, Pictures, mask_of
 from neural_sim.objects.placing import AXES, Placement, place
 from neural_sim.objects.resampling import pixels_per_pixel, resample
+from neural_sim.objects.scene_masks import Box, SceneMaskMaker, box_of
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
 from neural_sim.types import PosedViews
 
@@ -33,10 +37,14 @@ class Photos:
             object's name; null: that of the capture's file, else the mean of the cameras' up vectors.
         size: the diameter of the object's bounding sphere in metres, or a mapping by object's name; null: unknown, so
             that distances are in object radii.
+        box: with ``masks="scene"``: two corners of a box about the object, along the axes of the capture's frame and in
+            its unit, or a mapping by object's name; null: the object is looked for where the cameras look.
+        scene: what computes masks where ``masks="scene"``.
 
     Raises:
-        ValueError: a missing folder, one without captures, an unknown name, a bad ``up`` or ``size``, or a capture that
-            its reader refuses.
+        ValueError: a missing folder, one without captures, an unknown name, a bad ``up``, ``size`` or ``box``,
+            ``masks="scene"`` without ``scene``, ``box`` without ``masks="scene"``, or a capture that its reader
+            refuses.
     """
 
     def __init__(
@@ -46,15 +54,22 @@ class Photos:
         masks: Masks = "auto",
         up: Up | Mapping[str, Up] = None,
         size: float | Mapping[str, float] | None = None,
+        box: Box | Mapping[str, Box] = None,
+        scene: SceneMaskMaker | None = None,
     ) -> None:
         self.root = folder_of(root)
         captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
-        self.up, self.size = up, size
+        self.up, self.size, self.box, self.scene = up, size, box, scene
+        if masks == "scene" and scene is None:
+            raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
+        if masks != "scene" and box is not None:
+            raise ValueError(f"objects.box wants objects.masks=scene, got objects.masks={masks}")
         for name in self._folders:
             self._up(name)
             self.radius(name)
+            box_of(box, name)
         _ = self.captures  # errors in a file are raised here, not in a later stage
 
     def _found(self) -> dict[str, Path]:
@@ -111,15 +126,29 @@ class Photos:
             )
         return _spread(train, count), _spread(test, held_out)
 
-    def placement(self, name: str) -> Placement:
-        """An object's pose and radius in its capture's frame."""
-        return place(Pictures(self.captures[name], self.masks), self._up(name))
+    def computed_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
+        """A mask for each frame of an object's capture where ``masks="scene"``, else none."""
+        if self.scene is None or self.masks != "scene":
+            return ()
+        return self.scene.masks(self.captures[name], self._up(name), box_of(self.box, name))
 
-    def views(self, name: str, count: int, held_out: int, image_size: int) -> PosedViews:
+    def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
+        """An object's photographs; ``computed`` are its :meth:`computed_masks`, None: they are computed now."""
+        return Pictures(
+            self.captures[name], self.masks, self.computed_masks(name) if computed is None else computed
+        )
+
+    def placement(self, name: str, pictures: Pictures | None = None) -> Placement:
+        """An object's pose and radius in its capture's frame."""
+        return place(pictures or self.pictures(name), self._up(name))
+
+    def views(
+        self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
+    ) -> PosedViews:
         """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`."""
         train, test = self.split(name, count, held_out)
-        pictures = Pictures(self.captures[name], self.masks)
-        views = resample(pictures, [*train, *test], self.placement(name), image_size)
+        pictures = pictures or self.pictures(name)
+        views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
         finest = max(pixels_per_pixel(frame, views.camera) for frame in train)
         _log.info(
             "%s: %d photographs train and %d score; a pixel of views.image_size=%d covers up to %.1f of theirs a side",
@@ -142,13 +171,14 @@ class Photos:
 
     def _digest(self, name: str) -> str:
         capture, folder = self.captures[name], self._folders[name]
-        masks = (mask_of(frame, capture.source) for frame in capture.frames)
+        read = () if self.masks == "scene" else capture.frames
+        masks = (mask_of(frame, capture.source) for frame in read)
         files = dict.fromkeys([*capture.files, *(path for path in masks if path is not None)])
         listed = {
             str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path
             for path in files
         }
-        options = f"{self.masks} {self._up(name)} "
+        options = f"{self.masks} {self._up(name)} {box_of(self.box, name)} "
         return content_digest({options: Path(), **listed})
 
 

@@ -11,11 +11,14 @@ import torch
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
+from torch.nn import functional
 
 from neural_sim.objects.capture import Capture, Frame
 
-Masks = Literal["auto", "alpha", "files"]
+Masks = Literal["auto", "alpha", "files", "scene"]
 FOLDER = "masks"
+SHARPNESS = 4.0
+"""Slope of the masks' opacity about a half, where a computed mask has its edge: an object is opaque, fog is nothing."""
 
 
 @dataclass(frozen=True)
@@ -24,22 +27,38 @@ class Pictures:
 
     ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image of its name in a
     folder ``masks`` beside the images or beside the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
-    first of these that a frame has.
+    first of these that a frame has; ``scene``: ``computed``, a mask of any size for each of the capture's frames, in
+    their order.
 
     Raises:
-        ValueError: another source; from :meth:`rgba`, a frame without a mask, or a mask of another size.
+        ValueError: another source, or computed masks that are missing or too few; from :meth:`rgba`, a frame without a
+            mask, or a mask of another size.
     """
 
     capture: Capture
     masks: Masks = "auto"
+    computed: tuple[Float[Tensor, "_ _"], ...] = ()
 
     def __post_init__(self) -> None:
         if self.masks not in get_args(Masks):
             raise ValueError(f"objects.masks must be one of {get_args(Masks)}, got {self.masks!r}")
+        wanted = len(self.capture.frames) if self.masks == "scene" else 0
+        if len(self.computed) != wanted:
+            raise ValueError(
+                f"objects.masks={self.masks}: want {wanted} computed masks for the {len(self.capture.frames)} "
+                f"photographs of {self.capture.name}, got {len(self.computed)}"
+            )
 
     def rgba(self, frame: Frame) -> Float[Tensor, "h w 4"]:
         """Colour and mask of a frame: straight alpha, float32 in [0, 1]."""
         picture = _open(frame.image)
+        if self.masks == "scene":
+            number = next(i for i, other in enumerate(self.capture.frames) if other is frame)
+            mask = self.computed[number][None, None]
+            size = (picture.height, picture.width)
+            alpha = functional.interpolate(mask, size, mode="bilinear", align_corners=False)[0, 0, :, :, None]
+            alpha = (0.5 + SHARPNESS * (alpha - 0.5)).clamp(0.0, 1.0)
+            return torch.cat([_values(picture.convert("RGB")), alpha], -1)
         file = mask_of(frame, self.capture.source) if self.masks != "alpha" else None
         if file is not None:
             mask = _open(file)
@@ -56,7 +75,7 @@ class Pictures:
         else:
             raise ValueError(
                 f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel, a "
-                f"mask_path, or a mask of its name in a folder {FOLDER!r}"
+                f"mask_path, or a mask of its name in a folder {FOLDER!r}; objects.masks=scene finds masks without any"
             )
         return torch.cat([_values(picture.convert("RGB")), alpha], -1)
 
@@ -86,3 +105,8 @@ def _open(path: Path) -> Image.Image:
 
 def _values(image: Image.Image) -> Float[Tensor, "h w *c"]:
     return torch.from_numpy(np.asarray(image, dtype=np.float32) / 255.0)
+
+
+def reduced(frame: Frame, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
+    """A photograph's colours, averaged to ``size`` (width, height)."""
+    return _values(_open(frame.image).convert("RGB").resize(size, Image.Resampling.BOX))

@@ -59,8 +59,7 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placemen
     capture = pictures.capture
     chosen = up if up is not None else capture.up
     if chosen is None:
-        axes = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames])
-        chosen = tuple(axes.mean(0))
+        chosen = mean_up(capture)
         _log.info(
             "%s: up is taken to be (%.3f, %.3f, %.3f), the mean of the cameras' own; objects.up says another",
             capture.name, *(np.array(chosen) / max(float(np.linalg.norm(chosen)), 1e-12)),
@@ -75,6 +74,12 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placemen
     to_object[:3, :3] = turn / radius
     to_object[:3, 3] = -to_object[:3, :3] @ centre
     return Placement(to_object, radius)
+
+
+def mean_up(capture: Capture) -> tuple[float, float, float]:
+    """The mean of the cameras' up vectors, in the capture's frame."""
+    x, y, z = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames]).mean(0).tolist()
+    return x, y, z
 
 
 def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:

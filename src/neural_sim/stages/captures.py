@@ -11,7 +11,9 @@ from neural_sim.objects.photos import Photos
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.renderer.subject import FieldSubject
+from neural_sim.stages.masks import MasksStage
 from neural_sim.stages.meshes import Objects
+from neural_sim.stages.stage import Results
 from neural_sim.stages.views import ViewsStage
 from neural_sim.types import PosedViews
 
@@ -36,7 +38,9 @@ class Captures(Objects):
 @dataclass(frozen=True)
 class PhotoViewsStage(ViewsStage):
     """Photographs of one object as views of one camera. ``content`` is the digest of their files; of ``settings`` only
-    the counts and the image size apply."""
+    the counts and the image size apply. ``masks`` computes the object's masks, None: photographs bring them."""
+
+    masks: MasksStage | None = None
 
     @property
     def held_out(self) -> int:
@@ -48,6 +52,8 @@ class PhotoViewsStage(ViewsStage):
             raise TypeError(f"PhotoViewsStage: want Captures, got {type(self.objects).__name__}")
         return self.objects.source
 
-    def make(self, results: object) -> PosedViews:
+    def make(self, results: Results) -> PosedViews:
         counts = self.settings
-        return self._source.views(self.object, counts.count, counts.held_out, counts.image_size)
+        computed = () if self.masks is None else results(self.masks)
+        pictures = self._source.pictures(self.object, computed)
+        return self._source.views(self.object, counts.count, counts.held_out, counts.image_size, pictures)

@@ -22,6 +22,7 @@ from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedS
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
+from neural_sim.stages.masks import MasksStage
 from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import SceneStage
@@ -101,8 +102,15 @@ class Graph:
     @cached_property
     def views(self) -> tuple[ViewsStage, ...]:
         digests, settings = self.objects.digests, self.experiment.imaging.views
-        kind = PhotoViewsStage if isinstance(self.objects, Captures) else ViewsStage
-        return tuple(kind(name, digests[name], settings, self.objects) for name in self.names)
+        if not isinstance(self.objects, Captures):
+            return tuple(ViewsStage(name, digests[name], settings, self.objects) for name in self.names)
+        source = self.objects.source
+        return tuple(
+            PhotoViewsStage(
+                name, digests[name], settings, self.objects, MasksStage.of(source, name, digests[name])
+            )
+            for name in self.names
+        )
 
     @cached_property
     def fields(self) -> tuple[FieldStage, ...]:

@@ -1,0 +1,110 @@
+"""Which part of a fitted scene is the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from neural_sim.field.scene.fitting import ScenePixels
+from neural_sim.field.scene.grid import SceneGrid
+from neural_sim.field.scene.plane import Plane, refitted, supporting_plane
+from neural_sim.field.scene.region import GROUND, Region, cell_centres, connected_region
+from neural_sim.field.scene.space import Frame, expand
+from neural_sim.field.scene.surface import seen_surface
+from neural_sim.objects.capture import Capture
+from neural_sim.objects.scene_masks import Corners
+
+RAYS = 49_152
+"""Pixels whose rays find the scene's surface."""
+DETAILED = 3
+"""One in so many of them, those with most detail, give the points among which the plane is looked for."""
+FAINT = 0.05
+"""Largest contribution to any pixel of what is in a box with nothing in it."""
+THICK = 0.75
+"""Distance from the plane in cells up to which points lie on it: a fitted surface is about that thick."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The object's region in the normalised frame; its centre, radius and box in the capture's."""
+
+    frame: Frame
+    region: Region
+    centre: Float[np.ndarray, "3"]
+    radius: float
+    box: tuple[np.ndarray, np.ndarray]
+
+
+def find(
+    grid: SceneGrid,
+    pixels: ScenePixels,
+    frame: Frame,
+    capture: Capture,
+    up: Float[Tensor, "3"],
+    box: Corners | None,
+    generator: torch.Generator,
+    before: Found | None = None,
+) -> Found:
+    """The object in the field of a capture's scene; ``up`` and ``box`` are in the capture's frame. ``before`` is what a
+    coarser field, whose frame may be another, took for the object.
+
+    Raises:
+        ValueError: nothing solid in the box, or without one nothing near the origin.
+    """
+    index = torch.randperm(len(pixels), generator=generator)[:RAYS]
+    index = index[pixels.detail[index].argsort(descending=True, stable=True)]
+    points, largest = seen_surface(grid, pixels, index, frame)
+    poses = np.stack([photo.camera_to_world for photo in capture.frames])
+    cameras = frame.into(torch.from_numpy(poses[:, :3, 3]))
+    if before is None:
+        plane = supporting_plane(points[: len(points) // DETAILED], up, cameras, THICK * grid.edge, generator)
+    else:
+        coarse = before.region.plane
+        plane = coarse and refitted(
+            coarse.moved(before.frame, frame), points[: len(points) // DETAILED], THICK * grid.edge
+        )
+    middle = ", ".join(f"{x:.4g}" for x in frame.centre)
+    if box is not None:
+        region = _boxed(grid, largest, plane, frame, box)
+        if region is None:
+            raise ValueError(
+                f"objects.box: nothing of {capture.name} is in {[list(corner) for corner in box]}; want two corners "
+                f"about the object, in the frame and the unit of {capture.source}"
+            )
+    else:
+        within = None
+        if before is not None:
+            within = before.region.cells_in(before.frame, frame, grid.resolution)
+        region = connected_region(grid, largest, plane, within)
+        if region is None:
+            raise ValueError(
+                f"{capture.source}: objects.masks=scene finds no object of {capture.name} near ({middle}), where the "
+                "cameras look; set objects.box to two corners about it, or give masks"
+            )
+    low, high = (frame.out(corner) for corner in region.corners())
+    centre = 0.5 * (low + high)
+    cells = frame.out(expand(cell_centres(grid.resolution)[region.cells]).double().numpy())
+    radius = float(np.linalg.norm(cells - centre, axis=1).max())
+    return Found(
+        frame, region, centre, radius, (low, high) if box is None else (np.array(box[0]), np.array(box[1]))
+    )
+
+
+def _boxed(
+    grid: SceneGrid, largest: Float[Tensor, "cells"], plane: Plane | None, frame: Frame, box: Corners
+) -> Region | None:
+    """All of the box above the plane, if that passes through its lower half; None where nothing there is solid."""
+    low, high = (frame.into(torch.tensor(corner)) for corner in box)
+    if plane is not None and float(plane.height(0.5 * (low + high))) < 0.0:
+        plane = None  # the box is below it: it is no plane that the object stands on
+    centres = expand(cell_centres(grid.resolution))
+    inside: Bool[Tensor, "cells"] = ((centres > low) & (centres < high)).all(-1)
+    region = Region(inside, grid.resolution, plane, GROUND * grid.edge)
+    solid = inside & (largest > FAINT)
+    if plane is not None:
+        solid &= plane.height(centres) > 0.0
+    return region if bool(solid.any()) else None

@@ -1,0 +1,133 @@
+"""Masks of the object in a captured scene, found twice: in a coarse field of everything, then in a finer one."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.checks import at_least
+from neural_sim.field.scene.finding import Found, find
+from neural_sim.field.scene.fitting import Budget, ScenePixels, fit
+from neural_sim.field.scene.grid import SceneGrid
+from neural_sim.field.scene.photographs import photo_rays, scene_pixels
+from neural_sim.field.scene.rendering import object_mask
+from neural_sim.field.scene.space import Frame, looked_at
+from neural_sim.objects.capture import Capture
+from neural_sim.objects.placing import mean_up
+from neural_sim.objects.scene_masks import Corners, Direction
+
+_log = logging.getLogger(__name__)
+
+CAMERAS_AT = 2.0
+"""Median distance of the cameras in the first field's frame: they lie outside of the ball that is not contracted."""
+ROOM = 1.0
+"""Radius of the ball that the second field does not contract, in radii of what the first found."""
+COARSE = 0.5
+"""Steps, cells a side and pixels a side of the first field, relative to the second's."""
+LEAST_PIXELS = 80
+"""But photographs keep so many pixels along the longer side."""
+
+
+@dataclass(frozen=True)
+class SceneMasks:
+    """Masks from a field of the whole scene.
+
+    A first field, of half the resolution, finds the supporting plane and what stands on it where the cameras look. The
+    second has the object in the middle of its space, where its cells are finest; its masks are rendered.
+
+    Args:
+        image_size: longer side in pixels of the photographs that train the field, and of the masks.
+        resolution: cells of the field along each side of contracted space, a multiple of 4.
+        steps: optimiser steps, the budget.
+        batch_rays: rays of a step.
+        seed: of the order of rays; not the run's seed, so that runs share masks.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+
+    image_size: int = 160
+    resolution: int = 96
+    steps: int = 240
+    batch_rays: int = 2048
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        at_least("objects.scene", 1, steps=self.steps, batch_rays=self.batch_rays)
+        at_least("objects.scene", 16, image_size=self.image_size, resolution=self.resolution)
+        at_least("objects.scene", 0, seed=self.seed)
+        if self.resolution % 4:
+            raise ValueError(f"objects.scene.resolution must be a multiple of 4, got {self.resolution}")
+
+    def masks(
+        self, capture: Capture, up: Direction | None, box: Corners | None
+    ) -> tuple[Float[Tensor, "_ _"], ...]:
+        """The object's opacity in [0, 1] at each photograph, ``image_size`` pixels along its longer side.
+
+        ``up`` is in the capture's frame, None: its file's, else the mean of the cameras' up vectors. ``box``: what is
+        in it and above the plane is the object; None: what is connected and nearest to the point that cameras look at.
+
+        Raises:
+            ValueError: cameras that look at no one place, no object found, or nothing in the box.
+        """
+        poses = np.stack([frame.camera_to_world for frame in capture.frames])
+        upward = torch.tensor(up or capture.up or mean_up(capture), dtype=torch.float64)
+        generator = torch.Generator().manual_seed(self.seed)
+        if box is None:
+            point, distance = looked_at(poses, capture.name)
+            frame = Frame(_three(point), distance / CAMERAS_AT)
+        else:
+            low, high = np.array(box)
+            frame = Frame(_three(0.5 * (low + high)), ROOM * 0.5 * float(np.linalg.norm(high - low)))
+        pixels, grid = self._fit(capture, frame, COARSE, generator)
+        first = find(grid, pixels, frame, capture, upward, box, generator)
+        finer = Frame(_three(first.centre), ROOM * first.radius)
+        pixels, grid = self._fit(capture, finer, 1.0, generator, grid.moved(frame, finer))
+        found = find(grid, pixels, finer, capture, upward, box, generator, first)
+        masks = tuple(
+            object_mask(grid, found.region, photo_rays(photo, self.image_size), finer)
+            for photo in capture.frames
+        )
+        _tell(capture, found, masks)
+        return masks
+
+    def _fit(
+        self,
+        capture: Capture,
+        frame: Frame,
+        part: float,
+        generator: torch.Generator,
+        start: SceneGrid | None = None,
+    ) -> tuple[ScenePixels, SceneGrid]:
+        """The photographs' pixels and the field of them, with a part of the pixels a side, of the cells and steps."""
+        pixels = scene_pixels(capture, min(self.image_size, max(LEAST_PIXELS, round(part * self.image_size))))
+        budget = Budget(max(1, round(part * self.steps)), self.batch_rays, round(part * self.resolution))
+        return pixels, fit(pixels, frame, budget, generator, start).grid
+
+
+def _tell(capture: Capture, found: Found, masks: tuple[Tensor, ...]) -> None:
+    """Log what was taken for the object."""
+    covered = [float((mask > 0.5).float().mean()) for mask in masks]
+    low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in found.box)
+    plane = found.region.plane
+    stands = "stands on no plane"
+    if plane is not None:
+        foot = found.frame.out(np.array(plane.normal) * plane.offset)
+        place = ", ".join(f"{x:.4g}" for x in foot)
+        normal = ", ".join(f"{x:.3f}" for x in plane.normal)
+        stands = f"stands on the plane through ({place}) with normal ({normal})"
+    _log.info(
+        "%s: the object %s and has the box [[%s], [%s]] in the capture's frame; it covers %.1f %% of the photographs "
+        "(%.1f to %.1f %%). objects.box sets another box",
+        capture.name, stands, low, high, 100.0 * float(np.median(covered)), 100.0 * min(covered), 100.0 * max(covered),
+    )  # fmt: skip
+
+
+def _three(point: np.ndarray) -> Direction:
+    x, y, z = (float(value) for value in point)
+    return x, y, z

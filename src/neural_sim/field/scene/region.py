@@ -1,0 +1,160 @@
+"""The part of a scene that is the object: cells of a grid above the supporting plane, connected, near the origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull
+from torch import Tensor
+
+from neural_sim.field.scene.grid import SceneGrid
+from neural_sim.field.scene.plane import Plane
+from neural_sim.field.scene.space import Frame, cells_of, contract, expand
+
+SHOWS = 0.4
+"""Smallest contribution of a cell to some pixel with which it counts as solid."""
+REACH = 1.5
+"""The object lies inside the ball of this radius in the normalised frame."""
+LARGE = 0.1
+"""Connected parts with less than this fraction of the largest one's cells are errors of the field."""
+FARTHEST = 0.9
+"""Largest distance from the origin at which an object is looked for to end."""
+LEAST = 8
+"""Solid cells of an object, at least."""
+EMPTIER = 0.5
+"""Largest density of solid cells about an object, relative to its own."""
+APART = 1.0
+"""Height in cells above the plane from which on cells connect: below it the plane's own roughness does."""
+GROUND = 1.0
+"""Height in cells above the plane from which on samples are the object's."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """``cells`` of a grid, and of these what is above the plane by ``ground``, in the normalised frame."""
+
+    cells: Bool[Tensor, "cells"]
+    resolution: int
+    plane: Plane | None
+    ground: float
+
+    def holds(self, contracted: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether contracted positions lie in the object."""
+        inside = self.cells[cells_of(contracted, self.resolution)]
+        if self.plane is not None:
+            inside &= self.plane.height(expand(contracted)) > self.ground
+        return inside
+
+    def cells_in(self, own: Frame, frame: Frame, resolution: int) -> Bool[Tensor, "cells"]:
+        """Which cells of another grid and frame lie in this region's, whatever their height."""
+        points = contract(own.of(frame, expand(cell_centres(resolution))))
+        return self.cells[cells_of(points, self.resolution)]
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and highest corner of a box about the cells, in the normalised frame."""
+        centres = expand(cell_centres(self.resolution)[self.cells])
+        half = 2.0 / self.resolution
+        return (centres.amin(0) - half).double().numpy(), (centres.amax(0) + half).double().numpy()
+
+
+def cell_centres(resolution: int) -> Float[Tensor, "cells 3"]:
+    """Contracted, in the order of ``cells_of``."""
+    axis = (torch.arange(resolution) + 0.5) * (4.0 / resolution) - 2.0
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
+
+
+def connected_region(
+    grid: SceneGrid,
+    largest: Float[Tensor, "cells"],
+    plane: Plane | None,
+    within: Bool[Tensor, "cells"] | None = None,
+) -> Region | None:
+    """What is connected and nearest to the origin, None where nothing is. ``largest`` is the cells' contribution;
+    ``within``, where it is given, holds the object and little else: all that is solid there is taken."""
+    solid = (largest > SHOWS) & _allowed(grid, plane, APART)
+    if within is not None:
+        solid &= within
+        return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
+    centres = expand(cell_centres(grid.resolution))
+    distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
+    reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
+    if reach is None:
+        return None
+    return enclosed(grid, _nearest_part(solid & (distance < reach), centres, grid.resolution), plane)
+
+
+def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
+    """The distance from the origin at which the object ends, None where nothing stands apart.
+
+    Rings of two cells' width are compared with what they enclose, in solid cells for each volume: about an object is a
+    ring that is emptier by far, even where an error of the field bridges it.
+    """
+    inner = torch.arange(3, int(FARTHEST / edge)) * edge
+    within = (distance[None] < inner[:, None]).sum(1)
+    ring = (distance[None] < inner[:, None] + 2.0 * edge).sum(1) - within
+    volume = inner**dimensions
+    ratio = (ring / ((inner + 2.0 * edge) ** dimensions - volume)) / (within / volume).clamp_min(1e-12)
+    ratio[within < LEAST] = float("inf")
+    if not len(ratio) or float(ratio.min()) > EMPTIER:
+        return None
+    first = int((ratio <= max(1.2 * float(ratio.min()), 0.02)).int().argmax())
+    return float(inner[first]) + edge
+
+
+def _nearest_part(
+    solid: Bool[Tensor, "cells"], centres: Float[Tensor, "cells 3"], side: int
+) -> Bool[Tensor, "cells"]:
+    """Of the connected parts that are not small beside the largest the one nearest to the origin."""
+    large = _large_parts(solid, side)
+    label, count = _labelled(large, side)
+    distance = centres.norm(dim=-1)
+    nearest = torch.full((count + 1,), float("inf")).scatter_reduce(0, label, distance, "amin")
+    return label == 1 + int(nearest[1:].argmin())
+
+
+def _labelled(solid: Bool[Tensor, "cells"], side: int) -> tuple[Int[Tensor, "cells"], int]:
+    """The number of each cell's connected part from 1, 0 where it is not solid, and how many there are."""
+    parts = np.zeros((side, side, side), dtype=np.int64)
+    scipy.ndimage.label(solid.view(side, side, side).numpy(), np.ones((3, 3, 3)), output=parts)
+    return torch.from_numpy(parts).view(-1), int(parts.max())
+
+
+def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells"]:
+    """Of solid cells those in connected parts that are not small beside the largest."""
+    label, count = _labelled(solid, side)
+    sizes = torch.bincount(label, minlength=count + 1)
+    sizes[0] = 0
+    return (sizes >= LARGE * float(sizes.max()))[label] & solid
+
+
+def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
+    """The region of all cells inside the convex hull of these and their neighbours.
+
+    A hollow, such as a mug's, shows surfaces that few photographs see and that stay faint; in the hull they are the
+    object's. What is empty in the hull absorbs nothing and stays out of the masks.
+    """
+    side = grid.resolution
+    fringe: np.ndarray = np.asarray(
+        scipy.ndimage.binary_dilation(cells.view(side, side, side).numpy(), np.ones((3, 3, 3)))
+    )
+    spans = [np.flatnonzero(fringe.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    near = np.zeros(fringe.shape, dtype=np.bool_)
+    near[tuple(slice(span[0], span[-1] + 1) for span in spans)] = True
+    centres = expand(cell_centres(side)[torch.from_numpy(near).view(-1)]).double().numpy()
+    sides: np.ndarray = np.asarray(ConvexHull(centres[fringe[near]]).equations)
+    near[near] = (centres @ sides[:, :3].T + sides[:, 3] <= 1e-9).all(1)
+    inside = near.reshape(-1)
+    return Region(torch.from_numpy(inside), side, plane, GROUND * grid.edge)
+
+
+def _allowed(grid: SceneGrid, plane: Plane | None, cells: float) -> Bool[Tensor, "cells"]:
+    """Cells within reach, so many cells above the plane."""
+    centres = expand(cell_centres(grid.resolution))
+    inside = centres.norm(dim=-1) < REACH
+    if plane is not None:
+        inside &= plane.height(centres) > cells * grid.edge
+    return inside

@@ -1,0 +1,98 @@
+"""The space of a captured scene: normalised about its object, contracted so that it ends, and rays sampled in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+NEAR = 0.4
+"""Where rays begin, in distances of their camera from the origin: nearer, a field has room for a picture of its own
+before each camera, and photographs of an object show nothing."""
+FAR = 100.0
+"""Where rays end: the contraction moves what is farther away by less than 1 / FAR."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The normalised frame: the capture's, moved by -``centre`` and divided by ``unit``, both in the capture's."""
+
+    centre: tuple[float, float, float]
+    unit: float
+
+    def into(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points of the capture's frame in the normalised one."""
+        return (points - points.new_tensor(self.centre)) / self.unit
+
+    def of(self, other: Frame, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points of another normalised frame in this one."""
+        moved = (points.new_tensor(other.centre) - points.new_tensor(self.centre)) / self.unit
+        return points * (other.unit / self.unit) + moved
+
+    def out(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Inverse of :meth:`into`."""
+        return points * self.unit + np.array(self.centre)
+
+
+def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """All of space into the ball of radius 2; the unit ball stays (mip-NeRF 360, Barron et al. 2022, Eq. 10)."""
+    length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points * ((2.0 - 1.0 / length) / length)
+
+
+def expand(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Inverse of :func:`contract`; what is outside of the ball of radius 2 goes far away."""
+    length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points / (length * (2.0 - length).clamp_min(1e-6))
+
+
+def along_rays(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    phase: Float[Tensor, "rays"],
+    count: int,
+) -> tuple[Float[Tensor, "rays count 3"], Float[Tensor, "rays count"]]:
+    """Contracted positions of ``count`` samples of each ray, and the contracted length that each stands for.
+
+    Distances are equiangular about the origin (Kulla and Fajardo 2012): t = m + h tan(theta) with equal steps of theta,
+    where m is the distance to the point nearest to the origin and h^2 is 1 plus its square there, so that the unit ball
+    has most of the samples and steps grow as the contraction shrinks them. ``phase`` in [0, 1) shifts each ray's.
+    """
+    middle = -(origins * directions).sum(-1)
+    square = origins.square().sum(-1)
+    height = (1.0 + (square - middle.square()).clamp_min(0.0)).sqrt()
+    first = torch.atan((NEAR * square.sqrt() - middle) / height)
+    last = torch.atan((FAR - middle) / height)
+    step = torch.arange(count + 1, device=phase.device, dtype=phase.dtype)
+    theta = first[:, None] + (last - first)[:, None] * ((step + phase[:, None]) / (count + 1))
+    distance = middle[:, None] + height[:, None] * torch.tan(theta)
+    ends = contract(origins[:, None] + directions[:, None] * distance[..., None])
+    return 0.5 * (ends[:, 1:] + ends[:, :-1]), (ends[:, 1:] - ends[:, :-1]).norm(dim=-1)
+
+
+def cells_of(contracted: Float[Tensor, "*n 3"], resolution: int) -> Int[Tensor, "*n"]:
+    """Flat indices of the cells that points lie in; ``resolution`` cells along each side of [-2, 2]^3."""
+    place = ((contracted + 2.0) * (resolution / 4.0)).long().clamp_(0, resolution - 1)
+    return (place[..., 0] * resolution + place[..., 1]) * resolution + place[..., 2]
+
+
+def looked_at(camera_to_world: Float[np.ndarray, "n 4 4"], name: str) -> tuple[np.ndarray, float]:
+    """The point nearest to the cameras' optical axes (least squares), and the cameras' median distance from it.
+
+    Raises:
+        ValueError: axes that are all parallel, or a point behind most cameras.
+    """
+    axes, centres = -camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    point = np.linalg.lstsq(normal, (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+    ahead = ((point - centres) * axes).sum(1) > 0.0
+    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(axes) or ahead.mean() < 0.5:
+        raise ValueError(
+            f"objects.masks=scene: the cameras of {name} do not look at one place from several sides, so that nothing "
+            "says where the object is; set objects.box"
+        )
+    return point, float(np.median(np.linalg.norm(centres - point, axis=1)))
