@@ -17,6 +17,7 @@ from made_photographs import co3d, objectnet, photographs_by_class
 from omegaconf import OmegaConf
 from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
+from scenes import Room
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.saved import SavedDetector
@@ -187,6 +188,15 @@ def captures(root: Path) -> Path:
     return root
 
 
+def rooms(root: Path) -> Path:
+    """Photographs of a mug on a table in a room, without masks."""
+    root.mkdir(parents=True)
+    (item,) = Procedural(["mug"]).load()
+    room = Room(table=(float(item.mesh.bounds[0][2]), 4.0))
+    capture(root, "mug", count=28, width=160, height=120, item=item, angles=(0.2, 0.42), room=room)
+    return root
+
+
 def labels(path: Path) -> Path:
     """:func:`coco` with the objects of :func:`captures`."""
     return coco(path, ["can", "mug"])
@@ -224,6 +234,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/models": bop,
     "/data/meshes": meshes,
     "/data/captures": captures,
+    "/data/rooms": rooms,
     "/data/val.json": coco,
     "/data/wild.json": wild,
     "/data/blenderproc": blenderproc,

@@ -19,6 +19,7 @@ OTHERS = (
     "Lin et al",
     "Golub",
     "Meyer",
+    "Barron",
 )
 CITED = re.compile(r"(Eqs?|Secs?)\.\s+((?:[A-D]|\d+)(?:\.\d+)?(?:(?:, | and | to )(?:[A-D]\.|\d+\.?)\d*)*)")
 FILES = [
