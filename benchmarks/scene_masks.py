@@ -21,8 +21,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from captures import Made, capture
-from scenes import Room
+from captures import Made, on_a_table
 
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
@@ -36,15 +35,6 @@ from neural_sim.objects.ycb import YCB
 from neural_sim.report.machine import machine
 
 HELD_OUT = 4
-
-
-def photographs(folder: Path, item: ObjectMesh, count: int, size: tuple[int, int], noise: float) -> Made:
-    """With exposure noise of 5 %, from 36 to 76 degrees off the vertical, the table below the object."""
-    room = Room(table=(float(item.mesh.bounds[0][2]), 4.0))
-    return capture(
-        folder, item.name, count=count, width=size[0], height=size[1], item=item, angles=(0.2, 0.42), room=room,
-        exposure=0.05, pose_noise=noise, suffix=".jpg",
-    )  # fmt: skip
 
 
 def overlaps(truth: Made, pictures: Pictures) -> list[float]:
@@ -69,7 +59,10 @@ def psnr(source: Photos, name: str, pictures: Pictures, size: int) -> float:
 
 def measure(item: ObjectMesh, folder: Path, options: argparse.Namespace) -> dict[str, float | str]:
     """One object's row."""
-    truth = photographs(folder, item, options.photos, tuple(options.size), options.noise)
+    truth = on_a_table(
+        folder, item, count=options.photos, width=options.size[0], height=options.size[1],
+        exposure=0.05, pose_noise=options.noise, suffix=".jpg",
+    )  # fmt: skip
     source = Photos(folder, [item.name], masks="scene", scene=SceneMasks())
     began, spent = time.perf_counter(), time.process_time()
     pictures = source.pictures(item.name)

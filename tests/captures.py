@@ -143,6 +143,12 @@ def capture(
     return Made(home, written, k, mesh, scale, centre)
 
 
+def on_a_table(folder: Path, item: ObjectMesh, **more) -> Made:
+    """:func:`capture` of an object that stands on a round table in a room, from above, as people take photographs."""
+    room = Room(table=(float(item.mesh.bounds[0][2]), 4.0))
+    return capture(folder, item.name, item=item, angles=(0.2, 0.42), room=room, **more)
+
+
 def colmap_text(folder: Path, names: list[str], poses: np.ndarray, k: dict[str, float]) -> None:
     """COLMAP's text format, by its documentation."""
     folder.mkdir(parents=True)

@@ -13,11 +13,10 @@ import torch
 import trimesh
 from captures import capture
 from documented import PAGES, ROOT
-from made_photographs import co3d, objectnet, photographs_by_class
+from made_photographs import co3d, objectnet, photographs_by_class, rooms
 from omegaconf import OmegaConf
 from PIL import Image
 from posed_scenes import meshes_in_metres, photographs, write_bop, write_ycb_video
-from scenes import Room
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.saved import SavedDetector
@@ -185,15 +184,6 @@ def captures(root: Path) -> Path:
     root.mkdir(parents=True)
     for name, kind in (("can", "transforms"), ("mug", "colmap_text")):
         capture(root, name, count=12, kind=kind, suffix=".jpg")
-    return root
-
-
-def rooms(root: Path) -> Path:
-    """Photographs of a mug on a table in a room, without masks."""
-    root.mkdir(parents=True)
-    (item,) = Procedural(["mug"]).load()
-    room = Room(table=(float(item.mesh.bounds[0][2]), 4.0))
-    capture(root, "mug", count=28, width=160, height=120, item=item, angles=(0.2, 0.42), room=room)
     return root
 
 

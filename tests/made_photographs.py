@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from captures import DISTORTION, capture
+from captures import DISTORTION, capture, on_a_table
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -35,6 +35,13 @@ def objectnet(root: Path) -> Path:
     """Photographs of the folders that the experiment of that name lists, and of another."""
     classes = OmegaConf.load(conf_directory() / "experiment" / "objectnet.yaml").target.classes
     return photographs_by_class(root, [*classes, "squeegee"])
+
+
+def rooms(root: Path) -> Path:
+    """Photographs of a mug on a table in a room, without masks."""
+    root.mkdir(parents=True)
+    on_a_table(root, Procedural(["mug"]).load()[0], count=28, width=160, height=120)
+    return root
 
 
 def co3d(

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from captures import capture
+from captures import capture, on_a_table
 from hydra import compose, initialize_config_dir
 from scenes import Room
 
@@ -86,10 +86,7 @@ def test_photographs_with_masks_have_no_such_stage(root, tmp_path):
 def test_fields_from_these_masks_are_as_good_as_from_true_ones(tmp_path):
     """A mug, from photographs to a field by the command's own stages. Held-out photographs score each on its object."""
     (item,) = Procedural(["mug"]).load()
-    room = Room(table=(float(item.mesh.bounds[0][2]), 4.0))
-    truth = capture(
-        tmp_path / "captures", "mug", count=32, item=item, angles=(0.2, 0.42), room=room, exposure=0.05
-    )
+    truth = on_a_table(tmp_path / "captures", item, count=32, exposure=0.05)
     (truth.folder / "masks").mkdir()
     for file in (truth.folder / "truth").iterdir():
         (truth.folder / "masks" / file.name).write_bytes(file.read_bytes())

@@ -6,9 +6,8 @@ import re
 import numpy as np
 import pytest
 import torch
-from captures import capture
+from captures import on_a_table
 from PIL import Image
-from scenes import Room
 
 from neural_sim.field.scene.recipe import SceneMasks
 from neural_sim.objects.photos import Photos
@@ -16,16 +15,6 @@ from neural_sim.objects.procedural import Procedural
 from neural_sim.renderer.raycast import RaycastRenderer
 
 SMALL = SceneMasks(image_size=96, resolution=96, steps=240)
-
-
-def photographed(folder, name="mug", room=True, **more):
-    """Photographs of an object on a round table at its foot, from above, as people take them."""
-    (item,) = Procedural([name]).load()
-    foot = float(item.mesh.bounds[0][2])
-    return capture(
-        folder, name, count=20, width=96, height=72, item=item, renderer=RaycastRenderer(1), exposure=0.1,
-        angles=(0.2, 0.42), distance=(2.8, 3.8), room=Room(table=(foot, 4.0)), **more,
-    )  # fmt: skip
 
 
 def overlaps(truth, masks):
@@ -40,7 +29,10 @@ def overlaps(truth, masks):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return photographed(tmp_path_factory.mktemp("scene"))
+    return on_a_table(
+        tmp_path_factory.mktemp("scene"), Procedural(["mug"]).load()[0], count=20, width=96, height=72,
+        renderer=RaycastRenderer(1), exposure=0.1, distance=(2.8, 3.8),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
