@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
-from neural_sim.objects.photos import Photos, Up
+from neural_sim.objects.photos import Photos, PoseCorrector, Up
 from neural_sim.objects.pictures import Masks
 from neural_sim.objects.scene_masks import Box, SceneMaskMaker
 from neural_sim.objects.transforms_json import image_size
@@ -36,7 +36,7 @@ class Co3d(Photos):
         names: categories; null: all.
         sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
             the highest ``viewpoint_quality_score``, of those without one the longest.
-        masks, up, size, box, scene: see :class:`Photos`.
+        masks, up, size, box, scene, poses: see :class:`Photos`.
 
     Raises:
         ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
@@ -53,9 +53,10 @@ class Co3d(Photos):
         size: float | Mapping[str, float] | None = None,
         box: Box | Mapping[str, Box] = None,
         scene: SceneMaskMaker | None = None,
+        poses: PoseCorrector | None = None,
     ) -> None:
         self.sequences = dict(sequences or {})
-        super().__init__(root, names, masks, up, size, box, scene)
+        super().__init__(root, names, masks, up, size, box, scene, poses)
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
             raise ValueError(f"objects.sequences: {strange} are no objects, these are {self.names()}")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -26,6 +26,14 @@ _log = logging.getLogger(__name__)
 Up = str | list[float] | None
 
 
+class PoseCorrector(Protocol):
+    """Corrects the poses of an object's photographs."""
+
+    def refine(self, views: PosedViews, held_out: int) -> PosedViews:
+        """The views, of which the last ``held_out`` are test frames, at corrected poses."""
+        ...
+
+
 class Photos:
     """Captures of a folder; an object has the name of its folder.
 
@@ -40,6 +48,7 @@ class Photos:
         box: with ``masks="scene"``: two corners of a box about the object, along the axes of the capture's frame and in
             its unit, or a mapping by object's name; null: the object is looked for where the cameras look.
         scene: what computes masks where ``masks="scene"``.
+        poses: what corrects the cameras' poses; null: they stay as they are given.
 
     Raises:
         ValueError: a missing folder, one without captures, an unknown name, a bad ``up``, ``size`` or ``box``,
@@ -56,12 +65,13 @@ class Photos:
         size: float | Mapping[str, float] | None = None,
         box: Box | Mapping[str, Box] = None,
         scene: SceneMaskMaker | None = None,
+        poses: PoseCorrector | None = None,
     ) -> None:
         self.root = folder_of(root)
         captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
-        self.up, self.size, self.box, self.scene = up, size, box, scene
+        self.up, self.size, self.box, self.scene, self.poses = up, size, box, scene, poses
         if masks == "scene" and scene is None:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
@@ -145,7 +155,7 @@ class Photos:
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
     ) -> PosedViews:
-        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`."""
+        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`; then ``poses``."""
         train, test = self.split(name, count, held_out)
         pictures = pictures or self.pictures(name)
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
@@ -154,7 +164,7 @@ class Photos:
             "%s: %d photographs train and %d score; a pixel of views.image_size=%d covers up to %.1f of theirs a side",
             name, len(train), len(test), image_size, finest,
         )  # fmt: skip
-        return views
+        return views if self.poses is None else self.poses.refine(views, len(test))
 
     def _up(self, name: str) -> tuple[float, float, float] | None:
         up: Any = self.up.get(name) if isinstance(self.up, Mapping) else self.up

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
-from neural_sim.objects.photos import Photos
+from neural_sim.objects.photos import Photos, PoseCorrector
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.renderer.subject import FieldSubject
@@ -38,9 +38,11 @@ class Captures(Objects):
 @dataclass(frozen=True)
 class PhotoViewsStage(ViewsStage):
     """Photographs of one object as views of one camera. ``content`` is the digest of their files; of ``settings`` only
-    the counts and the image size apply. ``masks`` computes the object's masks, None: photographs bring them."""
+    the counts and the image size apply. ``masks`` computes the object's masks, None: photographs bring them; ``poses``
+    is the source's."""
 
     masks: MasksStage | None = None
+    poses: PoseCorrector | None = None
 
     @property
     def held_out(self) -> int:

@@ -107,7 +107,12 @@ class Graph:
         source = self.objects.source
         return tuple(
             PhotoViewsStage(
-                name, digests[name], settings, self.objects, MasksStage.of(source, name, digests[name])
+                name,
+                digests[name],
+                settings,
+                self.objects,
+                MasksStage.of(source, name, digests[name]),
+                source.poses,
             )
             for name in self.names
         )

@@ -1,0 +1,93 @@
+"""Fields from views whose poses are off, before and after their correction, beside fields from true poses.
+
+Quick scale's views and fields of YCB objects with `--root ../shared/ycb`, else of the embedded ones. A position is off
+by `--noise` of its distance from the object (standard deviation an axis), a rotation by the same number in radians.
+PSNR in dB of held-out views, of the pixels of the object; where poses are corrected, those of held-out views are too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from field import HELD_OUT, load_objects, training_views
+
+from neural_sim.field.fitting import GridFitting
+from neural_sim.field.grid import GridField
+from neural_sim.field.training import fit_field
+from neural_sim.renderer.pose_refinement import PoseRefinement, moved, rotation_angle
+from neural_sim.report.machine import machine
+from neural_sim.types import PosedViews
+
+
+def disturbed(views: PosedViews, noise: float) -> PosedViews:
+    """The views at wrong poses, as photographs, whose silhouettes need not agree."""
+    generator = torch.Generator().manual_seed(5)
+    step = noise * torch.randn(len(views), 6, generator=generator)
+    step[:, 3:] *= views.camera_to_world[:, :3, 3].norm(dim=-1, keepdim=True)
+    known = torch.ones(views.images.shape[:3], dtype=torch.bool)
+    return replace(views, camera_to_world=moved(views.camera_to_world, step), known=known)
+
+
+def psnr(views: PosedViews) -> float:
+    """Of a field as at quick scale."""
+    fitting = GridFitting(GridField(), resolution=128, refine_steps=(80,), prune_steps=(160,))
+    generator = torch.Generator().manual_seed(0)
+    return fit_field(views, fitting, generator, steps=240, held_out=HELD_OUT)[1][-1]["psnr_foreground"]
+
+
+def errors(views: PosedViews, truth: PosedViews) -> tuple[float, float]:
+    """Medians, in radii and degrees."""
+    a, b = views.camera_to_world, truth.camera_to_world
+    turned = float(rotation_angle(a[:, :3, :3], b[:, :3, :3]).median())
+    return float((a[:, :3, 3] - b[:, :3, 3]).norm(dim=-1).median()), math.degrees(turned)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
+    parser.add_argument("--names", nargs="*")
+    parser.add_argument("--photos", type=int, default=40)
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--noise", type=float, nargs="*", default=[0.0, 0.01])
+    parser.add_argument("--rounds", type=int, nargs="*", default=[3])
+    parser.add_argument("--resolution", type=int, default=PoseRefinement.resolution)
+    parser.add_argument("--updates", type=int, default=PoseRefinement.updates)
+    parser.add_argument("--steps", type=int, default=PoseRefinement.steps)
+    parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/pose_refinement.json"))
+    options = parser.parse_args()
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    torch.set_num_threads(1)
+    rows = []
+    print(f"{'object':24}{'noise':>7}{'rounds':>8}{'radii':>9}{'degrees':>9}{'psnr':>7}{'cpu s':>7}")
+    for item in load_objects(options.root, options.names):
+        truth = training_views(item, options.size, options.photos)
+        for noise in options.noise:
+            given = disturbed(truth, noise)
+            for rounds in (0, *options.rounds):
+                began = time.process_time()
+                refinement = PoseRefinement(
+                    rounds, options.updates, resolution=options.resolution, steps=options.steps
+                )
+                views = refinement.refine(given, HELD_OUT)
+                seconds = time.process_time() - began
+                radii, degrees = errors(views, truth)
+                rows.append({"object": item.name, "noise": noise, "rounds": rounds, "radii": radii,
+                             "degrees": degrees, "psnr_foreground": psnr(views), "cpu_seconds": seconds})  # fmt: skip
+                print(
+                    f"{item.name:24}{noise:7.3f}{rounds:8}{radii:9.4f}{degrees:9.3f}"
+                    f"{rows[-1]['psnr_foreground']:7.2f}{seconds:7.1f}",
+                    flush=True,
+                )
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,248 @@
+"""Camera poses of photographs, corrected until the photographs agree with one field of the object.
+
+Each round fits a small field at the poses so far and moves each camera by Gauss-Newton steps towards what its
+photograph shows of that field: image alignment as in Lucas and Kanade (1981) against a radiance field. BARF (Lin et al.
+2021) moves field and poses by one optimiser instead.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+from trimesh.registration import procrustes
+
+from neural_sim.cameras import resized
+from neural_sim.checks import at_least
+from neural_sim.field.base import RadianceField
+from neural_sim.field.fitting import GridFitting
+from neural_sim.field.grid import GridField
+from neural_sim.field.training import fit_field
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.types import Maps, PosedViews
+
+_log = logging.getLogger(__name__)
+
+FAIR = 0.1
+"""Scale of Fair's robust loss (1974), in units of colour and opacity. Larger differences, as of highlights and
+passers-by, count by their size, smaller ones by their square."""
+DAMPING = 1e-3
+"""Of the normal equations, relative to their diagonal (Marquardt 1963)."""
+VIEWS_AT_ONCE = 16
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """Corrects poses in rounds of a small field and steps of each camera.
+
+    Coarse fields find cameras that are far off and move right ones; the last third of the rounds has fields of twice
+    the resolution and steps, which put those back.
+
+    Args:
+        rounds: how often a field is fitted; 0: poses stay as they are given.
+        updates: Gauss-Newton steps of each camera in a round.
+        image_size: longer side in pixels to which larger views are reduced.
+        resolution: cells of the first rounds' fields along the unit sphere's diameter, a power of two from 32.
+        steps: optimiser steps of each of these fields.
+        batch_rays: rays of a step.
+        seed: of the order of rays; not the run's seed, so that runs share views.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+
+    rounds: int = 0
+    updates: int = 4
+    image_size: int = 96
+    resolution: int = 64
+    steps: int = 60
+    batch_rays: int = 4096
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        at_least("objects.poses", 0, rounds=self.rounds, seed=self.seed)
+        at_least("objects.poses", 1, updates=self.updates, steps=self.steps, batch_rays=self.batch_rays)
+        at_least("objects.poses", 8, image_size=self.image_size)
+
+    def refine(self, views: PosedViews, held_out: int) -> PosedViews:
+        """The views at corrected poses. The last ``held_out`` views train no field, but their poses are corrected too.
+
+        What the photographs leave open, a similarity of all cameras, is chosen such that the cameras stay where they
+        were on average.
+
+        Raises:
+            ValueError: as ``visual_hull``, where the silhouettes share no cell.
+        """
+        if self.rounds == 0:
+            return views
+        reduced, given = reduce_views(views, self.image_size), views.camera_to_world
+        poses, errors = given, []
+        for round in range(self.rounds):
+            reduced = replace(reduced, camera_to_world=poses)
+            finer = 2 if 3 * round >= 2 * self.rounds else 1
+            poses, error = align(self._field(reduced, held_out, finer), reduced, self.updates)
+            errors.append(error)
+        poses = onto(poses, given)
+        moved = (poses[:, :3, 3] - given[:, :3, 3]).norm(dim=-1)
+        turned = rotation_angle(poses[:, :3, :3], given[:, :3, :3])
+        _log.info(
+            "%d cameras corrected: by %.4f radii and %.2f degrees (medians; largest %.4f and %.2f); robust error of "
+            "renders by rounds %s",
+            len(views), float(moved.median()), math.degrees(float(turned.median())), float(moved.max()),
+            math.degrees(float(turned.max())), ", ".join(f"{error:.5f}" for error in errors),
+        )  # fmt: skip
+        return replace(views, camera_to_world=poses)
+
+    def _field(self, views: PosedViews, held_out: int, finer: int) -> RadianceField:
+        steps = finer * self.steps
+        fitting = GridFitting(
+            GridField().to(views.images),
+            finer * self.resolution,
+            (),
+            (steps // 2,),
+            batch_rays=self.batch_rays,
+        )
+        generator = torch.Generator().manual_seed(self.seed)
+        return fit_field(views, fitting, generator, steps=steps, held_out=held_out)[0]
+
+
+def reduce_views(views: PosedViews, size: int) -> PosedViews:
+    """The views with a longer side of at most ``size`` pixels, by the mean over each pixel's area. A reduced pixel is
+    known where all of its area is."""
+    camera = views.camera
+    factor = size / max(camera.width, camera.height)
+    if factor >= 1.0:
+        return views
+    camera = resized(camera, max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
+    shape, alpha = (camera.height, camera.width), views.images[..., 3:]
+    channels = torch.cat([views.images[..., :3] * alpha, alpha], -1).movedim(-1, 1)
+    small = functional.adaptive_avg_pool2d(channels, shape).movedim(1, -1)
+    colour = small[..., :3] / small[..., 3:].clamp_min(1e-6)
+    known = views.known
+    if known is not None:
+        known = functional.adaptive_avg_pool2d(known[:, None].to(small), shape)[:, 0] > 1.0 - 1e-4
+    return replace(views, images=torch.cat([colour, small[..., 3:]], -1), camera=camera, known=known)
+
+
+def align(
+    field: RadianceField, views: PosedViews, updates: int, renderer: NerfRenderer | None = None
+) -> tuple[Float[Tensor, "views 4 4"], float]:
+    """Poses after ``updates`` Gauss-Newton steps on Fair's loss of renders against views, and the mean loss there.
+
+    Of the poses that a camera passes, the given one among them, the one of the least loss is returned: a step that
+    overshoots is not kept.
+    """
+    renderer = renderer or NerfRenderer("draft")
+    parts = torch.arange(len(views)).split(VIEWS_AT_ONCE)
+    results = [_align(field, views.select(part), updates, renderer) for part in parts]
+    return torch.cat([poses for poses, _ in results]), float(torch.cat([loss for _, loss in results]).mean())
+
+
+def _align(
+    field: RadianceField, views: PosedViews, updates: int, renderer: NerfRenderer
+) -> tuple[Float[Tensor, "views 4 4"], Float[Tensor, "views"]]:
+    poses = best = views.camera_to_world
+    least = poses.new_full((len(views),), math.inf, dtype=torch.float64)
+    for update in range(updates + 1):
+        last = update == updates
+        if last:
+            values, tangents = Maps(*renderer.render(field, views.camera, poses)), []
+        else:
+            values, tangents = renderer.render_with_tangents(field, views.camera, poses, pose_rates(poses))
+        residual = _residuals(values, views)
+        loss = fair_loss(residual).mean(-1)
+        better = loss < least
+        best, least = torch.where(better[:, None, None], poses, best), torch.where(better, loss, least)
+        if not last:
+            jacobian = torch.stack([_shown(_flat(tangent), views) for tangent in tangents], -1)
+            poses = moved(poses, gauss_newton_step(jacobian, residual).to(poses))
+    return best, least
+
+
+def gauss_newton_step(
+    jacobian: Float[Tensor, "views n 6"], residual: Float[Tensor, "views n"]
+) -> Float[Tensor, "views 6"]:
+    """Minimises the weighted squares of residual - jacobian step; the weights are those of Fair's loss (iteratively
+    reweighted least squares). Zero for a camera whose image no motion changes."""
+    weighted = jacobian / (1.0 + residual.abs() / FAIR)[..., None]
+    normal = weighted.transpose(1, 2) @ jacobian
+    size = normal.diagonal(dim1=1, dim2=2)
+    floor = 1e-12 + 1e-9 * size.amax(-1, keepdim=True)
+    damped = normal + torch.diag_embed(DAMPING * size + floor)
+    return torch.linalg.solve(damped, (weighted.transpose(1, 2) @ residual[..., None]))[..., 0]
+
+
+def fair_loss(residual: Tensor) -> Tensor:
+    """Fair's loss: r^2 / 2 for small residuals, c |r| for large ones."""
+    ratio = residual.abs() / FAIR
+    return FAIR**2 * (ratio - ratio.log1p())
+
+
+def _residuals(values: Maps, views: PosedViews) -> Float[Tensor, "views n"]:
+    """What the views show less the render, premultiplied."""
+    alpha = views.images[..., 3:]
+    shown = Maps(views.images[..., :3] * alpha, alpha[..., 0])
+    return _shown(_flat(shown) - _flat(values), views)
+
+
+def _shown(values: Float[Tensor, "views n"], views: PosedViews) -> Float[Tensor, "views n"]:
+    """The values, 0 at pixels that a photograph does not show."""
+    return values if views.known is None else values * views.known.flatten(1).repeat_interleave(4, 1)
+
+
+def _flat(maps: Maps) -> Float[Tensor, "views n"]:
+    return torch.cat([maps.rgb, maps.opacity[..., None]], -1).flatten(1).double()
+
+
+def pose_rates(poses: Float[Tensor, "views 4 4"]) -> Float[Tensor, "6 views 4 4"]:
+    """Derivatives of :func:`moved`: turns about a camera's own axes (1 / rad), motions along them (1 / radius)."""
+    rates = poses.new_zeros(6, *poses.shape)
+    for axis, unit in enumerate(torch.eye(3, dtype=poses.dtype, device=poses.device)):
+        rates[axis, :, :3, :3] = poses[:, :3, :3] @ _cross(unit)
+        rates[3 + axis, :, :3, 3] = poses[:, :3, :3] @ unit
+    return rates
+
+
+def moved(poses: Float[Tensor, "views 4 4"], step: Float[Tensor, "views 6"]) -> Float[Tensor, "views 4 4"]:
+    """Cameras turned by a rotation vector in radians and shifted in object radii, both along their own axes."""
+    result = poses.clone()
+    result[:, :3, :3] = poses[:, :3, :3] @ torch.linalg.matrix_exp(_cross(step[:, :3]))
+    result[:, :3, 3] += (poses[:, :3, :3] @ step[:, 3:, None])[..., 0]
+    return result
+
+
+def _cross(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """The matrices that map v to vector x v."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:
+    """The angle in radians between rotations, exact for small ones, where arccos is not."""
+    chord = (a - b).flatten(-2).norm(dim=-1) / math.sqrt(8.0)  # sine of half the angle
+    return 2.0 * torch.asin(chord.clamp_max(1.0))
+
+
+def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -> Float[Tensor, "views 4 4"]:
+    """The poses under the similarity of least squares (Umeyama 1991) that takes their cameras to the given ones:
+    places, and points at one radius along each camera's axes, so that two cameras determine it."""
+    matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
+    similarity = torch.from_numpy(matrix).to(poses)
+    scale = torch.linalg.det(similarity[:3, :3]) ** (1.0 / 3.0)
+    result = similarity @ poses
+    result[:, :3, :3] /= scale
+    return result
+
+
+def _points(poses: Float[Tensor, "views 4 4"]) -> Float[np.ndarray, "points 3"]:
+    places = poses[:, None, :3, 3]
+    points = torch.cat([places, places + poses[:, :3, :3].transpose(1, 2)], 1).flatten(0, 1)
+    return points.double().cpu().numpy()
