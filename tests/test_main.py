@@ -101,6 +101,25 @@ def test_a_user_error_is_one_line_and_exit_status_two(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+def test_a_sweeps_folders_have_names_that_file_systems_take(tmp_path):
+    """Whatever is overridden: values with slashes, and more of them than a name has room for."""
+    one, two = (
+        "{initial: {dominant: 1}, target: {dominant: 2}}",
+        "{initial: {dominant: 3}, target: {dominant: 4}}",
+    )
+    biased = f"{{can: {one}, mug: {two}}}"
+    done = _run(
+        tmp_path, "-m", "scale=smoke", "stages=[views]", "objects.names=[can,mug]", "views.image_size=16",
+        "views.count=5", "views.held_out=1", f"+parameter.pose.biased={biased}", f"paths.data={tmp_path / 'data'}", "progress=false",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}", "seed=0,1",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    folders = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert [name[:2] for name in folders] == ["0_", "1_"] and all(len(name) == 150 for name in folders)
+    written = (tmp_path / "sweep" / folders[1] / ".hydra" / "overrides.yaml").read_text()
+    assert "seed=1" in written and f"paths.data={tmp_path / 'data'}" in written
+
+
 def test_help_answers_without_heavy_imports():
     code = "import sys, neural_sim.main; print([m for m in ('torch', 'mlflow', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

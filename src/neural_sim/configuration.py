@@ -25,6 +25,16 @@ def conf_directory() -> Path:
     raise FileNotFoundError(f"no conf/config.yaml beside {here.parents[2]} or in the installed package")
 
 
+LONGEST = 150
+"""Characters of the name of a job's folder; file systems allow 255 bytes."""
+
+
+def job_folder(number: int | str, overrides: str) -> str:
+    """Name of the folder of a sweep's job: its number and its overrides, cut where they are long. They are all in
+    ``.hydra/overrides.yaml`` of the folder."""
+    return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
+
+
 def check_top(plain: Mapping[str, Any]) -> None:
     """The top level's own values. Raises ``UserError``."""
     if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:

@@ -26,7 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from neural_sim.configuration import UserError, check_fits, check_top, conf_directory, first_line
+from neural_sim.configuration import UserError, check_fits, check_top, conf_directory, first_line, job_folder
 
 if TYPE_CHECKING:
     from neural_sim.stages.context import Context, Step
@@ -39,6 +39,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 _log = logging.getLogger(__name__)
+
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
 # Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
 _PARTS = (
