@@ -110,8 +110,8 @@ def test_a_sweeps_folders_have_names_that_file_systems_take(tmp_path):
     biased = f"{{can: {one}, mug: {two}}}"
     done = _run(
         tmp_path, "-m", "scale=smoke", "stages=[views]", "objects.names=[can,mug]", "views.image_size=16",
-        "views.count=5", "views.held_out=1", f"+parameter.pose.biased={biased}", f"paths.data={tmp_path / 'data'}", "progress=false",
-        f"hydra.sweep.dir={tmp_path / 'sweep'}", "seed=0,1",
+        "views.count=5", "views.held_out=1", f"+parameter.pose.biased={biased}", f"paths.data={tmp_path / 'data'}",
+        "progress=false", f"hydra.sweep.dir={tmp_path / 'sweep'}", "seed=0,1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     folders = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())

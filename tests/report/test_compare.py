@@ -140,6 +140,8 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
         Compare(("gap",), reference="ours", draws=5).compare(database, 0, {}, tmp_path)
     with pytest.raises(ValueError, match="no experiment 'other'"):
         Compare(("other",), draws=5).compare(database, 0, {}, tmp_path)
+    with pytest.raises(ValueError, match=r"compare\.methods: no run of typo in gap"):
+        Compare(("gap",), draws=5, methods=("typo",)).compare(database, 0, {}, tmp_path)
 
 
 def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):

@@ -118,6 +118,22 @@ def test_seeds_that_a_method_lacks_are_named():
     }  # fmt: skip
 
 
+def test_a_method_of_one_seed_takes_no_seeds_from_those_that_are_named():
+    found = [
+        made("ours", 0, 1),
+        made("ours", 1, 2),
+        made("lts", 0, 3),
+        made("lts", 1, 4),
+        made("response", 0, 5),
+    ]
+    (narrow,) = Selection(found, "ours").groups
+    assert narrow.seeds == (0,)
+    selection = Selection(found, "ours", ["lts"])
+    (group,) = selection.groups
+    assert [(m, seed) for m, seed, _ in chosen(group)] == [("ours", 0), ("ours", 1), ("lts", 0), ("lts", 1)]
+    assert reasons(selection) == {"5": "compare.methods does not name its method"}
+
+
 @pytest.mark.parametrize(
     ("run", "reason"),
     [

@@ -25,6 +25,7 @@ class Compare:
     Args:
         experiments: MLflow experiments whose runs are compared, each by itself and at each gap.
         reference: the method that the others are compared with.
+        methods: these; null: all that have runs. Seeds are those that all of them have.
         draws: of the bootstrap.
         clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
 
@@ -36,6 +37,7 @@ class Compare:
     reference: str = "neural_sim"
     draws: int = 300
     clock: Clock = "seconds"
+    methods: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.experiments or self.draws < 2:
@@ -49,9 +51,15 @@ class Compare:
         """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow.
 
         Raises:
-            ValueError: no such experiment, or no run that can be compared, with the reasons.
+            ValueError: no such experiment, no run of one of the methods, or none that can be compared, with the reasons.
         """
-        chosen = Selection(candidates(uri, self.experiments), self.reference)
+        finished = candidates(uri, self.experiments)
+        missing = sorted(set(self.methods or ()) - {run.results.get("method") for run in finished})
+        if missing:
+            raise ValueError(
+                f"compare.methods: no run of {', '.join(missing)} in {', '.join(self.experiments)}"
+            )
+        chosen = Selection(finished, self.reference, self.methods)
         if not chosen.groups:
             why = "; ".join(f"{reason}: {', '.join(runs)}" for reason, runs in by_reason(chosen.left_out))
             raise ValueError(

@@ -43,11 +43,14 @@ class Group:
 class Selection:
     """The groups of runs that a comparison with ``reference`` is made of, and what it leaves out.
 
-    ``candidates`` are the runs of all experiments asked for, those of each the newest first.
+    ``candidates`` are the runs of all experiments asked for, those of each the newest first. ``methods`` are those to
+    compare beside the reference, None: all.
     """
 
-    def __init__(self, candidates: Sequence[Candidate], reference: str) -> None:
-        self.reference = reference
+    def __init__(
+        self, candidates: Sequence[Candidate], reference: str, methods: Sequence[str] | None = None
+    ) -> None:
+        self.reference, self.methods = reference, methods
         self.left_out: list[LeftOut] = []
         usable = [run for run in candidates if self._usable(run)]
         keyed: dict[tuple[str, str], list[Candidate]] = {}
@@ -67,7 +70,9 @@ class Selection:
 
     def _usable(self, run: Candidate) -> bool:
         reason = run.unusable
-        if reason is None and not all(run.results.get(key) for key in KEYS):
+        if reason is None and self.methods is not None and run.method not in (self.reference, *self.methods):
+            reason = "compare.methods does not name its method"
+        elif reason is None and not all(run.results.get(key) for key in KEYS):
             reason = "an older version wrote it, without the digests that say what it can be compared with"
         elif reason is None and not (run.results["biased"] and run.results["curve"]):
             reason = "none of its objects starts from another distribution than its target's"
