@@ -51,7 +51,7 @@ class Compare:
         """Write compare.json, compare.md and the figures to ``folder``, and a run to MLflow.
 
         Raises:
-            ValueError: no such experiment, no run of one of the methods, or none that can be compared, with the reasons.
+            ValueError: no such experiment, no run of a named method, or none that can be compared, with the reasons.
         """
         finished = candidates(uri, self.experiments)
         missing = sorted(set(self.methods or ()) - {run.results.get("method") for run in finished})
