@@ -16,11 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from field import HELD_OUT, load_objects, training_views
+from field import HELD_OUT, load_objects, quick_psnr, training_views
 
-from neural_sim.field.fitting import GridFitting
-from neural_sim.field.grid import GridField
-from neural_sim.field.training import fit_field
 from neural_sim.renderer.pose_refinement import PoseRefinement, moved, rotation_angle
 from neural_sim.report.machine import machine
 from neural_sim.types import PosedViews
@@ -33,13 +30,6 @@ def disturbed(views: PosedViews, noise: float) -> PosedViews:
     step[:, 3:] *= views.camera_to_world[:, :3, 3].norm(dim=-1, keepdim=True)
     known = torch.ones(views.images.shape[:3], dtype=torch.bool)
     return replace(views, camera_to_world=moved(views.camera_to_world, step), known=known)
-
-
-def psnr(views: PosedViews) -> float:
-    """Of a field as at quick scale."""
-    fitting = GridFitting(GridField(), resolution=128, refine_steps=(80,), prune_steps=(160,))
-    generator = torch.Generator().manual_seed(0)
-    return fit_field(views, fitting, generator, steps=240, held_out=HELD_OUT)[1][-1]["psnr_foreground"]
 
 
 def errors(views: PosedViews, truth: PosedViews) -> tuple[float, float]:
@@ -56,10 +46,7 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=40)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--noise", type=float, nargs="*", default=[0.0, 0.01])
-    parser.add_argument("--rounds", type=int, nargs="*", default=[3])
-    parser.add_argument("--resolution", type=int, default=PoseRefinement.resolution)
-    parser.add_argument("--updates", type=int, default=PoseRefinement.updates)
-    parser.add_argument("--steps", type=int, default=PoseRefinement.steps)
+    parser.add_argument("--rounds", type=int, nargs="*", default=[6])
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks/pose_refinement.json"))
     options = parser.parse_args()
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -72,14 +59,13 @@ def main() -> None:
             given = disturbed(truth, noise)
             for rounds in (0, *options.rounds):
                 began = time.process_time()
-                refinement = PoseRefinement(
-                    rounds, options.updates, resolution=options.resolution, steps=options.steps
-                )
-                views = refinement.refine(given, HELD_OUT)
+                views = PoseRefinement(rounds).refine(given, HELD_OUT)
                 seconds = time.process_time() - began
                 radii, degrees = errors(views, truth)
-                rows.append({"object": item.name, "noise": noise, "rounds": rounds, "radii": radii,
-                             "degrees": degrees, "psnr_foreground": psnr(views), "cpu_seconds": seconds})  # fmt: skip
+                rows.append({
+                    "object": item.name, "noise": noise, "rounds": rounds, "radii": radii, "degrees": degrees,
+                    "cpu_seconds": seconds, "psnr_foreground": quick_psnr(views),
+                })  # fmt: skip
                 print(
                     f"{item.name:24}{noise:7.3f}{rounds:8}{radii:9.4f}{degrees:9.3f}"
                     f"{rows[-1]['psnr_foreground']:7.2f}{seconds:7.1f}",

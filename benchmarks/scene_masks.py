@@ -16,17 +16,14 @@ import time
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from captures import Made, on_a_table
+from field import quick_psnr
 
-from neural_sim.field.fitting import GridFitting
-from neural_sim.field.grid import GridField
 from neural_sim.field.scene.recipe import SceneMasks
-from neural_sim.field.training import fit_field
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.objects.photos import Photos
 from neural_sim.objects.pictures import Pictures
@@ -50,11 +47,7 @@ def overlaps(truth: Made, pictures: Pictures) -> list[float]:
 def psnr(source: Photos, name: str, pictures: Pictures, size: int) -> float:
     """Of a field of 240 steps, on the foreground of held-out photographs."""
     views = source.views(name, 1000, HELD_OUT, size, pictures)
-    fitting = GridFitting(GridField(), resolution=128, refine_steps=(80,), prune_steps=(160,))
-    held_out = len(source.split(name, 1000, HELD_OUT)[1])
-    generator = torch.Generator().manual_seed(0)
-    history = fit_field(views, fitting, generator, steps=240, held_out=held_out)[1]
-    return history[-1]["psnr_foreground"]
+    return quick_psnr(views, len(source.split(name, 1000, HELD_OUT)[1]))
 
 
 def measure(item: ObjectMesh, folder: Path, options: argparse.Namespace) -> dict[str, float | str]:

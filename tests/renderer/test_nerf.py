@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from made_fields import soft_ball
 from torch.nn.functional import normalize
 
 from neural_sim import cameras
@@ -14,16 +15,7 @@ from neural_sim.types import PinholeCamera, Rays
 
 @pytest.fixture
 def field(generator: torch.Generator) -> GridField:
-    """A soft ball: smooth densities and colours, zero density at the border of the occupied cells."""
-    field = GridField(step_cells=0.5, density_gain=1.0).double()
-    field.reset(torch.ones(12, 12, 12, dtype=torch.bool), torch.full((3,), -1.2, dtype=torch.float64), 0.2)
-    grid = torch.stack(
-        torch.meshgrid(*[torch.linspace(-1.2, 1.2, 13, dtype=torch.float64)] * 3, indexing="ij"), -1
-    )
-    with torch.no_grad():
-        field.table[:-1, 0] = (6.0 - 12.0 * grid.flatten(0, 2).norm(dim=-1)).clamp_min(-40.0)
-        field.table[:-1, 1:] = torch.randn(13**3, 3, generator=generator, dtype=torch.float64)
-    return field.eval().requires_grad_(False)
+    return soft_ball(generator)
 
 
 def view(size: int = 9) -> tuple[PinholeCamera, torch.Tensor]:

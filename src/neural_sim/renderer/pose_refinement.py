@@ -23,6 +23,7 @@ from neural_sim.checks import at_least
 from neural_sim.field.base import RadianceField
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
+from neural_sim.field.hull import COARSEST
 from neural_sim.field.training import fit_field
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import Maps, PosedViews
@@ -69,6 +70,10 @@ class PoseRefinement:
         at_least("objects.poses", 0, rounds=self.rounds, seed=self.seed)
         at_least("objects.poses", 1, updates=self.updates, steps=self.steps, batch_rays=self.batch_rays)
         at_least("objects.poses", 8, image_size=self.image_size)
+        if self.resolution < COARSEST or self.resolution & (self.resolution - 1):
+            raise ValueError(
+                f"objects.poses.resolution must be a power of two from {COARSEST}, got {self.resolution}"
+            )
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
         """The views at corrected poses. The last ``held_out`` views train no field, but their poses are corrected too.
@@ -83,18 +88,18 @@ class PoseRefinement:
             return views
         reduced, given = reduce_views(views, self.image_size), views.camera_to_world
         poses, errors = given, []
-        for round in range(self.rounds):
+        for number in range(self.rounds):
             reduced = replace(reduced, camera_to_world=poses)
-            finer = 2 if 3 * round >= 2 * self.rounds else 1
+            finer = 2 if 3 * number >= 2 * self.rounds else 1
             poses, error = align(self._field(reduced, held_out, finer), reduced, self.updates)
             errors.append(error)
         poses = onto(poses, given)
-        moved = (poses[:, :3, 3] - given[:, :3, 3]).norm(dim=-1)
+        shifted = (poses[:, :3, 3] - given[:, :3, 3]).norm(dim=-1)
         turned = rotation_angle(poses[:, :3, :3], given[:, :3, :3])
         _log.info(
             "%d cameras corrected: by %.4f radii and %.2f degrees (medians; largest %.4f and %.2f); robust error of "
             "renders by rounds %s",
-            len(views), float(moved.median()), math.degrees(float(turned.median())), float(moved.max()),
+            len(views), float(shifted.median()), math.degrees(float(turned.median())), float(shifted.max()),
             math.degrees(float(turned.max())), ", ".join(f"{error:.5f}" for error in errors),
         )  # fmt: skip
         return replace(views, camera_to_world=poses)
