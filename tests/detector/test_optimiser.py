@@ -70,3 +70,31 @@ def test_an_entry_that_never_had_a_gradient_has_a_finite_pull_back():
     earlier, along = pulled_back(rule, rule.begin(one), zero, 1e-2, 0, (one, zero, zero))
     assert float(along) == pytest.approx(-1e-2 / 1e-8, rel=1e-12)
     assert float(earlier[2]) == 0.0
+
+
+def test_a_floor_under_adamws_denominator_bounds_its_pull_back(generator):
+    """Where the floor holds, a step is rate m / (c1 floor): the second moment has no effect on theta."""
+    rate, done, (fast, slow) = 7e-3, 2, (0.9, 0.999)
+    theta, first, gradient, by_theta = torch.randn(4, 6, generator=generator, dtype=DOUBLE)
+    second, end = torch.rand(2, 6, generator=generator, dtype=DOUBLE)
+    second[:3] = first[:3] = gradient[:3] = 0.0
+    plain = AdamW(0.02)
+    usual = (end / (1 - slow**120)).sqrt()
+    rule = plain.floored((theta, first, end), 120, 1e-2)
+    torch.testing.assert_close(rule.floor, 1e-2 * (usual + plain.eps))
+    still = torch.zeros_like(theta)
+    (_, by_first, by_second), along = pulled_back(
+        rule, (theta, first, second), gradient, rate, done, (by_theta, still, still)
+    )
+    pushed = -rate * by_theta[:3] / ((1 - fast ** (done + 1)) * rule.floor[:3])
+    torch.testing.assert_close(by_first[:3], fast * pushed)
+    torch.testing.assert_close(along[:3], (1 - fast) * pushed)
+    assert not by_second[:3].any() and by_second[3:].all()
+    _, exact = pulled_back(plain, (theta, first, second), gradient, rate, done, (by_theta, still, still))
+    torch.testing.assert_close(along[3:], exact[3:])
+
+
+def test_rules_without_a_floor_are_themselves():
+    state = (torch.ones(2), torch.ones(2), torch.ones(2))
+    assert AdamW().floored(state, 3, 0.0) == AdamW()
+    assert SGD(0.1).floored(state[:2], 3, 0.5) == SGD(0.1)

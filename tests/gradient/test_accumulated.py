@@ -91,7 +91,10 @@ def test_a_few_probes_a_step_are_unbiased(micro, per_step, every):
 def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
     """The same draw of places and steps, by hand from all scores; two groups share places and keep their own means."""
     made = micro.trained(RULE, micro.examples)
-    scores, how = all_scores(micro, made), Unrolled("reverse_over_reverse", probes_per_step=1, score_every=2)
+    scores, how = (
+        all_scores(micro, made),
+        Unrolled("reverse_over_reverse", probes_per_step=1, score_every=2, floor=0.0),
+    )
     groups = [GROUP[:2], GROUP[2:]]
     found = how.accumulate(
         made, micro.examples, micro.like, micro.slope(made.end), torch.Generator().manual_seed(seed),
@@ -276,7 +279,7 @@ def test_pathwise_wants_the_derivative_by_inputs(problem):
 @pytest.mark.parametrize(
     "settings",
     [{"product": "dense"}, {"part": 0.0}, {"max_memory_mb": -1.0}, {"probes_per_step": -1}, {"score_every": 0},
-     {"chunk_size": 0}],
+     {"chunk_size": 0}, {"floor": -0.1}, {"floor": float("nan")}],
 )  # fmt: skip
 def test_nonsense_is_refused(settings):
     with pytest.raises(ValueError, match=rf"unrolled\.{next(iter(settings))}"):

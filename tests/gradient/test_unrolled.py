@@ -139,6 +139,51 @@ def test_forward_differences_are_central_where_more_than_probes_is_wanted(pulled
     assert torch.equal(one.images, other.images)
 
 
+def last_state(made):
+    """The state that a recorded training ended in."""
+    segment = made.segments()[0]
+    state, gradient = made.replayed(segment, lambda *_: None)[-1]
+    return made.rule.step(state, gradient, made.rates[-1], len(made) - 1)
+
+
+def test_with_a_floor_it_is_the_derivative_of_a_training_with_that_floor(micro, generator):
+    """A training whose denominators are at least those that a plain one ended with."""
+    rule = RULES[-1].floored(last_state(micro.trained(RULES[-1], micro.examples)), len(SHAPE), 1.0)
+    direction = torch.randn(8, generator=generator, dtype=DOUBLE)
+    found = float(micro.accumulated(rule).images @ direction)
+
+    def outcome(step):
+        return micro.outer(micro.trained(rule, micro.weighted(1.0 + step * direction)).end)
+
+    assert found == pytest.approx(extrapolated(outcome, STEP), rel=1e-6)
+
+
+def test_a_floor_gives_what_a_finite_change_does_where_the_first_gradient_is_tiny():
+    """One number, of gradient 1e-9 in the first batch and 1 in the others, as of a part of a detector whose first
+    object comes late. An image of gradient 1 enters the first batch with some weight."""
+    slopes = torch.tensor([1e-9, 1.0, 1.0], dtype=DOUBLE)
+    rows = tuple(torch.tensor(batch) for batch in ([0, 2], [1, 1], [1, 1], [1, 1]))
+    like, rule = {"theta": torch.ones(1, dtype=DOUBLE)}, AdamW(0.0)
+
+    def trained(weight):
+        weights = torch.tensor([1.0, 1.0, weight], dtype=DOUBLE)
+        examples = Examples((slopes,), lambda p, x, rows: weights[rows] * x[0] * p["theta"])
+        gradient_at = lambda theta, rows: examples.gradient(theta, like, rows)  # noqa: E731
+        return train(rule, flatten(like), rows, (0.1,) * 4, gradient_at), examples
+
+    def derivative(floor):
+        made, _ = trained(0.0)
+        weighted = Examples((slopes,), lambda p, x, rows: x[0] * p["theta"])
+        steps = reversed_steps(
+            made, weighted, like, torch.ones(1, dtype=DOUBLE), "reverse_over_reverse", floor=floor
+        )
+        return sum(float(step.scores[step.rows == 2].sum()) for step in steps)
+
+    finite = float(trained(0.15)[0].end - trained(0.0)[0].end) / 0.15
+    assert derivative(0.3) == pytest.approx(finite, rel=0.3)
+    assert derivative(0.0) < 1e6 * finite < 0.0
+
+
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)
 def test_states_kept_and_states_computed_again_give_the_same(pulled, rule):
     """Six steps in two segments of three; without room for gradients they are computed again."""

@@ -144,6 +144,20 @@ def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     assert float(steps.reported.abs().max()) == 0.0
 
 
+def test_what_others_lose_counts_beyond_the_error_of_the_sum():
+    """An object gains 0.1; the other class loses 0.2, by scores that scatter more or less than that."""
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    scatter = torch.randn(50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    scatter = (scatter - scatter.mean()) / scatter.std() / 50**0.5
+    for error, kept in ((0.05, False), (0.2, True)):
+        steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+        steps.judge(torch.zeros(2, 50))
+        proposed(steps, gradient, torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)]))
+        others = error * scatter - 0.2 / 50
+        verdicts = steps.judge(torch.stack([torch.full_like(others, 0.1 / 50), others]))
+        assert verdicts["a"].accepted == kept
+
+
 def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi, momentum=1.0)

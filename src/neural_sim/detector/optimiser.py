@@ -7,8 +7,8 @@ knows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 import torch
 from jaxtyping import Float
@@ -24,17 +24,24 @@ class Rule(Protocol):
 
     def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State: ...
 
+    def floored(self, end: State, done: int, fraction: float) -> Self:
+        """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``; itself for a
+        ``fraction`` of 0, or a rule that divides by nothing."""
+        ...
+
 
 @dataclass(frozen=True)
 class AdamW:
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019, Algorithm 2), as ``torch.optim.AdamW`` steps.
 
-    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments.
+    ``weight_decay`` is one number, or one for each entry of theta. The buffers are the two moments. ``floor`` is the
+    least denominator of every entry.
     """
 
     weight_decay: float | Float[Tensor, "n"] = 1e-2
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-8
+    floor: float | Float[Tensor, "n"] = 0.0
 
     def begin(self, theta: Float[Tensor, "n"]) -> State:
         return theta, torch.zeros_like(theta), torch.zeros_like(theta)
@@ -45,8 +52,23 @@ class AdamW:
         first = fast * first + (1.0 - fast) * gradient
         second = slow * second + (1.0 - slow) * gradient.square()
         corrected, spread = first / (1.0 - fast ** (done + 1)), second / (1.0 - slow ** (done + 1))
-        theta = (1.0 - rate * self.weight_decay) * theta - rate * corrected / (_root(spread) + self.eps)
+        denominator = (_root(spread) + self.eps).clamp_min(self.floor)
+        theta = (1.0 - rate * self.weight_decay) * theta - rate * corrected / denominator
         return theta, first, second
+
+    def floored(self, end: State, done: int, fraction: float) -> AdamW:
+        """With a least denominator of ``fraction`` times that of the last step.
+
+        Where an entry's gradients have been tiny so far (a level of the pyramid before the first batch with an object
+        of its size), a step is the moments' ratio, whatever their size, and its derivative is about 1 / |g|: thousands
+        of times that of other entries. A finite change of the batch's images brings a gradient of the usual size, moves
+        the moments with it, and changes the step by no more than the learning rate. The last step's second moment
+        averages the whole training, and is that usual size.
+        """
+        if fraction == 0.0:
+            return self
+        usual = _root(end[2] / (1.0 - self.betas[1] ** done)) + self.eps
+        return replace(self, floor=fraction * usual)
 
 
 @dataclass(frozen=True)
@@ -66,6 +88,9 @@ class SGD:
         theta, buffer = state
         buffer = self.momentum * buffer + gradient + self.weight_decay * theta
         return theta - rate * buffer, buffer
+
+    def floored(self, end: State, done: int, fraction: float) -> SGD:
+        return self
 
 
 def pulled_back(

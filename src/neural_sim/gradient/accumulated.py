@@ -102,6 +102,8 @@ class Unrolled:
         score_every: length of a block of steps; one step of each block, drawn at random, scores probes with the block's
             weight.
         chunk_size: probes whose losses are computed at a time.
+        floor: least denominator of an entry of theta in AdamW's steps, as a fraction of the last step's, see
+            :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -113,6 +115,7 @@ class Unrolled:
     probes_per_step: int = 1
     score_every: int = 2
     chunk_size: int = 64
+    floor: float = 0.3
 
     def __post_init__(self) -> None:
         if self.product not in get_args(Product):
@@ -120,6 +123,8 @@ class Unrolled:
         for key, least in (("probes_per_step", 0), ("score_every", 1), ("chunk_size", 1)):
             if getattr(self, key) < least:
                 raise ValueError(f"unrolled.{key} must be at least {least}, got {getattr(self, key)}")
+        if not self.floor >= 0.0:
+            raise ValueError(f"unrolled.floor must be at least 0, got {self.floor}")
         _ = self.recording  # raises for part and max_memory_mb
 
     @property
@@ -141,7 +146,7 @@ class Unrolled:
 
         ``like`` gives the parameters' names and shapes. ``generator`` draws which probes each step scores.
         """
-        steps = reversed_steps(trajectory, examples, like, slope, self.product, wanted)
+        steps = reversed_steps(trajectory, examples, like, slope, self.product, wanted, self.floor)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
         columns = shuffled_passes(per_bin, self.probes_per_step or per_bin, generator)

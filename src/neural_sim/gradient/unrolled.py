@@ -123,6 +123,7 @@ def reversed_steps(
     slope: Float[Tensor, "n"],
     product: Product = "central_difference",
     wanted: Wanted = "weights",
+    floor: float = 0.0,
 ) -> Iterator[ReversedStep]:
     """The steps of a training in reverse, from the last to the first recorded one.
 
@@ -130,7 +131,8 @@ def reversed_steps(
     how a batch's Hessian is multiplied: ``forward_difference``, the gradient at ``theta + h a`` minus the step's
     recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as ``central_difference``);
     ``central_difference``, two gradients at ``theta +- h a``, of relative error eps^(2/3); ``reverse_over_reverse``,
-    exact, at the time of three and a half gradients and the memory of a second derivative.
+    exact, at the time of three and a half gradients and the memory of a second derivative. ``floor`` is the fraction of
+    :meth:`detector.optimiser.Rule.floored`; at 0 the derivative is that of the training.
 
     Raises:
         ValueError: an unknown product, or a slope of another length than theta.
@@ -143,16 +145,16 @@ def reversed_steps(
         )
     one_sided = product == "forward_difference" and wanted == "probes"
     curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
-    cotangents = list(
-        trajectory.rule.begin(slope)
-    )  # L_val does not depend on the buffers after the last step
+    rule, floored = trajectory.rule, False
+    cotangents = list(rule.begin(slope))  # L_val does not depend on the buffers after the last step
     for segment in trajectory.segments():
         replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
         for step in reversed(segment):
             state, gradient = replayed.pop()
-            cotangents, along = pulled_back(
-                trajectory.rule, state, gradient, trajectory.rates[step], step, cotangents
-            )
+            rate = trajectory.rates[step]
+            if not floored:
+                rule, floored = rule.floored(rule.step(state, gradient, rate, step), step + 1, floor), True
+            cotangents, along = pulled_back(rule, state, gradient, rate, step, cotangents)
             rows = trajectory.rows[step]
             if one_sided:
                 of_batch = gradient - examples.proximal_gradient(state[0], like)

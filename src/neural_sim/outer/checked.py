@@ -130,17 +130,18 @@ class CheckedSteps:
 
     def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
         """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
-        paired differences. Where all these scores rose and yet the mean over all classes fell, steps harm each other,
-        and all are rejected."""
+        paired differences. Where all these scores rose and yet the mean over all classes fell by more than its own
+        standard errors, the steps harm other objects more than they help their own, and all are rejected."""
         scores = scores.double()
         if self._reference is None:
             self._reference = scores
         change = scores - self._reference
-        gains, images = change.sum(1), change.shape[1]
+        gains = change.sum(1)
         gain = gains[self.labels]
-        error = (images**0.5 * change.std(1))[self.labels] if images > 1 else torch.zeros_like(gain)
+        error = _of_sums(change)[self.labels]
         rose, pending = gain > self.settings.errors * error, self._pending
-        if bool(pending.any()) and bool(rose[pending].all()) and gains.nanmean() < 0.0:
+        total, of_total = gains.nansum(), _of_sums(change.nansum(0))
+        if bool(pending.any()) and bool(rose[pending].all()) and total < -self.settings.errors * of_total:
             rose = torch.zeros_like(rose)
         accepted = pending & rose
         self.accepted = torch.where(accepted[:, None], self.trial, self.accepted)
@@ -202,6 +203,12 @@ class CheckedSteps:
         self.trial = self.distribution.join(moved)
         self._moved = {name: (moved[name] != psi[name]).any(1) for name in moved}
         return self.trial
+
+
+def _of_sums(change: Float[Tensor, "*n images"]) -> Float[Tensor, "*n"]:
+    """Standard errors of sums over images; 0 for one image, whose scatter is not known."""
+    images = change.shape[-1]
+    return images**0.5 * change.std(-1) if images > 1 else torch.zeros_like(change[..., 0])
 
 
 def within(
