@@ -58,12 +58,16 @@ def measured(
     p = context.experiment.imaging.distribution.probabilities(psi)
     p = torch.cat([*p.values()], -1)
     found = {"response": response(loop.inner, psi).value}
-    solvers = {"unrolled": None, "implicit": loop.solver, "dL_val/dtheta alone": first_order}
-    for way in WAYS:
-        if (solver := solvers[way]) is not None:
-            inner = copy.copy(loop.inner)
-            inner.settings = replace(inner.settings, adjoint="implicit")
-            loop = SimulatorModule(inner, psi, loop.estimator, solver)
+    own = loop.inner.settings
+    exact, implicit = (
+        replace(own, unrolled=replace(own.unrolled, floor=0.0)),
+        replace(own, adjoint="implicit"),
+    )
+    settings, solvers = (own, exact, implicit, implicit), (loop.solver, loop.solver, loop.solver, first_order)
+    for way, how, solver in zip(WAYS, settings, solvers, strict=True):
+        inner = copy.copy(loop.inner)
+        inner.settings = how
+        loop = SimulatorModule(inner, psi, loop.estimator, solver)
         slopes = loop.derivative().psi_gradients
         found[way] = -torch.stack([slopes[name] for name in loop.scene.names]) / p
     return found

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from statistics import fmean
 from typing import Any
 
-WAYS = ("unrolled", "implicit", "dL_val/dtheta alone")
+WAYS = ("unrolled", "unrolled, no floor", "implicit", "dL_val/dtheta alone")
 CLEAR = 0.7
 """The correlation of two seeds' responses from which on the response is a signal."""
 
@@ -21,8 +21,8 @@ a loop starts, after the first step that its checks kept, and where it ends; mea
 
 {table}
 
-Where two seeds of the response agree to {clear}, {count} of {total} places: unrolled {unrolled:.2f}, implicit
-{implicit:.2f}, dL_val/dtheta alone {alone:.2f}. Elsewhere, mostly where there is little left to gain: {rest}.
+Where two seeds of the response agree to {clear}, {count} of {total} places: {agreeing}. Elsewhere, mostly where there
+is little left to gain: {rest}. *No floor*: the exact derivative, `outer.unrolled.floor=0`.
 """
 
 Row = dict[str, Any]
@@ -51,11 +51,16 @@ def report(rows: list[Row], settings: dict[str, Any]) -> str:
     def where(clear: Callable[[float], bool]) -> list[Row]:
         return [row for row in rows if clear(row["two seeds"])]
 
+    def each(rows: list[Row]) -> str:
+        return ", ".join(f"{way} {mean(rows, way):.2f}" for way in WAYS)
+
     clear, rest = where(lambda value: value >= CLEAR), where(lambda value: value < CLEAR)
     shown = [key for key in settings["overrides"] if not key.startswith("paths.")]
+    lists = {"experiments": settings["experiments"], "seeds": map(str, settings["seeds"])}
+    # Overrides come first: a list takes all that follows it.
+    command = "".join(f" --{key} {' '.join(values)}" for key, values in lists.items())
     return INTRODUCTION.format(
-        arguments="".join(f" {key}" for key in shown), 
+        arguments="".join(f" {key}" for key in shown) + command,
         seeds=", ".join(map(str, settings["seeds"])), repeats=settings["repeats"], table=table(rows), clear=CLEAR,
-        count=len(clear), total=len(rows), unrolled=mean(clear, WAYS[0]), implicit=mean(clear, WAYS[1]),
-        alone=mean(clear, WAYS[2]), rest=", ".join(f"{way} {mean(rest, way):.2f}" for way in WAYS),
+        count=len(clear), total=len(rows), agreeing=each(clear), rest=each(rest),
     )  # fmt: skip
