@@ -116,8 +116,16 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
 def test_every_place_has_its_turn(generator):
     turns = list(itertools.islice(shuffled_passes(5, 2, generator), 10))
     assert torch.bincount(torch.cat(turns), minlength=5).tolist() == [4] * 5
-    assert sum(step_weights(11, 3, generator)) == 11
+
+
+def test_blocks_of_steps_grow_and_weigh_what_they_stand_for(generator):
     assert list(step_weights(4, 1, generator)) == [1, 1, 1, 1]
+    drawn = torch.tensor([list(step_weights(12, 2, generator)) for _ in range(3000)]).flip(1)
+    assert (drawn.sum(1) == 12).all()
+    for step, length in enumerate(4 * [1] + 2 * [2] + 6 * [3]):
+        assert set(drawn[:, step].tolist()) == ({0, length} if length > 1 else {1})
+    error = drawn.double().std(0) / 3000**0.5  # every step counts once on average
+    assert ((drawn.double().mean(0) - 1.0).abs() <= 4.0 * error).all()
 
 
 @pytest.mark.parametrize("every", [1, 2])

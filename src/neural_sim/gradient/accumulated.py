@@ -99,8 +99,8 @@ class Unrolled:
         part: fraction of the steps, the last ones, that are reversed; 1 is exact.
         max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
         probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them.
-        score_every: length of a block of steps; one step of each block, drawn at random, scores probes with the block's
-            weight.
+        score_every: mean length of a block of steps; one step of each block, drawn at random, scores probes with the
+            block's weight, see :func:`step_weights`.
         chunk_size: probes whose losses are computed at a time.
         floor: least denominator of an entry of theta in AdamW's steps, as a fraction of the last step's, see
             :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
@@ -191,8 +191,11 @@ class _Scoring:
 
 
 def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
-    """Each step's weight: the block's length for one random step of each block of ``every`` steps, 0 for others."""
-    for first in range(0, steps, every):
-        block = min(every, steps - first)
+    """Each step's weight, from the last step to the first: the block's length for one random step of each block, 0 for
+    others. Blocks are 1 to ``2 every - 1`` steps long, longer the later in the training, where scores scatter less."""
+    left = steps
+    while left:
+        block = min(left, 1 + (2 * every - 1) * (left - 1) // steps)
         chosen = int(torch.randint(block, (), generator=generator))
         yield from (block if step == chosen else 0 for step in range(block))
+        left -= block
