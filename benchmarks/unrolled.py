@@ -44,7 +44,9 @@ PER_BIN = 24
 ALL = Unrolled(probes_per_step=0, score_every=1)
 EXACT = replace(ALL, product="reverse_over_reverse")
 CENTRAL = replace(ALL, product="central_difference")
-DEFAULT = "forward differences, a probe of each bin every second step (default)"
+DEFAULT = (
+    "forward differences, a probe of each bin in every early step and one of 2 or 3 later ones (default)"
+)
 OTHERS = {
     "tiny, 24 epochs": ("outer.epochs=24",),
     "resnet18, 12 epochs": ("detector=resnet18", "training.warm_epochs=1"),
@@ -119,13 +121,14 @@ class Walked:
     trained: Parameters
     trajectory: Trajectory
 
-    def scores(self, product: Product) -> Float[Tensor, "steps k per_bin"]:
+    def scores(self, product: Product, floor: float = ALL.floor) -> Float[Tensor, "steps k per_bin"]:
         """Of every probe of the object in every step, the last step first."""
         world, data = self.world, self.world.pool.select(self.rows)
         slope = gradient(world.validation.mean_terms(), self.trained)
         examples = Examples(data.inputs, data.losses_from)
         table, found = world.probes(self.label), []
-        for step in reversed_steps(self.trajectory, examples, self.trained, slope, product, "probes"):
+        steps = reversed_steps(self.trajectory, examples, self.trained, slope, product, "probes", floor)
+        for step in steps:
             along = scores(
                 world.pool.losses, step.params, step.along, table.reshape(-1), 96, "central_difference"
             )
@@ -205,8 +208,11 @@ def errors(run: Walked, draws: int = 200) -> dict[str, float]:
 
     products: tuple[Product, ...] = ("forward_difference", "central_difference")
     found = {product.replace("_", " ") + "s": error([bin_means(run.scores(product))]) for product in products}
+    whole = run.scores("reverse_over_reverse", floor=0.0)
+    found["no floor under AdamW's denominators"] = error([bin_means(whole)])
+    found["no floor, without the first two steps"] = error([bin_means(whole[:-2])])
     for count, every in FEW:
-        steps = "every step" if every == 1 else f"one step in {every}"
+        steps = "every step" if every == 1 else f"one step in 1 to {2 * every - 1}"
         drawn = [few(exact, count, every, generator) for _ in range(draws)]
         found[f"{count} of {PER_BIN} probes, {steps}"] = error(drawn)
     for part in PARTS:

@@ -54,6 +54,7 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
         "unrolled, exact products": unrolled("product", product="reverse_over_reverse"),
         "unrolled, 1 probe every step": unrolled("probes", probes_per_step=1, score_every=1),
         "unrolled, all probes every step": unrolled("probes", **everything),
+        "unrolled, exact: no floor": unrolled("floor", floor=0.0),
         "unrolled, last half of the steps": unrolled("part", part=0.5),
         "unrolled, last quarter": unrolled("part", part=0.25),
         "implicit, as configured": Way("implicit", implicit, solver),
