@@ -52,7 +52,7 @@ def report(rows: list[Row], settings: dict[str, Any]) -> str:
         return [row for row in rows if clear(row["two seeds"])]
 
     def each(rows: list[Row]) -> str:
-        return ", ".join(f"{way} {mean(rows, way):.2f}" for way in WAYS)
+        return "; ".join(f"{way} {mean(rows, way):.2f}" for way in WAYS)
 
     clear, rest = where(lambda value: value >= CLEAR), where(lambda value: value < CLEAR)
     shown = [key for key in settings["overrides"] if not key.startswith("paths.")]
