@@ -166,7 +166,7 @@ def test_with_a_floor_it_has_the_size_of_a_finite_change_where_the_first_gradien
     rows = tuple(torch.tensor(batch) for batch in ([0, 2], [1, 1], [1, 1], [1, 1]))
     like, rule = {"theta": torch.ones(1, dtype=DOUBLE)}, AdamW(0.0)
 
-    def trained(weight):
+    def trained(weight, rule=rule):
         weights = torch.tensor([1.0, 1.0, weight], dtype=DOUBLE)
         examples = Examples((slopes,), lambda p, x, rows: weights[rows] * x[0] * p["theta"])
         gradient_at = lambda theta, rows: examples.gradient(theta, like, rows)  # noqa: E731
@@ -179,6 +179,10 @@ def test_with_a_floor_it_has_the_size_of_a_finite_change_where_the_first_gradien
 
     finite = float(trained(0.15).end - trained(0.0).end) / 0.15
     assert 1 / 3 < derivative(0.3) / finite < 3.0
+    # The loss is linear, so that a floor changes no gradient: it is the derivative of a training with that floor.
+    floored = rule.floored(last_state(trained(0.0)), len(rows), 0.3)
+    smooth = extrapolated(lambda weight: float(trained(weight, floored).end), 1e-4)
+    assert derivative(0.3) == pytest.approx(smooth, rel=1e-6)
     assert derivative(0.0) < 1e6 * finite < 0.0
 
 

@@ -145,15 +145,15 @@ def reversed_steps(
         )
     one_sided = product == "forward_difference" and wanted == "probes"
     curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
-    rule, floored = trajectory.rule, False
+    rule = trajectory.rule
     cotangents = list(rule.begin(slope))  # L_val does not depend on the buffers after the last step
     for segment in trajectory.segments():
         replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
         for step in reversed(segment):
             state, gradient = replayed.pop()
             rate = trajectory.rates[step]
-            if not floored:
-                rule, floored = rule.floored(rule.step(state, gradient, rate, step), step + 1, floor), True
+            if step + 1 == len(trajectory):
+                rule = rule.floored(rule.step(state, gradient, rate, step), len(trajectory), floor)
             cotangents, along = pulled_back(rule, state, gradient, rate, step, cotangents)
             rows = trajectory.rows[step]
             if one_sided:
