@@ -52,7 +52,8 @@ class FrozenLoop:
         """v for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
         backbone, trainable = detector.split(theta)
         cached = CachedSet.of(detector, backbone, images)
-        weights = torch.full((len(images),), 1.0 / len(images), device=cached.device)
+        dtype = next(iter(trainable.values())).dtype
+        weights = torch.full((len(images),), 1.0 / len(images), dtype=dtype, device=cached.device)
         inner = InnerProblem(trainable, cached.losses, weights)
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
         result = hypergradient(inner, terms, {}, solver, generator)
