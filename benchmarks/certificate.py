@@ -106,7 +106,7 @@ def welch(trials: Iterator[tuple]) -> float:
 def best_ratio(trials: Iterator[tuple]) -> float:
     """How often the best component's |derivative| exceeds its standard error."""
     psi, log_p = torch.zeros(BINS, dtype=DOUBLE), lambda psi: torch.log_softmax(psi, -1)
-    found: list[MixedDerivative] = [stratified(values, bins, psi, log_p) for values, bins in trials]
+    found: list[MixedDerivative] = [stratified(values.view(BINS, -1), psi, log_p) for values, _ in trials]
     return sum(bool((part.value.abs() > part.standard_error).any()) for part in found) / len(found)
 
 

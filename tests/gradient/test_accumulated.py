@@ -155,7 +155,7 @@ def test_the_standard_error_counts_the_probes_and_the_few_that_are_scored(genera
             made, examples, like, torch.ones(3, dtype=DOUBLE), generator,
             ProbeGroups(losses, [torch.arange(bins * per_bin).view(bins, per_bin)]),
         )  # fmt: skip
-        part = stratified(found.probes, strata, PSI, lambda psi: torch.log_softmax(psi, -1))
+        part = stratified(found.probes.view(bins, per_bin), PSI, lambda psi: torch.log_softmax(psi, -1))
         values.append(part.value)
         errors.append(part.standard_error)
     ratio = torch.stack(errors).square().mean(0).sqrt() / torch.stack(values).std(0)

@@ -30,27 +30,27 @@ def exact(log_probabilities, means=SCORES, psi=PSI):
 
 @pytest.mark.parametrize("log_probabilities", [log_softmax, floored])
 def test_stratified_is_exact_given_the_bins_means(log_probabilities):
-    bins = torch.tensor([0, 0, 1, 2, 2])
-    scores = SCORES[bins] + torch.tensor([0.7, -0.7, 0.0, 0.2, -0.2], dtype=DOUBLE)
-    found = stratified(scores, bins, PSI, log_probabilities, weight=0.25)
+    table = SCORES[:, None] + torch.tensor([[0.7, -0.7], [0.0, 0.0], [0.2, -0.2]], dtype=DOUBLE)
+    found = stratified(table, PSI, log_probabilities, weight=0.25)
     torch.testing.assert_close(found.value, 0.25 * exact(log_probabilities))
 
 
 def test_stratified_equals_the_closed_form_in_logits():
-    bins = torch.tensor([0, 1, 2])
     p = torch.softmax(PSI, -1)
-    found = stratified(SCORES, bins, PSI, log_softmax)
+    found = stratified(SCORES[:, None], PSI, log_softmax)
     torch.testing.assert_close(found.value, p * (SCORES - p @ SCORES))
     assert float(found.value.sum().abs()) < 1e-15
+    assert bool(found.standard_error.isinf().all())  # of one scene
 
 
 def test_stratified_is_unbiased_and_its_standard_error_is_right(generator):
-    counts, spread = torch.tensor([3, 5, 4]), torch.tensor([0.5, 2.0, 1.0], dtype=DOUBLE)
-    bins = torch.arange(3).repeat_interleave(counts)
+    """Scores of a bin, of a scene in all bins alike, and of both."""
+    spread = torch.tensor([[0.5], [2.0], [1.0]], dtype=DOUBLE)
     runs = [
         stratified(
-            SCORES[bins] + spread[bins] * torch.randn(12, generator=generator, dtype=DOUBLE),
-            bins,
+            SCORES[:, None]
+            + 5.0 * torch.randn(1, 4, generator=generator, dtype=DOUBLE)
+            + spread * torch.randn(3, 4, generator=generator, dtype=DOUBLE),
             PSI,
             log_softmax,
         )
@@ -64,36 +64,22 @@ def test_stratified_is_unbiased_and_its_standard_error_is_right(generator):
     torch.testing.assert_close(predicted, error, rtol=4 / 800**0.5, atol=0.0)
 
 
-def test_a_bin_without_images_says_nothing():
-    bins = torch.tensor([0, 0, 2, 2])
-    scores = torch.tensor([1.0, 3.0, -1.0, 0.0], dtype=DOUBLE)
-    found = stratified(scores, bins, PSI, log_softmax)
-    p = torch.softmax(PSI, -1)
-    mean = (2.0 * p[0] - 0.5 * p[2]) / (p[0] + p[2])
-    means = torch.stack([torch.tensor(2.0, dtype=DOUBLE), mean, torch.tensor(-0.5, dtype=DOUBLE)])
-    torch.testing.assert_close(found.value, exact(log_softmax, means))
-    assert float(found.value[1].abs()) < 1e-15
-    # Its mean is not known, and moves every component.
-    assert bool(found.standard_error.isinf().all())
+def test_what_a_scene_adds_in_all_bins_is_no_error(generator):
+    common = torch.randn(1, 5, generator=generator, dtype=DOUBLE)
+    found = stratified(SCORES[:, None] + 100.0 * common, PSI, log_softmax)
+    torch.testing.assert_close(found.value, exact(log_softmax))
+    assert float(found.standard_error.max()) < 1e-12
 
 
 def test_one_bin_has_no_derivative():
-    found = stratified(SCORES, torch.zeros(3, dtype=torch.long), torch.zeros(1, dtype=DOUBLE), log_softmax)
+    found = stratified(SCORES[None], torch.zeros(1, dtype=DOUBLE), log_softmax)
     assert found.value.tolist() == [0.0] and found.standard_error.tolist() == [0.0]
 
 
-@pytest.mark.parametrize(
-    ("scores", "bins"),
-    [
-        (torch.ones(2), torch.zeros(3, dtype=torch.long)),
-        (torch.ones(0), torch.zeros(0, dtype=torch.long)),
-        (torch.ones(1), torch.tensor([3])),
-        (torch.ones(1), torch.tensor([-1])),
-    ],
-)
-def test_stratified_refuses_nonsense(scores, bins):
+@pytest.mark.parametrize("shape", [(3,), (2, 3), (3, 0), (3, 2, 1)])
+def test_stratified_refuses_nonsense(shape):
     with pytest.raises(ValueError, match="stratified"):
-        stratified(scores, bins, PSI, log_softmax)
+        stratified(torch.ones(shape), PSI, log_softmax)
 
 
 def test_importance_weights_restore_p():

@@ -57,7 +57,7 @@ def several(scene):
             scene,
             names=("a", "b", "c"),
             fields=(scene.fields[0],) * OBJECTS,
-            distribution=SceneDistribution.of([Pose(bins=BINS)]),
+            distribution=SceneDistribution.of([Pose(bins=BINS, floor=0.0)]),
             synthesizer=Synthesizer(Plain(), shift=0.0, minimum_area=1.0, objects_per_image=counts),
             camera=dataclasses.replace(scene.camera, width=SIZE, height=SIZE),
         )

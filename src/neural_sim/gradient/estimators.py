@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, get_args
 
-from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
@@ -17,7 +15,6 @@ from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.stratified import by_strata
 from neural_sim.gradient.unrolled import Wanted
-from neural_sim.parameter.factor import Factor
 from neural_sim.synthesis.draws import Draws, HardDraws
 
 
@@ -121,8 +118,8 @@ class StratifiedEstimator:
         for factor in distribution.factors:
             strata = probes[factor.name]
             along = scored(strata.index).to(images.psi)
-            parts[factor.name] = by_strata(along, strata.bins, factor, psi[factor.name], weight)
-            p_values[factor.name] = _equal_means(along, strata.bins, factor)
+            parts[factor.name] = by_strata(along, factor, psi[factor.name], weight)
+            p_values[factor.name] = no_difference(along.view(factor.size, -1).T)
         return MixedDerivative(
             distribution.join({name: part.value for name, part in parts.items()}),
             distribution.join({name: part.standard_error for name, part in parts.items()}),
@@ -177,11 +174,3 @@ class ReinforceEstimator:
         drawn = images.distribution.statistics(images.draw)
         p_values = {name: no_association(along, values) for name, values in drawn.items()}
         return replace(reinforce(along, log_prob, images.psi, weight), p_values=p_values)
-
-
-def _equal_means(scores: Float[Tensor, "n"], strata: Int[Tensor, "n"], factor: Factor) -> float:
-    """p-value of the null that all bins, or all lights, have the same mean score. Lights are compared on the same
-    scenes."""
-    if factor.same_scenes:
-        return no_difference(scores.view(factor.size, -1).T)
-    return no_association(scores, one_hot(strata, factor.size))

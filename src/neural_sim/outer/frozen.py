@@ -101,7 +101,7 @@ class FrozenLoop:
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
         probes = probed.probes[label][self.factor.name]
         along = scores(probed.cached.losses, self.trainable, self.vector, probes.index).cpu()
-        return by_strata(along, probes.bins, self.factor, self.psi[label].float())
+        return by_strata(along, self.factor, self.psi[label].float())
 
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator

@@ -30,6 +30,10 @@ class BinNoise:
     gumbel: Float[Tensor, "n k"]
     exponential: Float[Tensor, "n draws k"] | None = None
 
+    def select(self, index: Int[Tensor, "m"]) -> BinNoise:
+        """The draws ``index``, which may repeat."""
+        return BinNoise(self.gumbel[index], None if self.exponential is None else self.exponential[index])
+
 
 @dataclass(frozen=True)
 class ConfiguredDistributions:
@@ -61,8 +65,8 @@ class Factor(Protocol):
     """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
 
     ``update`` names the setting of the psi loop that steps it. ``lights`` is the number of anchor lights; above 0, the
-    images themselves change with psi, not only how often each is drawn. ``same_scenes``: probes of all strata show the
-    same scenes. ``drawn`` lists what hard draws at given ``p`` depend on.
+    images themselves change with psi, not only how often each is drawn. ``drawn`` lists what hard draws at given ``p``
+    depend on.
 
     ``psi`` is the configured ``initial`` or ``target`` psi of an object, float64. ``psi_of`` maps probabilities of bins
     or weights of lights to psi; ``p_of`` is its inverse. ``log_probabilities`` are 0 for lights, whose steps are
@@ -72,7 +76,6 @@ class Factor(Protocol):
     """
 
     update: ClassVar[str]
-    same_scenes: ClassVar[bool]
 
     @property
     def name(self) -> str: ...
@@ -112,7 +115,6 @@ class BinnedFactor:
     """
 
     update: ClassVar[str] = "update"
-    same_scenes: ClassVar[bool] = False
     name: str
     coordinate: Coordinate
     bins: int

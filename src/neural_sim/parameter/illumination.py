@@ -49,7 +49,6 @@ class Illumination:
     """
 
     update: ClassVar[str] = "light_update"
-    same_scenes: ClassVar[bool] = True
     anchors: int = 6
     constraint: Constraint = "simplex"
     deviation: float = 0.1

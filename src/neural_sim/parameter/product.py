@@ -46,6 +46,12 @@ class SceneNoise:
     def __len__(self) -> int:
         return self.uniform["phi"].shape[0]
 
+    def select(self, index: Int[Tensor, "k"]) -> SceneNoise:
+        """The draws ``index``, which may repeat."""
+        bins = {name: part.select(index) for name, part in self.bins.items()}
+        uniform = {name: values[index] for name, values in self.uniform.items()}
+        return SceneNoise(bins, uniform, None if self.light is None else self.light[index])
+
 
 @dataclass(frozen=True)
 class SceneDistribution:
@@ -229,15 +235,17 @@ class SceneDistribution:
     def probes(
         self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
     ) -> tuple[SceneDraw, Int[Tensor, "n"]]:
-        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi; and the index of
-        each draw's scene, the same for all strata where ``same_scenes``."""
+        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi and the same in all
+        strata; and the index of each draw's scene."""
         factor = self.factor(name)
-        strata = torch.arange(factor.size).repeat_interleave(each)
-        if not factor.same_scenes:
-            scenes = torch.arange(len(strata))
-            return self.stratum(name, strata, psi, self.draw_noise(len(strata), generator, dtype)), scenes
-        scenes = torch.arange(each).repeat(factor.size)
-        draw = self.hard(psi, self.draw_noise(each, generator, dtype)).select(scenes)
+        strata, scenes = (
+            torch.arange(factor.size).repeat_interleave(each),
+            torch.arange(each).repeat(factor.size),
+        )
+        noise = self.draw_noise(each, generator, dtype)
+        if not factor.lights:
+            return self.stratum(name, strata, psi, noise.select(scenes)), scenes
+        draw = self.hard(psi, noise).select(scenes)
         return replace(draw, weights=torch.eye(factor.size, dtype=psi.dtype)[strata]), scenes
 
     def stratum(

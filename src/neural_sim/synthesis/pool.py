@@ -64,7 +64,9 @@ class ImagePool:
         named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
         pools = []
         for label in range(len(scene.names)):
-            noise = scene.distribution.draw_noise(len(bins), generator, scene.dtype(label))
+            # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
+            noise = scene.distribution.draw_noise(per_cell, generator, scene.dtype(label))
+            noise = noise.select(torch.arange(per_cell).repeat(cells))
             part = scene.render(label, scene.distribution.at_bins(named, noise))
             maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
             pools.append(ObjectPool((maps * 255).round().to(torch.uint8), part.draw, per_cell))
@@ -81,28 +83,29 @@ class ImagePool:
         if not isinstance(how, HardDraws):
             raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
         noise = self.scene.distribution.draw_noise(count, generator)
-        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, generator)
+        within = torch.randint(self.objects[label].per_cell, (count,), generator=generator)
+        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, within)
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> tuple[RenderedObject, Int[Tensor, "m"]]:
         """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; other factors from
-        p_psi. Every render is a scene of its own."""
+        p_psi and the same in all bins. And the index of each render's scene."""
         distribution = self.scene.distribution
-        bins = torch.arange(distribution.factor(factor).size).repeat_interleave(per_bin)
-        scenes, chosen = torch.arange(len(bins)), bins[:, None]
+        size = distribution.factor(factor).size
+        bins, scenes = torch.arange(size).repeat_interleave(per_bin), torch.arange(per_bin).repeat(size)
+        chosen = bins[:, None]
         if len(distribution.binned) > 1:
-            noise = distribution.draw_noise(len(bins), generator)
+            noise = distribution.draw_noise(per_bin, generator).select(scenes)
             chosen = distribution.stratum(factor, bins, psi.float(), noise).bins
-        return self._taken(label, chosen, generator), scenes
+        within = torch.randint(self.objects[label].per_cell, (per_bin,), generator=generator)
+        return self._taken(label, chosen, within[scenes]), scenes
 
-    def _taken(
-        self, label: int, bins: Int[Tensor, "n factors"], generator: torch.Generator
-    ) -> RenderedObject:
+    def _taken(self, label: int, bins: Int[Tensor, "n factors"], within: Int[Tensor, "n"]) -> RenderedObject:
         pool = self.objects[label]
         cell = torch.zeros(len(bins), dtype=torch.long)
         for column, factor in zip(bins.unbind(1), self.scene.distribution.binned, strict=True):
             cell = cell * factor.bins + column
-        index = cell * pool.per_cell + torch.randint(pool.per_cell, cell.shape, generator=generator)
+        index = cell * pool.per_cell + within
         maps = pool.maps[index.to(pool.maps.device)].float() / 255
         return RenderedObject(pool.draw.select(index), maps[..., :3], maps[..., 3])
