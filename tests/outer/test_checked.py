@@ -75,7 +75,6 @@ def test_a_step_is_as_long_as_its_radius(factor, start):
 def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order_gain():
     psi = POSE.psi_of(torch.tensor([[0.7, 0.1, 0.1, 0.1], [0.25, 0.25, 0.25, 0.25]], dtype=torch.float64))
     steps = steps_at(psi, radius=0.2)
-    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([2, 3], psi)
     tried, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     p, before = POSE.p_of(tried), POSE.p_of(psi)
@@ -84,7 +83,7 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
         variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0
     )
     assert max(p_values["a"]["pose"], p_values["b"]["pose"]) < 1e-6
-    verdicts = steps.judge(scored(0.1, 0.1))
+    verdicts = steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))
     # The score is linear in p: the promise is its change, exactly but for the floor under p.
     for i, name in enumerate(NAMES):
         assert verdicts[name].expected_gain == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
@@ -93,29 +92,29 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
 def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi)
-    steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], psi)
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(scored(0.6, 0.45, 0.5))
+    verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.45, 0.5))
     assert verdicts["a"].accepted and not verdicts["b"].accepted
     assert verdicts["b"].measured_gain == pytest.approx(-0.05)
     assert torch.equal(steps.reported, torch.stack([tried[0], psi[1]]))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
-    # The next step of b sets out from where it was, and is judged against its score there.
+    # The next step of b sets out from where it was.
     again, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert float(variation(POSE, again, psi)[1]) == pytest.approx(0.2, abs=1e-6)
-    assert steps.judge(scored(0.7, 0.52, 0.5))["b"].measured_gain == pytest.approx(0.02)
+    assert steps.judge(scored(0.6, 0.5, 0.5), scored(0.7, 0.52, 0.5))["b"].measured_gain == pytest.approx(
+        0.02
+    )
 
 
 def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     zoom = BinnedFactor("zoom", "distance", 4, 1.0, 2.0)
     psi = torch.zeros(2, 8, dtype=torch.float64)
     steps = steps_at(psi, (POSE, zoom))
-    steps.judge(scored(0.5, 0.5, 0.5))
     gradient = torch.cat([gradients([1, 2], psi[:, :4]), torch.zeros(2, 4, dtype=torch.float64)], 1)
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert bool((tried[:, :4] != 0.0).any(1).all()) and not bool(tried[:, 4:].any())
-    steps.judge(scored(0.6, 0.4, 0.5))
+    steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.4, 0.5))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
 
@@ -127,19 +126,17 @@ def test_a_rise_within_the_error_of_its_images_is_not_believed():
     error = float(50**0.5 * noise[0].std())
     for rise, kept in ((0.9 * error, False), (1.1 * error, True)):
         steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-        steps.judge(torch.zeros(2, 50))
         proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-        verdict = steps.judge(noise + rise / 50)["a"]
+        verdict = steps.judge(torch.zeros(2, 50), noise + rise / 50)["a"]
         assert verdict.accepted == kept
         assert verdict.error == pytest.approx(error) and verdict.measured_gain == pytest.approx(rise)
 
 
 def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    steps.judge(scored(0.5, 0.5, 0.5))
     gradient = gradients([1, 2], steps.accepted)
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(scored(0.52, 0.51, 0.3))
+    verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.52, 0.51, 0.3))
     assert not any(verdict.accepted for verdict in verdicts.values())
     assert float(steps.reported.abs().max()) == 0.0
 
@@ -151,42 +148,37 @@ def test_what_others_lose_counts_beyond_the_error_of_the_sum():
     scatter = (scatter - scatter.mean()) / scatter.std() / 50**0.5
     for error, kept in ((0.05, False), (0.2, True)):
         steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-        steps.judge(torch.zeros(2, 50))
         proposed(steps, gradient, torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)]))
         others = error * scatter - 0.2 / 50
-        verdicts = steps.judge(torch.stack([torch.full_like(others, 0.1 / 50), others]))
+        verdicts = steps.judge(torch.zeros(2, 50), torch.stack([torch.full_like(others, 0.1 / 50), others]))
         assert verdicts["a"].accepted == kept
 
 
 def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi, momentum=1.0)
-    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([1, 2], psi) * 0.3
     noise = torch.full_like(gradient, 0.03)
     found = []
     for _ in range(6):
         tried, p_values = proposed(steps, gradient, noise, level=0.01)
         found.append(p_values["a"]["pose"])
-        if torch.equal(tried, psi):
-            assert steps.judge(scored(*[0.0] * 2)) == {} and not steps.moved
+        assert steps.pending == (not torch.equal(tried, psi))
     assert found[0] > 0.01 > found[-1]
     assert not torch.equal(tried, psi)
 
 
 def test_an_object_whose_radius_is_too_small_rests():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), smallest=0.3)
-    steps.judge(scored(*[0.0] * 2))
     gradient = gradients([1, 2], steps.accepted)
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    steps.judge(scored(-1.0, -1.0))
+    steps.judge(scored(0.0, 0.0), scored(-1.0, -1.0))
     tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     assert torch.equal(tried, steps.accepted)
 
 
 def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    steps.judge(scored(*[0.0] * 2))
     bad = torch.full((2, 4), math.nan, dtype=torch.float64)
     tried, _ = proposed(steps, bad, bad)
     assert torch.equal(tried, steps.accepted)

@@ -1,9 +1,9 @@
-"""Trust-region steps of psi, accepted or rejected by the next iteration's training.
+"""Trust-region steps of psi, accepted or rejected by a training at the new psi.
 
-Each iteration trains a detector anyway. Under common random numbers (the same initial parameters, batches, backgrounds
-and noise of the draws) the difference of two consecutive trainings measures the effect of the step with little noise. A
-step that does not raise its object's score is rejected and its radius shrinks; an accepted one enlarges it (Conn, Gould
-and Toint 2000, Chapter 6, with the reduction measured object by object).
+It has the random numbers of the training at the old psi, whose derivative was taken (the same initial parameters,
+batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the step with
+little noise. A step that does not raise its object's score is rejected and its radius shrinks; an accepted one enlarges
+it (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by object).
 """
 
 from __future__ import annotations
@@ -112,15 +112,13 @@ class CheckedSteps:
         self._expected = torch.zeros_like(psi[:, 0])
         self._moved = {name: torch.zeros(len(psi), dtype=torch.bool) for name in parts}
         self._just_accepted = torch.zeros(len(psi), dtype=torch.bool)
-        self._reference: Tensor | None = None
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
         return self.accepted
 
     @property
-    def moved(self) -> bool:
-        """Whether an object's step is pending."""
+    def pending(self) -> bool:
         return bool(self._pending.any())
 
     @property
@@ -128,14 +126,13 @@ class CheckedSteps:
         """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
         return torch.stack([*self._moved.values()]).any(0)
 
-    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
+    def judge(
+        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
+    ) -> dict[str, Verdict]:
         """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
         paired differences. Where all these scores rose and yet the mean over all classes fell by more than its own
         standard errors, the steps harm other objects more than they help their own, and all are rejected."""
-        scores = scores.double()
-        if self._reference is None:
-            self._reference = scores
-        change = scores - self._reference
+        change = after.double() - before.double()
         gains = change.sum(1)
         gain = gains[self.labels]
         error = _of_sums(change)[self.labels]
@@ -150,25 +147,18 @@ class CheckedSteps:
             self.radius[name] = torch.where(
                 self._moved[name], scaled.clamp_max(self.settings.largest), radius
             )
-        # After a rejected step an object is compared with its last training at the accepted psi, to which it returns.
-        rejected = pending & ~accepted
-        reference = scores.clone()
-        reference[self.labels] = torch.where(
-            rejected[:, None], self._reference[self.labels], scores[self.labels]
-        )
         verdicts = {
             name: Verdict(bool(accepted[i]), float(self._expected[i]), float(gain[i]), float(error[i]))
             for i, name in enumerate(self.names)
             if pending[i]
         }
         self._just_accepted = accepted
-        self._reference = reference
         self._moved = {name: torch.zeros_like(pending) for name in self._moved}
         return verdicts
 
     def observe(self, result: Hypergradient) -> PValues:
         gradient, error = stacked(result, self.names, self.accepted)
-        psi, slope, noise = (self.distribution.split(values) for values in (self.trial, gradient, error))
+        psi, slope, noise = (self.distribution.split(values) for values in (self.accepted, gradient, error))
         p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
         # Derivatives at a psi that has not changed keep their full weight.
         keep = torch.where(self._just_accepted, self.settings.momentum, 1.0)[:, None].to(self.accepted)

@@ -1,4 +1,4 @@
-"""The psi loop of methods with a derivative: draw, train, accept or reject the last step, differentiate, step."""
+"""The psi loop of methods with a derivative: train, differentiate, step, train to accept or reject the step."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from neural_sim.outer.certificate import certify
 from neural_sim.outer.checked import CheckedSteps
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
-from neural_sim.outer.steps import FreeSteps, Steps
+from neural_sim.outer.steps import FreeSteps, Steps, Verdict
 from neural_sim.synthesis.assembly import RenderedImages
 
 
 class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
 
-    Where steps are checked, the last iteration only trains, to accept or reject the last step.
+    Where steps are checked, an iteration begins with a training that accepts or rejects the last step; the last
+    iteration ends with it.
     """
 
     def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> None:
@@ -32,6 +33,7 @@ class GradientLoop(OuterLoop, ABC):
         self._names = [names[label] for label in self._learned]
         self.steps = self._begin()
         self._recording: Recording | None = None
+        self._before = psi.new_zeros(0, 0)
         self._stopped = False
 
     def _begin(self) -> Steps:
@@ -44,27 +46,27 @@ class GradientLoop(OuterLoop, ABC):
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         seconds: dict[str, float] = {}
-        with timed(seconds, "render", self.inner.device):
-            rendered = self.inner.draw(self.psi)
-            images = rendered.images
+        verdicts: dict[str, Verdict] = {}
         last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
-        if not last:
-            with timed(seconds, "probes", self.inner.device):
-                self._prepare()
-        with timed(seconds, "features", self.inner.device):
-            cached = self.inner.training_set(images)
-        with timed(seconds, "train", self.inner.device):
-            # The warm start has trained at this psi, on more images and for more steps than an iteration.
-            recording = None if last else self._recording
-            trained = not self.records and not self.settings.train_first
-            training_loss = self.inner.loss(cached) if trained else self.inner.train(cached, recording)
-        with timed(seconds, "judge", self.inner.device):
-            scores = self.inner.scores()
-            verdicts = self.steps.judge(scores)
+        if self.steps.pending or last:
+            rendered, _, training_loss = self._trained(seconds)
+            with timed(seconds, "judge", self.inner.device):
+                scores = self.inner.scores()
+                if self.steps.pending:
+                    verdicts = self.steps.judge(self._before, scores)
         if last:
-            self.record(self.psi, images, training_loss, seconds, scores=scores.sum(1), verdicts=verdicts)
+            by_class = scores.sum(1)
+            self.record(self.psi, rendered.images, training_loss, seconds, scores=by_class, verdicts=verdicts)
             self._go_to(self.steps.reported)
             return
+        self.psi.data[self._learned] = self.steps.reported
+        if self.records:
+            self.inner.renew()  # what is peculiar to one training averages out of the derivatives
+        with timed(seconds, "probes", self.inner.device):
+            self._prepare()
+        rendered, cached, training_loss = self._trained(seconds, self._recording)
+        with timed(seconds, "judge", self.inner.device):
+            self._before = self.inner.scores()
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._derivative(rendered, cached)
         seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
@@ -76,15 +78,26 @@ class GradientLoop(OuterLoop, ABC):
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
-        products, by_class = _products(result), scores.sum(1)
+        products, by_class, images = _products(result), self._before.sum(1), rendered.images
         self.record(
             self.psi, images, training_loss, seconds, certificate, norms, products, by_class, verdicts
         )
         self._stopped = certificate.stopped
-        psi = self.steps.next(certificate)
-        if not self.steps.moved:
-            self.inner.renew()  # the same training again would give the same derivative
-        self._go_to(psi)
+        self._go_to(self.steps.next(certificate))
+
+    def _trained(
+        self, seconds: dict[str, float], recording: Recording | None = None
+    ) -> tuple[RenderedImages, CachedSet, float]:
+        """Images at psi, and the loss of a training on them."""
+        with timed(seconds, "render", self.inner.device):
+            rendered = self.inner.draw(self.psi)
+        with timed(seconds, "features", self.inner.device):
+            cached = self.inner.training_set(rendered.images)
+        with timed(seconds, "train", self.inner.device):
+            if not self.records and not self.settings.train_first:
+                # The warm start has trained at this psi, on more images and for more steps than an iteration.
+                return rendered, cached, self.inner.loss(cached)
+            return rendered, cached, self.inner.train(cached, recording)
 
     def derivative(self) -> Hypergradient:
         """The derivative at psi as an iteration takes it, by new images and a training on them; psi does not move."""

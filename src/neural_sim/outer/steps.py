@@ -23,7 +23,7 @@ PValues = Mapping[str, Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether an object's step was accepted, by the next iteration's training; a rejected one is taken back.
+    """Whether an object's step was accepted, by a training at the new psi; a rejected one is taken back.
 
     ``expected_gain`` is the fall of L_val that the hypergradient predicts to first order, ``measured_gain`` the rise of
     the object's score, ``error`` the standard error of that rise over validation images.
@@ -38,22 +38,24 @@ class Verdict:
 class Steps(Protocol):
     """Moves psi [objects, K] of the learned objects."""
 
-    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
-        """Accept or reject the last step by the training on its psi. ``scores`` are each validation image's
+    def judge(
+        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
+    ) -> dict[str, Verdict]:
+        """Accept or reject the last step by trainings before and after it. The scores are each validation image's
         contributions to the score of each class, more is better."""
         ...
 
     def observe(self, result: Hypergradient) -> PValues:
-        """Add an iteration's derivative; p-values of the null that the derivative which steps follow is zero."""
+        """Add a derivative at ``reported``; p-values of the null that the derivative which steps follow is zero."""
         ...
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """psi of the next iteration's training."""
+        """psi after the next step."""
         ...
 
     @property
-    def moved(self) -> bool:
-        """Whether the last :meth:`next` moved psi."""
+    def pending(self) -> bool:
+        """Whether the last step waits for :meth:`judge`."""
         ...
 
     @property
@@ -79,9 +81,11 @@ class FreeSteps:
         self.reported = psi.detach().clone()
         self._states = {name: UpdateState.zeros(part) for name, part in distribution.split(psi).items()}
         self._gradient = self._error = torch.zeros_like(psi)
-        self._steps, self.moved = 0, True
+        self._steps, self.pending = 0, False
 
-    def judge(self, scores: Float[Tensor, "classes images"]) -> dict[str, Verdict]:
+    def judge(
+        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
+    ) -> dict[str, Verdict]:
         return {}
 
     def observe(self, result: Hypergradient) -> PValues:
