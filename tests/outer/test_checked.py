@@ -4,11 +4,10 @@ import math
 
 import pytest
 import torch
-from scipy import stats
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import certify
-from neural_sim.outer.checked import Average, CheckedSteps, within
+from neural_sim.outer.checked import CheckedSteps, within
 from neural_sim.outer.settings import Checks, Trust
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.illumination import Illumination
@@ -187,37 +186,13 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     assert POSE.p_of(tried).argmax(1).tolist() == [1, 2]
 
 
-def test_a_noisy_direction_counts_by_its_variance():
-    average = Average.zeros(torch.zeros(1, 4, dtype=torch.float64))
-    good = torch.tensor([[3.0, -1.0, -1.0, -1.0]], dtype=torch.float64)
-    wild = torch.tensor([[-90.0, 90.0, 0.0, 0.0]], dtype=torch.float64)
-    average = average.joined(good, torch.full_like(good, 0.01), 0.5)
-    average = average.joined(wild, torch.full_like(good, 1e4), 0.5)
-    # Inverse-variance weights in closed form.
-    wanted = (0.5 * good / 0.01 + wild / 1e4) / (0.5 / 0.01 + 1e-4)
-    torch.testing.assert_close(average.value, wanted)
-
-
-def test_p_values_are_those_of_the_chi_square_and_uniform_under_noise():
-    generator = torch.Generator().manual_seed(0)
-    spread = torch.tensor([0.5, 1.0, 2.0, 1.0], dtype=torch.float64)
-    noise = torch.randn(4000, 4, generator=generator, dtype=torch.float64) * spread
-    average = Average.zeros(noise).joined(noise, spread.square().expand_as(noise), 0.5)
-    centre = (noise / spread**2).sum(1, keepdim=True) / (1 / spread**2).sum()
-    wanted = stats.chi2.sf(((noise - centre) ** 2 / spread**2).sum(1).numpy(), 3)
-    torch.testing.assert_close(average.p_values, torch.from_numpy(wanted))
-    # A binomial's standard deviation at 4,000 draws is 0.0034.
-    assert float((average.p_values <= 0.05).double().mean()) == pytest.approx(0.05, abs=4 * 0.0034)
-    again = average.joined(noise.flip(0), spread.square().expand_as(noise), 0.5)
-    assert float((again.p_values <= 0.05).double().mean()) == pytest.approx(0.05, abs=4 * 0.0034)
-
-
 @pytest.mark.parametrize(
     "bad",
     [
         {"radius": 0.8},
         {"smallest": 0.0},
         {"grow": 0.9},
+        {"trainings": 0},
         {"shrink": 1.0},
         {"momentum": -0.1},
         {"max_step": 0.0},

@@ -9,7 +9,6 @@ it (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,69 +16,13 @@ from torch import Tensor
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
+from neural_sim.outer.evidence import Average
 from neural_sim.outer.settings import Checks
 from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
 
 HALVINGS = 40
-
-
-@dataclass(frozen=True)
-class Average:
-    """Inverse-variance weighted mean of the iterations' directions, with weights that decay.
-
-    So neither a noisy direction, which is long, nor the first one dominates. ``total`` is the weighted sum, ``weight``
-    the sum of weights, ``noise`` the variance of ``total``.
-    """
-
-    total: Float[Tensor, "objects k"]
-    weight: Float[Tensor, "objects 1"]
-    noise: Float[Tensor, "objects k"]
-
-    @staticmethod
-    def zeros(psi: Float[Tensor, "objects k"]) -> Average:
-        return Average(torch.zeros_like(psi), torch.zeros_like(psi[:, :1]), torch.zeros_like(psi))
-
-    def joined(
-        self,
-        direction: Float[Tensor, "objects k"],
-        variance: Float[Tensor, "objects k"],
-        keep: Float[Tensor, "objects 1"] | float,
-    ) -> Average:
-        """The mean with one more direction; earlier weights are multiplied by ``keep``. Objects whose direction or
-        variance is not finite stay as they are."""
-        known = (direction.isfinite() & variance.isfinite()).all(1, keepdim=True)
-        mean = variance.mean(1, keepdim=True)
-        # Without noise (an exact derivative) all iterations have the same weight.
-        weight = torch.where(mean > 0.0, 1.0 / mean, 1.0)
-        joined = (
-            keep * self.total + weight * direction,
-            keep * self.weight + weight,
-            keep**2 * self.noise + weight.square() * variance,
-        )
-        return Average(*(torch.where(known, new, old) for new, old in zip(joined, self._parts, strict=True)))
-
-    @property
-    def _parts(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.total, self.weight, self.noise
-
-    @property
-    def value(self) -> Float[Tensor, "objects k"]:
-        return self.total / self.weight.clamp_min(torch.finfo(self.total.dtype).tiny)
-
-    @property
-    def p_values(self) -> Float[Tensor, "objects"]:
-        """Of the null that all components of the mean are equal: a chi-square test with k - 1 degrees of freedom, each
-        component over its own variance. 1 without observations, 0 without noise."""
-        variance = self.noise / self.weight.square().clamp_min(torch.finfo(self.total.dtype).tiny)
-        exact = (variance == 0.0).all(1)
-        weights = 1.0 / torch.where(variance > 0.0, variance, 1.0)
-        centre = (weights * self.value).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
-        statistic = (weights * (self.value - centre).square()).sum(1)
-        freedom = torch.full_like(statistic, 0.5 * (self.value.shape[1] - 1))
-        p_value = torch.special.gammaincc(freedom, 0.5 * statistic)
-        return torch.where(exact, torch.where(self.value.abs().amax(1) > 0.0, 0.0, 1.0).to(p_value), p_value)
 
 
 class CheckedSteps:
@@ -107,11 +50,10 @@ class CheckedSteps:
         self.accepted = self.trial = psi.detach().clone()
         parts = distribution.split(psi)
         self.radius = {name: torch.full_like(part[:, 0], settings.radius) for name, part in parts.items()}
-        self._averages = {name: Average.zeros(part) for name, part in parts.items()}
-        self._joined = self._averages
+        self._averages = {name: Average.zeros(part, settings.momentum) for name, part in parts.items()}
+        self._joined = dict(self._averages)  # with the derivatives since the last step
         self._expected = torch.zeros_like(psi[:, 0])
         self._moved = {name: torch.zeros(len(psi), dtype=torch.bool) for name in parts}
-        self._just_accepted = torch.zeros(len(psi), dtype=torch.bool)
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
@@ -152,7 +94,8 @@ class CheckedSteps:
             for i, name in enumerate(self.names)
             if pending[i]
         }
-        self._just_accepted = accepted
+        self._averages = {name: average.moved(accepted) for name, average in self._averages.items()}
+        self._joined = dict(self._averages)
         self._moved = {name: torch.zeros_like(pending) for name in self._moved}
         return verdicts
 
@@ -160,16 +103,13 @@ class CheckedSteps:
         gradient, error = stacked(result, self.names, self.accepted)
         psi, slope, noise = (self.distribution.split(values) for values in (self.accepted, gradient, error))
         p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
-        # Derivatives at a psi that has not changed keep their full weight.
-        keep = torch.where(self._just_accepted, self.settings.momentum, 1.0)[:, None].to(self.accepted)
-        self._joined = {}
         for factor in self.distribution.factors:
             name = factor.name
             p = factor.log_probabilities(psi[name]).exp()
             # The derivative by p: that by logits is p times it, and would hardly move a bin of small p.
             direction = -slope[name] / p
             direction = direction - direction.mean(-1, keepdim=True)
-            self._joined[name] = self._averages[name].joined(direction, (noise[name] / p).square(), keep)
+            self._joined[name] = self._joined[name].joined(direction, (noise[name] / p).square())
             for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
                 p_values[object_name][name] = value
         return p_values
@@ -177,9 +117,10 @@ class CheckedSteps:
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
         self._expected = torch.zeros_like(self._expected)
         if certificate.void:
+            self._joined = dict(self._averages)
             self.trial = self.accepted
             return self.trial
-        self._averages = self._joined
+        self._averages = dict(self._joined)
         psi, moved = self.distribution.split(self.accepted), {}
         for factor in self.distribution.factors:
             name = factor.name

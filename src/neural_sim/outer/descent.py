@@ -60,21 +60,17 @@ class GradientLoop(OuterLoop, ABC):
             self._go_to(self.steps.reported)
             return
         self.psi.data[self._learned] = self.steps.reported
-        if self.records:
-            self.inner.renew()  # what is peculiar to one training averages out of the derivatives
-        with timed(seconds, "probes", self.inner.device):
-            self._prepare()
-        rendered, cached, training_loss = self._trained(seconds, self._recording)
-        with timed(seconds, "judge", self.inner.device):
-            self._before = self.inner.scores()
-        with timed(seconds, "hypergradient", self.inner.device):
-            result = self._derivative(rendered, cached)
-        seconds |= {f"hypergradient_{phase}": spent for phase, spent in result.seconds.items()}
+        checks, first = self.settings.steps == "checked", not self.records
+        for trial in range(self.settings.checks.trainings if checks and first else 1):
+            if trial or not first:
+                self.inner.renew()  # what is peculiar to one training averages out of the derivatives
+            rendered, result, training_loss = self._differentiated(seconds)
+            p_values = self.steps.observe(result)
         with timed(seconds, "certify", self.inner.device):
             every = self.settings.certify_every
             due = every > 0 and (len(self.records) + 1) % every == 0
             cosine = self._cosine(result) if due else math.nan
-        p_values, factors = self.steps.observe(result), self.scene.distribution.names
+        factors = self.scene.distribution.names
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
@@ -84,6 +80,20 @@ class GradientLoop(OuterLoop, ABC):
         )
         self._stopped = certificate.stopped
         self._go_to(self.steps.next(certificate))
+
+    def _differentiated(self, seconds: dict[str, float]) -> tuple[RenderedImages, Hypergradient, float]:
+        """Images at psi, the derivative of a training on them, and its loss."""
+        with timed(seconds, "probes", self.inner.device):
+            self._prepare()
+        rendered, cached, training_loss = self._trained(seconds, self._recording)
+        with timed(seconds, "judge", self.inner.device):
+            self._before = self.inner.scores()
+        with timed(seconds, "hypergradient", self.inner.device):
+            result = self._derivative(rendered, cached)
+        for phase, spent in result.seconds.items():
+            name = f"hypergradient_{phase}"
+            seconds[name] = seconds.get(name, 0.0) + spent
+        return rendered, result, training_loss
 
     def _trained(
         self, seconds: dict[str, float], recording: Recording | None = None

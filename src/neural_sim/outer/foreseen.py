@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.checked import Average, within
+from neural_sim.outer.checked import within
 from neural_sim.outer.descent import GradientLoop
+from neural_sim.outer.evidence import Average
 from neural_sim.outer.steps import stacked
 from neural_sim.parameter.product import SceneDistribution
 
@@ -77,8 +78,8 @@ def expected(
             # By p, as in CheckedSteps: the derivative by logits is p times it.
             direction = -gradient / scale
             direction = direction - direction.mean(-1, keepdim=True)
-            average = average.joined(direction, (error / scale).square(), 1.0)
-        variance = average.noise / average.weight.square().clamp_min(torch.finfo(own.dtype).tiny)
+            average = average.joined(direction, (error / scale).square())
+        variance = average.variance
         bins = torch.eye(p.shape[-1], dtype=p.dtype)
         toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]
         step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius), max_step)) - p

@@ -64,9 +64,10 @@ class Trust:
 
 @dataclass(frozen=True)
 class Checks:
-    """Trust-region steps, which the next iteration's training accepts or rejects.
+    """Trust-region steps, which another training accepts or rejects.
 
     Args:
+        trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
@@ -79,6 +80,7 @@ class Checks:
         ValueError: any of these out of its range, with the key and the value.
     """
 
+    trainings: int = 2
     radius: float = 0.5
     largest: float = 0.7
     smallest: float = 0.05
@@ -94,7 +96,7 @@ class Checks:
             raise ValueError(
                 f"{where}: want 0 < smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
             )
-        at_least(where, 1, grow=self.grow)
+        at_least(where, 1, grow=self.grow, trainings=self.trainings)
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
             raise ValueError(

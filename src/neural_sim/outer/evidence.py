@@ -1,0 +1,110 @@
+"""What the derivatives of several trainings say together: their mean, its variance, whether it differs from zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Average:
+    """Weighted mean of derivatives by p, object by object; weights are inverse variances and decay as psi moves.
+
+    So neither a noisy derivative, which is long, nor the first one dominates. Two variances add up: that of the images
+    which a derivative was computed from, and that between trainings (of other initial parameters, batches and images),
+    :attr:`between`. A derivative of which a component is not finite counts for nothing.
+
+    Args:
+        directions, variances: the derivatives, and their variances by images.
+        moves: how often the object has moved since.
+        momentum: factor of a derivative's weight for every move.
+    """
+
+    directions: Float[Tensor, "n objects k"]
+    variances: Float[Tensor, "n objects k"]
+    moves: Int[Tensor, "n objects"]
+    momentum: float = 1.0
+
+    @staticmethod
+    def zeros(psi: Float[Tensor, "objects k"], momentum: float = 1.0) -> Average:
+        nothing = psi.new_zeros(0, *psi.shape)
+        return Average(nothing, nothing, nothing[..., 0].long(), momentum)
+
+    def joined(self, direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]) -> Average:
+        """The mean with one more derivative, at the present psi."""
+        known = (direction.isfinite() & variance.isfinite()).all(1, keepdim=True)
+        new = (direction.where(known, 0.0), variance.where(known, torch.inf))
+        return replace(
+            self,
+            directions=torch.cat([self.directions, new[0][None]]),
+            variances=torch.cat([self.variances, new[1][None]]),
+            moves=torch.cat([self.moves, torch.zeros_like(direction[None, :, 0], dtype=torch.long)]),
+        )
+
+    def moved(self, objects: Bool[Tensor, "objects"]) -> Average:
+        """The mean after some ``objects`` have moved."""
+        return replace(self, moves=self.moves + objects.long())
+
+    @property
+    def between(self) -> Float[Tensor, "objects"]:
+        """Variance of a component between trainings, estimated from an object's derivatives at one psi: their scatter
+        beyond that of their images. The mean over all objects counts as one more pair of derivatives of each. 0 where
+        no object has two derivatives at one psi."""
+        known = self.variances.isfinite().all(2)
+        excess, freedom = (
+            torch.zeros_like(self.directions[:1].sum((0, 2))),
+            torch.zeros_like(self.moves[:1].sum(0)),
+        )
+        pair = self.directions.shape[2] - 1
+        for moves in self.moves.unique():
+            here = (known & (self.moves == moves)).to(self.directions)[..., None]
+            count = here.sum(0)
+            mean = (here * self.directions).sum(0) / count.clamp_min(1.0)
+            scatter = (here * (self.directions - mean)).square().sum((0, 2))
+            images = torch.where(here > 0.0, self.variances, 0.0).sum((0, 2))
+            several = (count[:, 0] - 1.0).clamp_min(0.0)
+            excess = excess + scatter - several / count[:, 0].clamp_min(1.0) * images
+            freedom = freedom + several * pair
+        if not bool((freedom > 0).any()):
+            return torch.zeros_like(excess)
+        mean = (excess.sum() / freedom.sum()).clamp_min(0.0)
+        return ((excess + pair * mean) / (freedom + pair)).clamp_min(0.0)
+
+    @property
+    def _weights(self) -> Float[Tensor, "n objects 1"]:
+        """Relative weights. Without any variance (exact derivatives) all have the same."""
+        variance = self.variances.mean(2, keepdim=True) + self.between[:, None]
+        inverse = torch.where(variance > 0.0, 1.0 / variance, 1.0)
+        return self.momentum ** self.moves[..., None].to(inverse) * inverse
+
+    @property
+    def value(self) -> Float[Tensor, "objects k"]:
+        """The mean; zeros without a derivative."""
+        weights = self._weights
+        total = weights.sum(0).clamp_min(torch.finfo(weights.dtype).tiny)
+        return (weights * self.directions).sum(0) / total
+
+    @property
+    def variance(self) -> Float[Tensor, "objects k"]:
+        """Of the mean's components."""
+        weights = self._weights
+        known = self.variances.isfinite()
+        each = torch.where(known, self.variances, 0.0) + self.between[:, None]
+        total = weights.sum(0).clamp_min(torch.finfo(weights.dtype).tiny)
+        return (weights.square() * each).sum(0) / total.square()
+
+    @property
+    def p_values(self) -> Float[Tensor, "objects"]:
+        """Of the null that all components of the mean are equal: a chi-square test with k - 1 degrees of freedom, each
+        component over its own variance. 1 without observations, 0 without noise."""
+        value, variance = self.value, self.variance
+        exact = (variance == 0.0).all(1)
+        weights = 1.0 / torch.where(variance > 0.0, variance, 1.0)
+        centre = (weights * value).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+        statistic = (weights * (value - centre).square()).sum(1)
+        freedom = torch.full_like(statistic, 0.5 * (value.shape[1] - 1))
+        p_value = torch.special.gammaincc(freedom, 0.5 * statistic)
+        return torch.where(exact, torch.where(value.abs().amax(1) > 0.0, 0.0, 1.0).to(p_value), p_value)
