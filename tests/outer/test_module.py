@@ -243,15 +243,33 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     assert last.certificate is None and "hypergradient" not in last.seconds
     assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
     assert torch.equal(learned.trajectory[1], learned.trajectory[0])  # nothing was judged yet
-    distribution = module.scene.distribution
-    for number, record in enumerate(learned.records[1:], 1):
-        tried = torch.tensor(record.probabilities["pose"], dtype=torch.float64)
-        before, after = (
-            distribution.probabilities(psi)["pose"] for psi in learned.trajectory[number : number + 2]
-        )
-        for label, name in enumerate(("a", "b")):
-            accepted = name in record.verdicts and record.verdicts[name].accepted
-            torch.testing.assert_close(after[label], (tried if accepted else before)[label])
+    # An iteration's derivative is that at the psi which its verdicts accepted.
+    for number, record in enumerate(learned.records[:-1], 1):
+        reported = module.scene.distribution.probabilities(learned.trajectory[number])["pose"]
+        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), reported)
+    tried = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
+    before, after = (module.scene.distribution.probabilities(psi)["pose"] for psi in learned.trajectory[-2:])
+    for label, name in enumerate(("a", "b")):
+        accepted = name in last.verdicts and last.verdicts[name].accepted
+        torch.testing.assert_close(after[label], (tried if accepted else before)[label])
+
+
+def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    trained, inner = [], module.inner
+    train = inner.train
+
+    def watched(images, recording=None):
+        trained.append((inner._numbers, recording is not None, module.psi.detach().clone()))
+        return train(images, recording)
+
+    inner.train = watched
+    learned = learn_psi(module, progress=False)
+    # Two derivatives before the first step; then a verdict and a derivative an iteration; then a verdict.
+    assert [part[:2] for part in trained] == [(0, True), (1, True), (1, False), (2, True), (2, False)]
+    start, again, tried, accepted, last = (psi for _, _, psi in trained)
+    assert torch.equal(start, again) and bool((tried != start).any(1).all())
+    assert torch.equal(accepted, learned.trajectory[2]) and not torch.equal(last, accepted)
 
 
 def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):

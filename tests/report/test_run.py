@@ -69,7 +69,7 @@ def test_bins_that_look_the_same_are_drawn_as_one():
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = (
-        "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected by the next training 2 of 2; "
+        "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected after training on them 2 of 2; "
     )
     trust += "cosine with what outer.certify measured 0.90, 0.90"
     images = ("validation images, learned: 25.0", "without a box: 6")

@@ -192,8 +192,8 @@ def _adjoint(c: Certificate) -> list[str]:
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Counts over recorded iterations: steps (one for each object and factor), untrusted ones, what happened to these
-    and why (failed conditions, or ``signal``: no significance), objects' steps that the next training judged, and those
-    that it rejected; and every measured cosine."""
+    and why (failed conditions, or ``signal``: no significance), objects' steps that were judged, and those that
+    were rejected; and every measured cosine."""
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
         (action, certificate["doubts"] or ["signal"])

@@ -107,7 +107,7 @@ class ResponseLoop(GradientLoop):
             name: slopes[i] if i in self._learned else zero for i, name in enumerate(self.scene.names)
         }
         solution = Solution(torch.zeros(1), Status.MEASURED, 0, 0.0, (0.0, 0.0), 0, False)
-        # Its noise is not known; the next training decides on each step.
+        # Its noise is not known; the training at the new psi decides on each step.
         errors = dict.fromkeys(gradients, zero)
         return Hypergradient(gradients, errors, {}, solution, Damped(0.0, None), math.nan, math.nan, math.nan)
 

@@ -73,7 +73,7 @@ class Checks:
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
         errors: standard errors by which an object's score must rise for its step to be accepted.
         grow, shrink: factors of the radius after an accepted and a rejected step.
-        momentum: weight of an iteration's derivative in the next one's average, before noise is weighed.
+        momentum: factor of a derivative's weight in the average for every later move of its object.
         max_step: largest change of a logit (or a weight) in one step.
 
     Raises:

@@ -179,7 +179,7 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
         if trust[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in trust[part].items())
     if trust["judged"]:
-        text += f"; rejected by the next training {trust['rejected']} of {trust['judged']}"
+        text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
     if trust["cosines"]:
         text += "; cosine with what outer.certify measured " + ", ".join(f"{c:.2f}" for c in trust["cosines"])
     return text

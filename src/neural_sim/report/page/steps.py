@@ -44,7 +44,7 @@ class StepRow:
 def step_rows(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[StepRow]:
     """Rows of the objects; none where the method takes no hypergradient.
 
-    A checked step is judged by the next iteration's training, so its verdict is in the next record.
+    A checked step is judged when the next iteration begins, so its verdict is in the next record.
     """
     steps = [record for record in records if record["certificate"]]
     if not steps:
