@@ -17,7 +17,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from foretold_report import WAYS, report
+from foretold_report import SEEDS, WAYS, report
 from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from torch import Tensor
@@ -74,10 +74,14 @@ def measured(
 
 
 def correlations(repeats: list[Measured], label: int) -> dict[str, float]:
-    """Over one object's bins: of the response under two seeds, and of each way with the response of its own seed."""
+    """Over one object's bins: of the response and of the unrolled derivative under two seeds, and of each way with the
+    response of its own seed."""
     rows = [{way: values[label] for way, values in held.items()} for held in repeats]
-    pairs = [centred_cosine(a["response"], b["response"]) for a, b in combinations(rows, 2)]
-    return {"two seeds": fmean(pairs)} | {
+
+    def between_seeds(way: str) -> float:
+        return fmean(centred_cosine(a[way], b[way]) for a, b in combinations(rows, 2))
+
+    return {"two seeds": between_seeds("response"), SEEDS: between_seeds(WAYS[0])} | {
         way: fmean(centred_cosine(row[way], row["response"]) for row in rows) for way in WAYS
     }
 

@@ -8,6 +8,7 @@ from statistics import fmean
 from typing import Any
 
 WAYS = ("unrolled", "unrolled, no floor", "implicit", "dL_val/dtheta alone")
+SEEDS = "unrolled, two seeds"
 CLEAR = 0.7
 """The correlation of two seeds' responses from which on the response is a signal."""
 
@@ -17,7 +18,8 @@ The response of training itself: 15% of an object's images drawn from one bin in
 other random numbers the same; the change of the object's smooth AP, bin by bin. Beside it what the derivatives of the
 outer objective foretell, through the training that was run and at a stationary point. Correlations over the bins, where
 a loop starts, after the first step that its checks kept, and where it ends; means over loops (seeds {seeds}) with
-{repeats} seeds of trainings each. *Two seeds*: of the response with itself under other random numbers.
+{repeats} seeds of trainings each. *Two seeds*: of the response with itself under other random numbers. *Unrolled, two
+seeds*: of the unrolled derivative with itself, whose remaining part is peculiar to one training.
 
 {table}
 
@@ -34,7 +36,7 @@ def mean(rows: list[Row], key: str) -> float:
 
 
 def table(rows: list[Row]) -> str:
-    keys = ("two seeds", *WAYS)
+    keys = ("two seeds", SEEDS, *WAYS)
     lines = ["| | " + " | ".join(keys) + " |", "|---" * (len(keys) + 1) + "|"]
     cells: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
