@@ -193,6 +193,7 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
         {"smallest": 0.0},
         {"grow": 0.9},
         {"trainings": 0},
+        {"folds": 0},
         {"shrink": 1.0},
         {"momentum": -0.1},
         {"max_step": 0.0},

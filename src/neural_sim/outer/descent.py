@@ -15,6 +15,7 @@ from neural_sim.outer.certificate import certify
 from neural_sim.outer.checked import CheckedSteps
 from neural_sim.outer.inner import InnerLoop, timed
 from neural_sim.outer.loop import OuterLoop
+from neural_sim.outer.objective import Objective
 from neural_sim.outer.steps import FreeSteps, Steps, Verdict
 from neural_sim.synthesis.assembly import RenderedImages
 
@@ -34,6 +35,7 @@ class GradientLoop(OuterLoop, ABC):
         self.steps = self._begin()
         self._recording: Recording | None = None
         self._before = psi.new_zeros(0, 0)
+        self._folds: list[Objective] = []
         self._stopped = False
 
     def _begin(self) -> Steps:
@@ -88,12 +90,21 @@ class GradientLoop(OuterLoop, ABC):
         rendered, cached, training_loss = self._trained(seconds, self._recording)
         with timed(seconds, "judge", self.inner.device):
             self._before = self.inner.scores()
+        self.inner.differentiated = self._fold()
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._derivative(rendered, cached)
         for phase, spent in result.seconds.items():
             name = f"hypergradient_{phase}"
             seconds[name] = seconds.get(name, 0.0) + spent
         return rendered, result, training_loss
+
+    def _fold(self) -> Objective:
+        """The next part of L_val. The scatter of derivatives then has that of the validation images in it."""
+        if self.settings.steps != "checked" or self.settings.checks.folds == 1:
+            return self.inner.objective
+        if not self._folds:
+            self._folds = self.inner.objective.folds(self.settings.checks.folds, self.inner.generator)
+        return self._folds.pop()
 
     def _trained(
         self, seconds: dict[str, float], recording: Recording | None = None

@@ -60,6 +60,7 @@ class InnerLoop:
         photographs: labelled ones that every training has beside the drawn images, as ``training.real`` says.
 
     With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
+    ``objective`` is L_val, ``differentiated`` the part of it whose derivative is taken: all, unless it was replaced.
     ``images`` and ``steps`` count labelled images and optimiser steps; ``cpu_begun`` is the processor time before the
     pool was rendered.
     """
@@ -94,6 +95,7 @@ class InnerLoop:
         if settings.start != "warm":
             self._start = {**placed(detector.init(generator), self.device), **self.backbone}
         self.objective = Objective(self.validation, validation, settings.objective, settings.smooth)
+        self.differentiated = self.objective
         self.images = self.steps = self._numbers = 0
         self.common_numbers = False
         self.trajectory: Trajectory | None = None

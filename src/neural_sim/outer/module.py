@@ -66,7 +66,12 @@ class SimulatorModule(GradientLoop):
             for label, name in zip(self._learned, self._names, strict=True)
         }
         result = hypergradient(
-            inner, self.inner.objective.terms(), estimates, self.solver, self.inner.generator, self._adjoint
+            inner,
+            self.inner.differentiated.terms(),
+            estimates,
+            self.solver,
+            self.inner.generator,
+            self._adjoint,
         )
         self._adjoint = result.solution.value
         return self._with_fixed(result)

@@ -32,6 +32,14 @@ class Objective:
     kind: ObjectiveKind
     smooth: SmoothAP | SmoothAccuracy
 
+    def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
+        """L_val on ``count`` disjoint random parts of the validation images, each with the same number of images of
+        every class (that of an image's first box), give or take one."""
+        shuffled = torch.randperm(len(self.images), generator=generator)
+        ordered = shuffled[self.images.labels.cpu()[shuffled, 0].argsort(stable=True)]
+        rows = [ordered[fold::count] for fold in range(count)]
+        return [replace(self, cached=self.cached.select(r), images=self.images.select(r)) for r in rows]
+
     def terms(self) -> list[Term]:
         """L_val as a sum of terms; a smooth score, of which average precision ranks all images, is one."""
         if self.kind == "loss":

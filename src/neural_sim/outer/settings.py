@@ -68,6 +68,8 @@ class Checks:
 
     Args:
         trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter.
+        folds: disjoint parts of the validation images; each derivative is that of L_val on one of them, so that the
+            scatter between derivatives has that of the validation images in it.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
@@ -81,6 +83,7 @@ class Checks:
     """
 
     trainings: int = 2
+    folds: int = 2
     radius: float = 0.5
     largest: float = 0.7
     smallest: float = 0.05
@@ -96,7 +99,7 @@ class Checks:
             raise ValueError(
                 f"{where}: want 0 < smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
             )
-        at_least(where, 1, grow=self.grow, trainings=self.trainings)
+        at_least(where, 1, grow=self.grow, trainings=self.trainings, folds=self.folds)
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
             raise ValueError(

@@ -60,7 +60,7 @@ def through_training(
         problem,
         loop.trajectory,
         examples,
-        loop.objective.terms(),
+        loop.differentiated.terms(),
         {name: partial(estimate, name) for name in images},
         loop.settings.unrolled,
         loop.generator,
