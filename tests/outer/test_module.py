@@ -272,6 +272,24 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
     assert torch.equal(accepted, learned.trajectory[2]) and not torch.equal(last, accepted)
 
 
+def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):
+    module = checked_loop(scene, 4, trust=Trust(level=None))
+    seen, derivative = [], module._derivative
+
+    def watched(*arguments):
+        seen.append(module.inner.differentiated.images.images)
+        return derivative(*arguments)
+
+    module._derivative = watched
+    learn_psi(module, progress=False)
+    assert [len(part) for part in seen] == [3] * 4
+    for first, second in (seen[:2], seen[2:]):
+        both = torch.cat([first, second]).flatten(1)
+        assert (
+            len(both.unique(dim=0)) == len(module.inner.objective.images.images.flatten(1).unique(dim=0)) == 6
+        )
+
+
 def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
     module = checked_loop(scene, trust=Trust(level=None))
     falling = iter(range(10))

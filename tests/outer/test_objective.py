@@ -77,3 +77,24 @@ def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
         assert float(sum(term(params) for term in fewer.terms())) == pytest.approx(
             1.0 - float(scores[0]), abs=1e-12
         )
+
+
+def test_folds_share_the_images_of_every_class_and_their_mean_loss_is_the_whole(made, generator):
+    objective, params = made("loss")
+    folds = objective.folds(2, generator)
+    assert [len(fold.images) for fold in folds] == [5, 5]
+    counts = [torch.bincount(fold.images.labels[:, 0], minlength=2).tolist() for fold in folds]
+    assert all(abs(a - b) <= 1 for a, b in zip(*counts, strict=True))
+    flat = objective.images.images.flatten(1)
+    parts = torch.cat([fold.images.images.flatten(1) for fold in folds])
+    assert torch.equal(flat[flat.sum(1).argsort()], parts[parts.sum(1).argsort()])
+
+    def loss(part):
+        return float(sum(term(params) for term in part.terms()))
+
+    assert sum(map(loss, folds)) / 2 == pytest.approx(loss(objective), rel=1e-12)
+
+
+def test_more_folds_than_images_are_an_image_each(made, generator):
+    objective, _ = made("loss")
+    assert [len(fold.images) for fold in objective.folds(20, generator)] == [1] * 10
