@@ -7,7 +7,7 @@ import torch
 
 from neural_sim import cameras
 from neural_sim.objects.procedural import Procedural
-from neural_sim.parameter.factor import BinNoise
+from neural_sim.parameter.noise import BinNoise
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.types import PinholeCamera

@@ -12,7 +12,8 @@ from torch import Tensor
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.frozen import FrozenLoop, centred
 from neural_sim.parameter.bins import gumbel
-from neural_sim.parameter.factor import BinnedFactor, BinNoise
+from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.noise import BinNoise
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.parameter.noise import BinNoise
 from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
@@ -20,19 +21,6 @@ COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
 Gap = Literal["disjoint", "uniform", "same"]
 Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
 """How a draw depends on psi, see :meth:`BinnedFactor.relaxed`."""
-
-
-@dataclass(frozen=True)
-class BinNoise:
-    """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponential noise, for
-    further Gumbel noise that selects the same bins."""
-
-    gumbel: Float[Tensor, "n k"]
-    exponential: Float[Tensor, "n draws k"] | None = None
-
-    def select(self, index: Int[Tensor, "m"]) -> BinNoise:
-        """The draws ``index``, which may repeat."""
-        return BinNoise(self.gumbel[index], None if self.exponential is None else self.exponential[index])
 
 
 @dataclass(frozen=True)

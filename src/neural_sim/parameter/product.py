@@ -14,8 +14,9 @@ from torch.nn.functional import one_hot
 from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distances import Unit, radii_in_metres
-from neural_sim.parameter.factor import COORDINATES, BinnedFactor, BinNoise, Factor, Relaxation
+from neural_sim.parameter.factor import COORDINATES, BinnedFactor, Factor, Relaxation
 from neural_sim.parameter.illumination import Illumination
+from neural_sim.parameter.noise import BinNoise, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.types import SceneDraw
 
@@ -28,29 +29,6 @@ class Parameter(Protocol):
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]: ...
-
-
-@dataclass(frozen=True)
-class SceneNoise:
-    """All randomness of n draws, drawn once and replayed in every pass (paper, Tool 2).
-
-    ``bins`` selects each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it. ``light`` is standard normal, for lights drawn around psi's weights; None: the lights are
-    psi's weights.
-    """
-
-    bins: Mapping[str, BinNoise]
-    uniform: Mapping[str, Float[Tensor, "n"]]
-    light: Float[Tensor, "n k"] | None = None
-
-    def __len__(self) -> int:
-        return self.uniform["phi"].shape[0]
-
-    def select(self, index: Int[Tensor, "k"]) -> SceneNoise:
-        """The draws ``index``, which may repeat."""
-        bins = {name: part.select(index) for name, part in self.bins.items()}
-        uniform = {name: values[index] for name, values in self.uniform.items()}
-        return SceneNoise(bins, uniform, None if self.light is None else self.light[index])
 
 
 @dataclass(frozen=True)

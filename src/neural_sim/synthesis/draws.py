@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from neural_sim.parameter.factor import Relaxation
-from neural_sim.parameter.product import SceneDistribution, SceneNoise
+from neural_sim.parameter.noise import SceneNoise
+from neural_sim.parameter.product import SceneDistribution
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.cameras import orbit
-from neural_sim.parameter.factor import COORDINATES, BinNoise
-from neural_sim.parameter.product import SceneDistribution, SceneNoise
+from neural_sim.parameter.factor import COORDINATES
+from neural_sim.parameter.noise import BinNoise, SceneNoise
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.subject import Subject
 from neural_sim.types import PinholeCamera, SceneDraw
 

@@ -97,7 +97,8 @@ class Hypergradients:
             truths.append(truth)
             for name, way in named.items():
                 found, seconds = slopes(loop, way)
-                rows[name].append((1.0 - correlation(found, truth), seconds))
+                # A correlation of 1 may be rounded beyond it.
+                rows[name].append((max(0.0, 1.0 - correlation(found, truth)), seconds))
         both = [correlation(a, b) for a, b in combinations(truths, 2)]
         again = f"; the responses of two trainings correlate by {fmean(both):.2f}" if both else ""
         points = tuple(
