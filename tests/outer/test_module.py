@@ -15,7 +15,6 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
-from neural_sim.outer.settings import Outer, Trust
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
@@ -174,6 +173,19 @@ def test_probes_cover_every_bin_equally(scene):
     assert torch.equal(scene.distribution.bins_of(draw), draw.bins)
 
 
+@pytest.mark.parametrize("pooled", [True, False])
+def test_probes_show_the_same_scenes_in_every_bin(scene, pooled):
+    generator = torch.Generator().manual_seed(0)
+    source = ImagePool.render(scene, 4, generator) if pooled else None
+    images, draw = scene.probes(0, "pose", 8, torch.zeros(2, 4), generator, source)
+    for same in (draw.rho, draw.distance, images.images[:, :, 0, 0], images.images[:, :, -1, -1]):
+        table = same.unflatten(0, (4, 8))
+        assert torch.equal(table, table[:1].expand_as(table))
+        assert len(same[:8].unique(dim=0)) > 1
+    place = draw.phi.view(4, 8) - torch.pi / 2 * torch.arange(4)[:, None]
+    torch.testing.assert_close(place, place[:1].expand(4, 8))
+
+
 def test_cached_losses_equal_losses_from_images(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
@@ -201,109 +213,6 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
         assert set(certificate.p_values[name]) == set(certificate.actions[name]) == {"pose", "zoom"}
         assert all(0.0 < p <= 1.0 for p in certificate.p_values[name].values())
     assert all((part.abs().amax(-1) > 0.0).all() for part in joint.split(learned.last).values())
-
-
-CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
-
-
-def checked_loop(scene, iterations=3, **outer):
-    return small_loop(
-        scene, StratifiedEstimator(probes_per_bin=2), iterations, pool_per_bin=2, **(CHECKED | outer)
-    )
-
-
-def test_checked_trainings_differ_by_psi_alone(scene):
-    inner = checked_loop(scene).inner
-    psi = torch.zeros(2, 4)
-    first, second = (inner.draw(psi).images.images for _ in range(2))
-    assert torch.equal(first, second)
-    moved = inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]])).images.images
-    assert torch.equal(moved[:6], first[:6]) and not torch.equal(moved[6:], first[6:])
-    thetas = []
-    for _ in range(2):
-        inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
-        thetas.append(inner.trainable)
-    assert all(torch.equal(thetas[0][name], value) for name, value in thetas[1].items())
-    inner.renew()
-    assert not torch.equal(inner.draw(psi).images.images, first)
-
-
-def test_methods_that_are_not_checked_get_new_random_numbers(scene):
-    inner = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2).inner
-    first, second = (inner.draw(torch.zeros(2, 4)).images.images for _ in range(2))
-    assert not torch.equal(first, second)
-
-
-def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
-    learned = learn_psi(module, progress=False)
-    first, middle, last = learned.records
-    assert first.verdicts == {} and first.certificate and middle.certificate
-    # The last training judges and takes no derivative.
-    assert last.certificate is None and "hypergradient" not in last.seconds
-    assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
-    assert torch.equal(learned.trajectory[1], learned.trajectory[0])  # nothing was judged yet
-    # An iteration's derivative is that at the psi which its verdicts accepted.
-    for number, record in enumerate(learned.records[:-1], 1):
-        reported = module.scene.distribution.probabilities(learned.trajectory[number])["pose"]
-        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), reported)
-    tried = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
-    before, after = (module.scene.distribution.probabilities(psi)["pose"] for psi in learned.trajectory[-2:])
-    for label, name in enumerate(("a", "b")):
-        accepted = name in last.verdicts and last.verdicts[name].accepted
-        torch.testing.assert_close(after[label], (tried if accepted else before)[label])
-
-
-def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
-    trained, inner = [], module.inner
-    train = inner.train
-
-    def watched(images, recording=None):
-        trained.append((inner._numbers, recording is not None, module.psi.detach().clone()))
-        return train(images, recording)
-
-    inner.train = watched
-    learned = learn_psi(module, progress=False)
-    # Two derivatives before the first step; then a verdict and a derivative an iteration; then a verdict.
-    assert [part[:2] for part in trained] == [(0, True), (1, True), (1, False), (2, True), (2, False)]
-    start, again, tried, accepted, last = (psi for _, _, psi in trained)
-    assert torch.equal(start, again) and bool((tried != start).any(1).all())
-    assert torch.equal(accepted, learned.trajectory[2]) and not torch.equal(last, accepted)
-
-
-def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):
-    module = checked_loop(scene, 4, trust=Trust(level=None))
-    seen, derivative = [], module._derivative
-
-    def watched(*arguments):
-        seen.append(module.inner.differentiated.images.images)
-        return derivative(*arguments)
-
-    module._derivative = watched
-    learn_psi(module, progress=False)
-    assert [len(part) for part in seen] == [3] * 4
-    for first, second in (seen[:2], seen[2:]):
-        both = torch.cat([first, second]).flatten(1)
-        assert (
-            len(both.unique(dim=0)) == len(module.inner.objective.images.images.flatten(1).unique(dim=0)) == 6
-        )
-
-
-def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
-    falling = iter(range(10))
-    module.inner.scores = lambda: torch.full((2, 6), -float(next(falling)))
-    learned = learn_psi(module, progress=False)
-    assert any(record.verdicts for record in learned.records)
-    assert not any(v.accepted for record in learned.records for v in record.verdicts.values())
-    assert torch.equal(learned.last, learned.trajectory[0])
-
-
-@pytest.mark.parametrize("bad", [{"train_first": False}, {"start": "previous"}, {"epochs": 0}])
-def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
-    with pytest.raises(ValueError, match="outer"):
-        Outer(Mirror(), **bad)
 
 
 def test_the_pool_holds_every_combination_of_bins(scene):

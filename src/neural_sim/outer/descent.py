@@ -62,15 +62,14 @@ class GradientLoop(OuterLoop, ABC):
             self._go_to(self.steps.reported)
             return
         self.psi.data[self._learned] = self.steps.reported
-        checks, first = self.settings.steps == "checked", not self.records
+        checks, first, every = self.settings.steps == "checked", not self.records, self.settings.certify_every
+        due = every > 0 and (len(self.records) + 1) % every == 0
         for trial in range(self.settings.checks.trainings if checks and first else 1):
             if trial or not first:
                 self.inner.renew()  # what is peculiar to one training averages out of the derivatives
-            rendered, result, training_loss = self._differentiated(seconds)
+            rendered, result, training_loss = self._differentiated(seconds, whole=due)
             p_values = self.steps.observe(result)
         with timed(seconds, "certify", self.inner.device):
-            every = self.settings.certify_every
-            due = every > 0 and (len(self.records) + 1) % every == 0
             cosine = self._cosine(result) if due else math.nan
         factors = self.scene.distribution.names
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
@@ -83,14 +82,17 @@ class GradientLoop(OuterLoop, ABC):
         self._stopped = certificate.stopped
         self._go_to(self.steps.next(certificate))
 
-    def _differentiated(self, seconds: dict[str, float]) -> tuple[RenderedImages, Hypergradient, float]:
-        """Images at psi, the derivative of a training on them, and its loss."""
+    def _differentiated(
+        self, seconds: dict[str, float], whole: bool
+    ) -> tuple[RenderedImages, Hypergradient, float]:
+        """Images at psi, the derivative of a training on them, and its loss. ``whole``: of L_val on all images, as the
+        reference of a certificate is."""
         with timed(seconds, "probes", self.inner.device):
             self._prepare()
         rendered, cached, training_loss = self._trained(seconds, self._recording)
         with timed(seconds, "judge", self.inner.device):
             self._before = self.inner.scores()
-        self.inner.differentiated = self._fold()
+        self.inner.differentiated = self.inner.objective if whole else self._fold()
         with timed(seconds, "hypergradient", self.inner.device):
             result = self._derivative(rendered, cached)
         for phase, spent in result.seconds.items():

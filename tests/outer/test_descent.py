@@ -1,0 +1,126 @@
+"""The loop of checked steps: what is trained on, under which random numbers, and what is differentiated."""
+
+import pytest
+import torch
+from small_loop import small_loop
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.settings import Outer, Trust
+from neural_sim.parameter.update import Mirror
+
+CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
+
+
+def checked_loop(scene, iterations=3, **outer):
+    return small_loop(
+        scene, StratifiedEstimator(probes_per_bin=2), iterations, pool_per_bin=2, **(CHECKED | outer)
+    )
+
+
+def test_checked_trainings_differ_by_psi_alone(scene):
+    inner = checked_loop(scene).inner
+    psi = torch.zeros(2, 4)
+    first, second = (inner.draw(psi).images.images for _ in range(2))
+    assert torch.equal(first, second)
+    moved = inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]])).images.images
+    assert torch.equal(moved[:6], first[:6]) and not torch.equal(moved[6:], first[6:])
+    thetas = []
+    for _ in range(2):
+        inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
+        thetas.append(inner.trainable)
+    assert all(torch.equal(thetas[0][name], value) for name, value in thetas[1].items())
+    inner.renew()
+    assert not torch.equal(inner.draw(psi).images.images, first)
+
+
+def test_methods_that_are_not_checked_get_new_random_numbers(scene):
+    inner = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2).inner
+    first, second = (inner.draw(torch.zeros(2, 4)).images.images for _ in range(2))
+    assert not torch.equal(first, second)
+
+
+def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    learned = learn_psi(module, progress=False)
+    first, middle, last = learned.records
+    assert first.verdicts == {} and first.certificate and middle.certificate
+    # The last training judges and takes no derivative.
+    assert last.certificate is None and "hypergradient" not in last.seconds
+    assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
+    assert torch.equal(learned.trajectory[1], learned.trajectory[0])  # nothing was judged yet
+    # An iteration's derivative is that at the psi which its verdicts accepted.
+    for number, record in enumerate(learned.records[:-1], 1):
+        reported = module.scene.distribution.probabilities(learned.trajectory[number])["pose"]
+        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), reported)
+    tried = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
+    before, after = (module.scene.distribution.probabilities(psi)["pose"] for psi in learned.trajectory[-2:])
+    for label, name in enumerate(("a", "b")):
+        accepted = name in last.verdicts and last.verdicts[name].accepted
+        torch.testing.assert_close(after[label], (tried if accepted else before)[label])
+
+
+def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    trained, inner = [], module.inner
+    train = inner.train
+
+    def watched(images, recording=None):
+        trained.append((inner._numbers, recording is not None, module.psi.detach().clone()))
+        return train(images, recording)
+
+    inner.train = watched
+    learned = learn_psi(module, progress=False)
+    # Two derivatives before the first step; then a verdict and a derivative an iteration; then a verdict.
+    assert [part[:2] for part in trained] == [(0, True), (1, True), (1, False), (2, True), (2, False)]
+    start, again, tried, accepted, last = (psi for _, _, psi in trained)
+    assert torch.equal(start, again) and bool((tried != start).any(1).all())
+    assert torch.equal(accepted, learned.trajectory[2]) and not torch.equal(last, accepted)
+
+
+def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):
+    module = checked_loop(scene, 4, trust=Trust(level=None))
+    seen, derivative = [], module._derivative
+
+    def watched(*arguments):
+        seen.append(module.inner.differentiated.images.images)
+        return derivative(*arguments)
+
+    module._derivative = watched
+    learn_psi(module, progress=False)
+    assert [len(part) for part in seen] == [3] * 4
+    for first, second in (seen[:2], seen[2:]):
+        both = torch.cat([first, second]).flatten(1)
+        assert (
+            len(both.unique(dim=0)) == len(module.inner.objective.images.images.flatten(1).unique(dim=0)) == 6
+        )
+
+
+def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene):
+    module = checked_loop(scene, 3, trust=Trust(level=None), certify_every=2)
+    seen, derivative = [], module._derivative
+
+    def watched(*arguments):
+        seen.append(len(module.inner.differentiated.images))
+        return derivative(*arguments)
+
+    module._derivative = watched
+    learn_psi(module, progress=False)
+    assert seen == [3, 3, 6]
+
+
+def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
+    module = checked_loop(scene, trust=Trust(level=None))
+    falling = iter(range(10))
+    module.inner.scores = lambda: torch.full((2, 6), -float(next(falling)))
+    learned = learn_psi(module, progress=False)
+    assert any(record.verdicts for record in learned.records)
+    assert not any(v.accepted for record in learned.records for v in record.verdicts.values())
+    assert torch.equal(learned.last, learned.trajectory[0])
+
+
+@pytest.mark.parametrize("bad", [{"train_first": False}, {"start": "previous"}, {"epochs": 0}])
+def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
+    with pytest.raises(ValueError, match="outer"):
+        Outer(Mirror(), **bad)
