@@ -226,7 +226,9 @@ objects; {old:.3f} of such objects pass it by themselves (normal, 16 images of e
 {laws}
 
 Each p-value, except of relaxed draws, is the larger of two. One is exact where scores do not depend on the bin, the
-other where they are symmetric about its mean. The rate is too high for skewed scores with unequal standard deviations.
+other where they are symmetric about its mean, and with three scenes it cannot be below 0.25. Checked steps
+(`outer.steps=checked`) take another test, of the average of several derivatives, by their scatter
+(`outer/evidence.py`). The rate is too high for skewed scores with unequal standard deviations.
 No test of means holds its level for every distribution (Bahadur and Savage 1956). So the next table resamples the
 detector's scores: {images} of every bin at the warm start of `pose_gap`, minus their bins' means.
 
