@@ -224,4 +224,4 @@ def test_the_pool_holds_every_combination_of_bins(scene):
     assert torch.equal(joint.bins_of(held), held.bins)
     drawn = pool.drawn(1, psi, 200, generator).draw
     assert torch.equal(joint.bins_of(drawn), drawn.bins)
-    assert pool.probed(1, "zoom", 5, psi, generator)[0].draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
+    assert pool.probed(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5

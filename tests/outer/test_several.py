@@ -46,8 +46,7 @@ class Painted:
         return self._at(label, self.distribution.hard(psi, noise))
 
     def probed(self, label, factor, per_bin, psi, generator):
-        draw, scenes = self.distribution.probes(factor, per_bin, psi, generator, DOUBLE)
-        return self._at(label, draw), scenes
+        return self._at(label, self.distribution.probes(factor, per_bin, psi, generator, DOUBLE))
 
 
 @pytest.fixture

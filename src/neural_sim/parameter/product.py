@@ -212,19 +212,15 @@ class SceneDistribution:
 
     def probes(
         self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
-    ) -> tuple[SceneDraw, Int[Tensor, "n"]]:
+    ) -> SceneDraw:
         """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi and the same in all
-        strata; and the index of each draw's scene."""
-        factor = self.factor(name)
-        strata, scenes = (
-            torch.arange(factor.size).repeat_interleave(each),
-            torch.arange(each).repeat(factor.size),
-        )
-        noise = self.draw_noise(each, generator, dtype)
-        if not factor.lights:
-            return self.stratum(name, strata, psi, noise.select(scenes)), scenes
-        draw = self.hard(psi, noise).select(scenes)
-        return replace(draw, weights=torch.eye(factor.size, dtype=psi.dtype)[strata]), scenes
+        strata."""
+        size, lights = self.factor(name).size, self.factor(name).lights
+        strata = torch.arange(size).repeat_interleave(each)
+        noise = self.draw_noise(each, generator, dtype).select(torch.arange(each).repeat(size))
+        if not lights:
+            return self.stratum(name, strata, psi, noise)
+        return replace(self.hard(psi, noise), weights=torch.eye(size, dtype=psi.dtype)[strata])
 
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise

@@ -112,7 +112,7 @@ class Shots:
         """``PER_BIN`` cameras of every bin of a factor, drawn as images of that bin are."""
         distribution, psi = self.scene.distribution, self.psi[which][label].float()
         p = distribution.probabilities(psi)[factor]
-        draw, _ = distribution.probes(factor, PER_BIN, psi, torch.Generator().manual_seed(seed), psi.dtype)
+        draw = distribution.probes(factor, PER_BIN, psi, torch.Generator().manual_seed(seed), psi.dtype)
         if self.scene.radii is not None:
             draw = replace(draw, radius=self.scene.radii[label])
         poses = cameras.orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius).numpy()

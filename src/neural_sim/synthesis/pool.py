@@ -88,9 +88,9 @@ class ImagePool:
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
-    ) -> tuple[RenderedObject, Int[Tensor, "m"]]:
-        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; other factors from
-        p_psi and the same in all bins. And the index of each render's scene."""
+    ) -> RenderedObject:
+        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; all else from p_psi
+        and the same in all bins."""
         distribution = self.scene.distribution
         size = distribution.factor(factor).size
         bins, scenes = torch.arange(size).repeat_interleave(per_bin), torch.arange(per_bin).repeat(size)
@@ -99,7 +99,7 @@ class ImagePool:
             noise = distribution.draw_noise(per_bin, generator).select(scenes)
             chosen = distribution.stratum(factor, bins, psi.float(), noise).bins
         within = torch.randint(self.objects[label].per_cell, (per_bin,), generator=generator)
-        return self._taken(label, chosen, within[scenes]), scenes
+        return self._taken(label, chosen, within[scenes])
 
     def _taken(self, label: int, bins: Int[Tensor, "n factors"], within: Int[Tensor, "n"]) -> RenderedObject:
         pool = self.objects[label]

@@ -33,7 +33,7 @@ class Source(Protocol):
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator, /
-    ) -> tuple[RenderedObject, Int[Tensor, "m"]]: ...
+    ) -> RenderedObject: ...
 
 
 @dataclass(frozen=True)
@@ -106,15 +106,12 @@ class Scene:
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
-    ) -> tuple[RenderedObject, Int[Tensor, "m"]]:
-        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; other factors from
-        p_psi. And which renders are of one scene.
-
-        For an illumination the bins are the anchor lights, all with the same ``per_bin`` scenes.
-        """
+    ) -> RenderedObject:
+        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; all else from p_psi
+        and the same in all bins. For an illumination the bins are the anchor lights."""
         dtype = self.dtype(label)
-        draw, scenes = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
-        return self.render(label, draw), scenes
+        draw = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
+        return self.render(label, draw)
 
     def _maps_with_tangents(
         self, label: int, draw: SceneDraw, names: tuple[str, ...]
@@ -229,21 +226,20 @@ class Scene:
     ) -> tuple[LabelledImages, SceneDraw]:
         """``per_bin`` images of every bin of a factor of one object, in the order of its bins, and the object's draws.
 
-        All else is as in an image of the training set in which the object shows: other factors from p_psi, other
-        objects from theirs. Probes of lights share scenes, other objects and backgrounds.
+        All else is as in an image of the training set in which the object shows, and the same in all bins: other
+        factors from p_psi, other objects from theirs, backgrounds.
         """
         source = source or self
-        part, scenes = source.probed(label, factor, per_bin, psi[label], generator)
+        part = source.probed(label, factor, per_bin, psi[label], generator)
         (bins,) = self._bins([part])
-        count = int(scenes.max()) + 1
+        scenes = torch.arange(per_bin).repeat(len(part) // per_bin)
         if not self.synthesizer.several:
-            nuisance = self._nuisance(count, generator)
-            nuisance = nuisance if count == len(scenes) else nuisance.select(scenes)
+            nuisance = self._nuisance(per_bin, generator).select(scenes)
             return one_each([part], [nuisance], [label], [bins], self.synthesizer).images, part.draw
-        own = torch.full((count,), label)
+        own = torch.full((per_bin,), label)
         layout = draw_layout(own, len(self.names), self.synthesizer.count, generator, present=True)
-        first = torch.full((count,), len(scenes)).scatter_reduce(0, scenes, torch.arange(len(scenes)), "amin")
-        around = self._around(layout, psi, generator, HARD, source, {label: part.select(first)})
+        known = {label: part.select(torch.arange(per_bin))}
+        around = self._around(layout, psi, generator, HARD, source, known)
         return around.repeated(scenes, label, part, bins).composed().images, part.draw
 
     def _bins(self, objects: Sequence[RenderedObject]) -> list[Int[Tensor, "m"]]:
