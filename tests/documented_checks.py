@@ -47,12 +47,21 @@ def _run(folder, config):
     """README.md, Use: the files of a run."""
     results = json.loads((folder / "results.json").read_text())
     beside = {"synthetic_only", "real_only"} if config["training"]["real"]["mode"] != "none" else set()
-    assert set(results["ap"]) == {"ns", "learned", "matched"} | beside
+    photographs = config["target"]["_target_"].rpartition(".")[2] != "RenderedTarget"
+    stated = any(
+        own.get("target", "uniform") != "uniform"
+        for factor in config["parameter"].values()
+        for own in (factor["biased"] or {}).values()
+    )
+    known = not photographs or stated
+    assert set(results["ap"]) == {"ns", "learned", *(["matched"] if known else [])} | beside
     assert (results["experiment"], results["seed"]) == (config["name"], config["seed"])
     assert {"seconds", "peak_memory_mb", "left_out"} <= set(results)
     for factors in results["psi"].values():
         assert set(config["parameter"]) <= set(factors)  # axis=both has a second of its own
-        assert all(set(psi) == {"initial", "learned", "target"} for psi in factors.values())
+        assert all(
+            set(psi) == {"initial", "learned", *(["target"] if known else [])} for psi in factors.values()
+        )
     if config["baseline"]["name"].startswith("neural_sim"):
         assert len(results["iterations"]) == config["outer"]["iterations"]
     # A method without iterations has no psi over them.

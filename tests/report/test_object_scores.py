@@ -1,5 +1,7 @@
 """AP by object and method, beside the comparison of means, which resamples the same seeds and images."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from finished_runs import finished
@@ -21,6 +23,16 @@ def runs(*methods, seeds=(0, 1)):
                  experiment="gap", method=method, seed=seed, curve=CURVE)
         for method, ap in methods for seed in seeds
     ]  # fmt: skip
+
+
+def test_scores_do_not_need_a_known_target():
+    made = runs(("neural_sim", 0.7), ("lts", 0.3))
+    bare = [
+        dataclasses.replace(r, matches={w: m for w, m in r.matches.items() if w != "matched"}) for r in made
+    ]
+    found, beside = (object_scores(each, "neural_sim", draws=10) for each in (bare, made))
+    assert found.methods == ("ns", "lts", "neural_sim") == beside.methods[:-1]
+    assert found.ahead["lts"] == beside.ahead["lts"]
 
 
 def test_objects_have_their_own_ap_and_their_mean_is_that_of_the_comparison():

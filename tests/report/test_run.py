@@ -66,6 +66,30 @@ def test_bins_that_look_the_same_are_drawn_as_one():
     assert heights == pytest.approx([0.8, 0.1, 0.1]) and len(axes.collections) == 3
 
 
+def test_nothing_is_said_of_a_target_that_nobody_knows(results, tmp_path):
+    known = {which: p for which, p in results.probabilities.items() if which != "target"}
+    ap = {which: scores for which, scores in results.ap.items() if which != "matched"}
+    photographs = dataclasses.replace(results, probabilities=known, ap=ap)
+    held = photographs.document()
+    assert held["total_variation"] == {"a": {}, "b": {}} and set(held["psi"]["a"]["pose"]) == {
+        "initial",
+        "learned",
+    }
+    text = photographs.summary()
+    assert "learned" in text and "target" not in text and "matched" not in text
+    images = LabelledImages(
+        torch.rand(1, 3, 16, 16), torch.zeros(1, 1, 4), torch.tensor([[-1]]), torch.zeros(1).long()
+    )
+    paths = write_figures(photographs, images, images, [], tmp_path)
+    assert {path.name for path in paths} == {"psi_pose.png", "ap.png", "training_images.png"}
+
+
+def test_a_panel_without_a_target_has_no_bar():
+    (axes,) = psi_figure({"a": [[0.25] * 4, [0.4, 0.1, 0.4, 0.1]]}, None, "title", "pose").axes
+    assert not axes.patches and len(axes.collections) == 4 and axes.get_xlim() == (0.0, 1.0)
+    assert "target" not in [label.get_text() for label in axes.get_xticklabels()]
+
+
 def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = (

@@ -52,6 +52,16 @@ def test_shares_won_back_and_leads_are_those_of_the_runs():
     }
 
 
+def test_leads_do_not_need_a_known_target():
+    runs = [run(method, s, ap) for s in range(3) for method, ap in (("ours", 0.7), ("other", 0.4))]
+    bare = [
+        dataclasses.replace(r, matches={w: m for w, m in r.matches.items() if w != "matched"}) for r in runs
+    ]
+    found, beside = compare(bare, "ours", draws=50), compare(runs, "ours", draws=50)
+    assert found.bounds == ["ns"] and beside.bounds == ["ns", "matched"] and found.won_back == {}
+    assert found.ahead == beside.ahead and found.ap == {m: e for m, e in beside.ap.items() if m != "matched"}
+
+
 def test_a_lead_that_hangs_on_the_seed_is_not_certain():
     runs = [run("ours", s, ap) for s, ap in enumerate((0.3, 0.7, 0.5))]
     runs += [run("other", s, ap) for s, ap in enumerate((0.6, 0.4, 0.5))]

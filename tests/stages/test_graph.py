@@ -1,9 +1,13 @@
 """Which settings a stored detector depends on: what its images are drawn from, not how a method relaxes the draws."""
 
+import json
+
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import build, conf_directory
+from neural_sim.outer.records import LearnedPsi
 from neural_sim.stages.graph import Graph
 
 
@@ -47,3 +51,36 @@ def test_the_scored_detector_of_the_start_is_the_warm_start_where_epochs_are_equ
 def test_objects_that_no_source_has_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"names \['drill'\], objects are"):
         keys(tmp_path, "objects.names=[pitcher,mug]")
+
+
+@pytest.mark.parametrize(
+    ("target", "overrides", "known"),
+    [
+        ("rendered", [], True),
+        ("coco", [], False),
+        ("coco", ["parameter.pose.initial={dominant: 1}"], False),
+        ("coco", ["parameter.pose.target={dominant: 1}"], True),
+        ("coco", ["parameter.pose.biased={mug: {target: {dominant: 2}}}"], True),
+        ("coco", ["parameter.pose.biased={mug: {initial: {dominant: 2}}}"], False),
+    ],
+)
+def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
+    tmp_path, target, overrides, known
+):
+    """Else no detector is called matched, and nothing can be drawn from it."""
+    labels = tmp_path / "labels.json"
+    entry = {"id": 1, "file_name": "a.png", "height": 8, "width": 8}
+    labels.write_text(json.dumps({"images": [entry], "annotations": [], "categories": []}))
+    photographs = ["target=coco", f"target.annotations={labels}"] if target == "coco" else []
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        words = ["scale=smoke", *photographs, *overrides, f"paths.store={tmp_path}"]
+        graph = Graph(build(compose("config", words)))
+    assert (graph.target_psi is not None) == known
+    psi = graph.psi("initial")
+    assert ("matched" in graph.compared(LearnedPsi(psi[None], []))) == known
+    assert torch.equal(graph.stated_psi("initial", "export.psi"), psi)
+    if known:
+        assert torch.equal(graph.stated_psi("target", "export.psi"), graph.psi("target"))
+        return
+    with pytest.raises(ValueError, match=r"^export\.psi=target: no distribution of the target is known"):
+        graph.stated_psi("target", "export.psi")

@@ -48,6 +48,12 @@ class ConfiguredDistributions:
             return "uniform" if self.gap == "uniform" else own.get("target", self.target)
         return own.get(which, self.initial if which == "initial" else self.target)
 
+    @property
+    def states_target(self) -> bool:
+        """Whether any object's target is another than uniform, the default."""
+        own = [biased.get("target", self.target) for biased in (self.biased or {}).values()]
+        return any(target != "uniform" for target in [self.target, *own])
+
 
 class Factor(Protocol):
     """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).

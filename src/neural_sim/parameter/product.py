@@ -145,6 +145,11 @@ class SceneDistribution:
         """Names of the objects that some factor's ``biased`` lists, sorted."""
         return tuple(sorted({name for factor in self.factors for name in factor.configured.biased or {}}))
 
+    @property
+    def states_target(self) -> bool:
+        """Whether the target of any factor is configured: uniform is the default."""
+        return any(factor.configured.states_target for factor in self.factors)
+
     # --- draws ---
 
     def draw_noise(

@@ -15,7 +15,7 @@ from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
 from neural_sim.report.page.comparison_page import Section, write_comparison_page
 from neural_sim.report.selection import Group, LeftOut, Selection
-from neural_sim.report.statistics import BOUNDS, Clock, Comparison, Estimate, compare
+from neural_sim.report.statistics import Clock, Comparison, Estimate, compare
 
 
 @dataclass(frozen=True)
@@ -154,14 +154,15 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         f"| {c.score} after {c.equal_cost:.0f} {unit} | images | detector steps | {unit} |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for bound in BOUNDS:
+    for bound in c.bounds:
         lines.append(f"| {bound} | {points(c.ap[bound])} | | | | | | | |")
     for method in c.methods:
         ahead = points(c.ahead[method], sure=True) if method in c.ahead else ""
         area = points(c.area[method], sure=True) if method in c.area else ""
+        won = points(c.won_back[method], "%") if method in c.won_back else ""
         spent = c.spent[method]
         lines.append(
-            f"| {method} | {points(c.ap[method])} | {points(c.won_back[method], '%')} | {ahead} | {area} "
+            f"| {method} | {points(c.ap[method])} | {won} | {ahead} | {area} "
             f"| {points(c.at_equal_cost[method])} "
             f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent[c.clock]:.0f} |"
         )
@@ -170,8 +171,6 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
               "labelled validation images are not counted. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
               "iterations linear in log seconds.", ""]  # fmt: skip
-    lines += ["| total variation to the target | initial | " + " | ".join(c.methods) + " |"]
-    lines += ["|---|" + "---|" * (1 + len(c.methods))]
     return "\n".join(lines + _distances(c, runs))
 
 
@@ -203,7 +202,7 @@ def _hundredfold(value: float, digits: int) -> str:
 
 
 def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:
-    """Mean distances of every biased object and factor, before and after."""
+    """Mean distances of every biased object and factor, before and after; empty where the target is not known."""
     rows = []
     table = {(run.method, run.seed): run.results["total_variation"] for run in runs}
     for name in runs[0].results["biased"]:
@@ -214,4 +213,6 @@ def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]
                 means.append({w: sum(row[w] for row in each) / len(each) for w in ("initial", "learned")})
             cells = " | ".join(f"{mean['learned']:.2f}" for mean in means)
             rows.append(f"| {name}, {factor} | {means[0]['initial']:.2f} | {cells} |")
-    return rows
+    head = ["| total variation to the target | initial | " + " | ".join(comparison.methods) + " |"]
+    head += ["|---|" + "---|" * (1 + len(comparison.methods))]
+    return head + rows if rows else []

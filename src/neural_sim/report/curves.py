@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from neural_sim.report import figures
 from neural_sim.report.finished import FinishedRun
-from neural_sim.report.statistics import BOUNDS, Comparison, biased_ap
+from neural_sim.report.statistics import Comparison, biased_ap
 
 UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of processor time"}
 
@@ -35,7 +35,7 @@ def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
                     linewidth=1,
                     label=label,
                 )
-        for bound, style in zip(BOUNDS, (":", "--"), strict=True):
+        for bound, style in zip(comparison.bounds, (":", "--"), strict=False):
             axes.axhline(100 * comparison.ap[bound].value, color=figures.MUTED, linestyle=style, linewidth=1)
             axes.annotate(bound, (1.0, 100 * comparison.ap[bound].value), xycoords=("axes fraction", "data"),
                           ha="right", va="bottom", fontsize=7, color=figures.MUTED)  # fmt: skip

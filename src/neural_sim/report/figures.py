@@ -45,14 +45,14 @@ def save(figure: Figure, path: Path) -> Path:
 
 def psi_figure(
     history: Mapping[str, Sequence[Sequence[float]]],
-    target: Mapping[str, Sequence[float]],
+    target: Mapping[str, Sequence[float]] | None,
     title: str,
     factor: str,
     groups: Mapping[str, Sequence[Sequence[int]]] | None = None,
 ) -> Figure:
     """p over the bins at every iteration, stacked, with the target distribution as a bar beside it.
 
-    ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them.
+    ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them (None: not known).
     ``factor`` names what the bins are of; only a pose's colours close the circle. ``groups`` are an object's bins (from
     1) that look the same: stacked as one, in the colour of the first.
     """
@@ -60,13 +60,13 @@ def psi_figure(
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
-    bins = len(next(iter(target.values())))
+    bins = len(history[names[0]][0])
     colours = bin_colours(factor, bins)
     figure.suptitle(title, color=INK, fontsize=11)
     for place, name in enumerate(names, 1):
         joined = groups[name] if groups is not None else [[b] for b in range(1, bins + 1)]
         axes = figure.add_subplot(rows, columns, place)
-        psi_panel(axes, history[name], target[name], joined, colours)
+        psi_panel(axes, history[name], None if target is None else target[name], joined, colours)
         axes.set_title(_titled(name, joined), fontsize=9)
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
     figure.legend(
@@ -86,28 +86,31 @@ def bin_colours(factor: str, bins: int) -> Any:
 def psi_panel(
     axes: Any,
     history: Sequence[Sequence[float]],
-    target: Sequence[float],
+    target: Sequence[float] | None,
     groups: Sequence[Sequence[int]],
     colours: Any,
 ) -> None:
     """One object's probabilities, stacked, by iteration, and its target's beside them; arguments as in
     :func:`psi_figure`."""
-    p, wanted = (merged(torch.tensor(each), groups).numpy() for each in (history, target))
+    p = merged(torch.tensor(history), groups).numpy()
     shades = [colours[group[0] - 1] for group in groups]
     steps = np.arange(len(p))
     width = max(1.0, 0.12 * len(p))
     axes.stackplot(steps, p.T, colors=shades, linewidth=0)
-    bottom = 0.0
+    ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
+    style(axes)
+    axes.set(xlim=(0, max(1, len(p) - 1)), ylim=(0, 1), xticks=ticks)
+    if target is None:
+        return
+    wanted, bottom = merged(torch.tensor(target), groups).numpy(), 0.0
     for group, mass, shade in zip(groups, wanted, shades, strict=True):
         axes.bar(len(p) - 1 + 1.1 * width, mass, width, bottom=bottom, color=shade, linewidth=0)
         if mass > 0.25:
             axes.text(len(p) - 1 + 1.1 * width, bottom + mass / 2, "=".join(map(str, group)), ha="center",
                       va="center", color="white", fontsize=8)  # fmt: skip
         bottom += mass
-    axes.set(xlim=(0, len(p) - 1 + 1.8 * width), ylim=(0, 1))
-    ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
+    axes.set_xlim(0, len(p) - 1 + 1.8 * width)
     axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
-    style(axes)
 
 
 def _titled(name: str, groups: Sequence[Sequence[int]]) -> str:

@@ -29,8 +29,8 @@ def called(method: str) -> str:
 class ObjectScores:
     """``ap`` and ``ahead`` map a method, then an object or ``MEAN``, to an estimate in [0, 1]: the AP (0.50 to 0.95) on
     the test set, and the reference's AP minus the method's. ``methods`` begin with ns and end with matched, the
-    detectors trained on the initial and on the target's distribution. Where photographs train too, ``ap`` also has
-    ``WITHOUT``, of the reference's runs."""
+    detectors trained on the initial and on the target's distribution, if that is known. Where photographs train too,
+    ``ap`` also has ``WITHOUT``, of the reference's runs."""
 
     reference: str
     methods: tuple[str, ...]
@@ -59,7 +59,8 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
     missing = [f"{m} seed {s}" for m in learned for s in seeds if (m, s) not in table]
     if missing:
         raise ValueError(f"scores of {reference}: want a run of each method at each seed, lacking {missing}")
-    methods = (BOUNDS[0], *reversed(learned), BOUNDS[1])
+    bounds = [bound for bound in BOUNDS if all(bound in table[reference, at].matches for at in seeds)]
+    methods = (bounds[0], *reversed(learned), *bounds[1:])
     objects = tuple(runs[0].results["biased"])
     columns = (*methods, *(w for w in WITHOUT if all(w in table[reference, at].matches for at in seeds)))
     matches = [

@@ -29,7 +29,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class RunResults:
     """Everything the report shows. ``probabilities`` are those of initial, learned and target, by factor, [objects, k];
-    ``ap`` maps ns, learned, matched to scores on the test set. ``validation_ap`` is that of the learned distribution's
+    ``ap`` maps ns, learned, matched to scores on the test set. Photographs whose distribution is not known have neither
+    target nor matched. ``validation_ap`` is that of the learned distribution's
     detector on the validation images, which steered psi too: settings are chosen by it, nothing is reported by it.
     ``curve`` has what the method had spent (images, detector_steps, products, seconds) and what its psi was worth
     (``ap``) at every iteration that was scored.
@@ -104,16 +105,19 @@ class RunResults:
     @property
     def factors(self) -> tuple[str, ...]:
         """Names of what is learned, in order."""
-        return tuple(self.probabilities["target"])
+        return tuple(self.probabilities["learned"])
 
     def groups(self, name: str, factor: str) -> Sequence[Sequence[int]]:
         """Groups of a factor's bins (from 1) that look the same for an object; a bin each where nothing is known."""
-        bins = self.probabilities["target"][factor].shape[-1]
+        bins = self.probabilities["learned"][factor].shape[-1]
         return self.symmetric_bins.get(name, {}).get(factor) or [[b] for b in range(1, bins + 1)]
 
     def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Distance of the initial and the learned distribution from the target, by object and factor, over groups."""
+        """Distance of the initial and the learned distribution from the target, by object and factor, over groups;
+        empty for every object where the target is not known."""
         distances: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
+        if "target" not in self.probabilities:
+            return distances
         for label, name in enumerate(self.names):
             for factor in self.factors:
                 groups = self.groups(name, factor)
@@ -140,7 +144,7 @@ class RunResults:
             score = f"{100 * self.validation_ap:.1f}"
             lines.append(f"{self.score} on the validation images, learned: {score} (to choose settings by)")
         distances = self.total_variations()
-        for factor in self.factors:
+        for factor in self.factors if "target" in self.probabilities else ():
             lines.append(f"distance to target, {factor}")
             for which in ("initial", "learned"):
                 row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
@@ -203,13 +207,14 @@ def write_figures(
     """The run's figures as PNG files."""
     names, paths = list(results.names), []
     for factor in results.factors if results.records else ():
-        target = results.probabilities["target"][factor].tolist()
+        target = results.probabilities.get("target")
+        wanted = None if target is None else dict(zip(names, target[factor].tolist(), strict=True))
         steps = [*(r["probabilities"][factor] for r in results.records)]
         steps.append(results.probabilities["learned"][factor].tolist())
         history = {name: [p[i] for p in steps] for i, name in enumerate(names)}
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
         groups = {name: results.groups(name, factor) for name in names}
-        drawn_psi = figures.psi_figure(history, dict(zip(names, target, strict=True)), title, factor, groups)
+        drawn_psi = figures.psi_figure(history, wanted, title, factor, groups)
         paths.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
     if results.ap:
         paths.append(

@@ -20,7 +20,8 @@ from neural_sim.report.finished import FinishedRun
 
 BOUNDS = ("ns", "matched")
 """Detectors that every run of a seed has, and that do not depend on its method. They stand for the methods ``ns`` and
-``oracle``, whose own runs are not compared again."""
+``oracle``, whose own runs are not compared again. The second is missing where the target's distribution is not known.
+"""
 FIXED = ("ns", "oracle")
 Clock = Literal["seconds", "cpu_seconds"]
 """What a method has taken: by the clock on the wall, or of all processor cores together."""
@@ -44,7 +45,8 @@ class Estimate:
 class Comparison:
     """The methods of one setting over the seeds that all of them have.
 
-    ``ap`` is the biased objects' mean AP, ``won_back`` the fraction of the gap from ns to matched, ``ahead`` the
+    ``ap`` is the biased objects' mean AP, of ``bounds`` too; ``won_back`` the fraction of the gap from ns to matched,
+    empty without matched; ``ahead`` the
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
     unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
     took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`. ``spent`` are means over seeds, the warm
@@ -65,6 +67,11 @@ class Comparison:
     clock: Clock = "seconds"
     score: Score = "AP"
 
+    @property
+    def bounds(self) -> list[str]:
+        """The detectors of ``BOUNDS`` that the runs have."""
+        return [bound for bound in BOUNDS if bound in self.ap]
+
 
 def compare(
     runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0, clock: Clock = "seconds"
@@ -82,20 +89,25 @@ def compare(
     seeds = tuple(sorted({s for _, s in table if all((method, s) in table for method in methods)}))
     if not seeds:
         raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
-    columns = (*BOUNDS, *methods)
+    bounds = [bound for bound in BOUNDS if all(bound in table[reference, s].matches for s in seeds)]
+    columns, first = (*bounds, *methods), len(bounds)
     matches = [
-        [table[reference, s].matches[bound] for bound in BOUNDS]
+        [table[reference, s].matches[bound] for bound in bounds]
         + [table[method, s].matches["learned"] for method in methods]
         for s in seeds
     ]
     point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
     spread = resampled(matches, draws, seed)
     ap = dict(zip(columns, with_intervals(point, spread), strict=True))
-    gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
-    won = with_intervals((point[2:] - point[0]) / gap, (spread[:, 2:] - spread[:, :1]) / spread_gap[:, None])
-    ahead = with_intervals(point[2] - point[3:], spread[:, 2:3] - spread[:, 3:])
+    won = {}
+    if "matched" in bounds:
+        gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
+        parts = (point[first:] - point[0]) / gap, (spread[:, first:] - spread[:, :1]) / spread_gap[:, None]
+        won = dict(zip(methods, with_intervals(*parts), strict=True))
+    ours, others = slice(first, first + 1), slice(first + 1, None)
+    ahead = with_intervals(point[ours] - point[others], spread[:, ours] - spread[:, others])
     return Comparison(
-        runs[0].setting, seeds, methods, reference, ap, dict(zip(methods, won, strict=True)),
+        runs[0].setting, seeds, methods, reference, ap, won,
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
         {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
          for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock), clock,

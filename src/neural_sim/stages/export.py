@@ -144,7 +144,7 @@ class ExportStep:
         if self.psi == "learned":
             return context.results(graph.learned).last
         if self.psi in ("initial", "target"):
-            return graph.psi(self.psi)
+            return graph.stated_psi(self.psi, "export.psi")
         return psi_of_file(Path(self.psi).expanduser(), distribution, graph.names)
 
     def _processes(self, context: Context) -> int:

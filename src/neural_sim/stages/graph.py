@@ -154,6 +154,28 @@ class Graph:
         """The configured psi of all objects."""
         return self.experiment.imaging.distribution.psi(which, list(self.names))
 
+    @property
+    def target_psi(self) -> Psi | None:
+        """The target's psi; None where its images are photographs and no configured distribution says what they show:
+        uniform, the default, would then be nobody's statement."""
+        imaging = self.experiment.imaging
+        known = getattr(imaging.target, "renders", True) or imaging.distribution.states_target
+        return self.psi("target") if known else None
+
+    def stated_psi(self, which: Literal["initial", "target"], key: str) -> Psi:
+        """The initial psi or the target's, which ``key`` of the configuration asks for.
+
+        Raises:
+            ValueError: the target's is not known.
+        """
+        psi = self.psi("initial") if which == "initial" else self.target_psi
+        if psi is None:
+            raise ValueError(
+                f"{key}=target: no distribution of the target is known, because its images are photographs and no "
+                "parameter.*.target says what they show"
+            )
+        return psi
+
     @cached_property
     def warm_start(self) -> DetectorStage:
         """The detector that the psi loop begins with; with equal epochs, and unless scored detectors are fine-tuned, it
@@ -221,10 +243,10 @@ class Graph:
 
     def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
         """The scores that a run reports: of the initial distribution (``ns``), the learned one, and the target's own
-        (``matched``); where photographs train too, also without them (``synthetic_only``, of the learned distribution)
-        and on them alone (``real_only``)."""
-        psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.psi("target")}
-        rows = {called: self.scores(psi, called) for called, psi in psis.items()}
+        (``matched``) where that is known; where photographs train too, also without them (``synthetic_only``, of the
+        learned distribution) and on them alone (``real_only``)."""
+        psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.target_psi}
+        rows = {called: self.scores(psi, called) for called, psi in psis.items() if psi is not None}
         if self.experiment.training.real.used:
             rows["synthetic_only"] = ScoresStage(self.synthetic(learned.last, "learned"), self.targets)
             rows["real_only"] = ScoresStage(self._on_photographs(None), self.targets)

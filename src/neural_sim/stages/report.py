@@ -101,7 +101,7 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
     """What there is to report: a run without evaluation has no AP. ``symmetric``: with the bins that look the same."""
     x, graph, results = context.experiment, context.graph, context.results
     distribution, learned = x.imaging.distribution, results(graph.learned)
-    psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.psi("target")}
+    psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.target_psi}
     angles = [factor.name for factor in distribution.binned if factor.coordinate in ("phi", "rho")]
     fields = {stage.views.object: results(stage).history for stage in graph.fields}
     return RunResults(
@@ -110,7 +110,9 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
         seed=x.run.seed,
         names=list(graph.names),
         biased=distribution.biased,
-        probabilities={which: distribution.probabilities(value) for which, value in psi.items()},
+        probabilities={
+            which: distribution.probabilities(value) for which, value in psi.items() if value is not None
+        },
         records=[dataclasses.asdict(record) for record in learned.records],
         ap={called: dataclasses.asdict(part.ap) for called, part in scores.items()},
         validation_ap=context.returned,

@@ -81,9 +81,9 @@ class SamplesGalleryStep:
         return test.select(rows[chosen])
 
     def _distance(self, graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
-        """Total variation to the target by factor; None where photographs are the target, whose p nobody knows."""
-        imaging = graph.experiment.imaging
-        if not getattr(imaging.target, "renders", True):
+        """Total variation to the target by factor; None where the target's p is not known."""
+        imaging, target = graph.experiment.imaging, graph.target_psi
+        if target is None:
             return None
-        found, wanted = (imaging.distribution.probabilities(p) for p in (psi, graph.psi("target")))
+        found, wanted = (imaging.distribution.probabilities(p) for p in (psi, target))
         return {name: float(total_variation(found[name][label], wanted[name][label])) for name in wanted}

@@ -61,7 +61,9 @@ class ViewerStep:
     def shots(self, context: Context) -> Shots:
         """The scene, the known distributions, and the detector trained on ``psi``."""
         graph, distribution = context.graph, context.experiment.imaging.distribution
-        known = {which: graph.psi(which) for which in ("initial", "target")}
+        known = {"initial": graph.psi("initial")}
+        if self.psi == "target" or graph.target_psi is not None:
+            known["target"] = graph.stated_psi("target", "viewer.psi")
         if self.psi not in known:
             file = Path(self.psi).expanduser()
             learned = self.psi == "learned"

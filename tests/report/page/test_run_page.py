@@ -103,6 +103,19 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
     assert "Lost (" not in page and 'title="pose: p = 0.01; expected fall of the outer loss 0.100; ' in page
 
 
+def test_a_page_says_that_photographs_have_an_unknown_distribution(results, shown, tmp_path):
+    known = {which: p for which, p in results.probabilities.items() if which != "target"}
+    ap = {which: scores for which, scores in results.ap.items() if which != "matched"}
+    scored = {which: found for which, found in shown.detections.items() if which != "matched"}
+    photographs = dataclasses.replace(results, probabilities=known, ap=ap)
+    page = write_run_page(
+        photographs, dataclasses.replace(shown, detections=scored), COMMANDS, tmp_path
+    ).read_text()
+    text = re.sub(r'src="[^"]*"|<style>.*?</style>', "", page, flags=re.DOTALL)
+    assert "It worked" in text and "The target's is not known: its images are photographs." in text
+    assert not re.search("matched|distance|the target's own", text)
+
+
 def test_a_classification_s_page_speaks_of_accuracy(results, shown, tmp_path):
     """An image is right by its class, wherever its box."""
     moved = {}

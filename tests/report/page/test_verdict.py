@@ -40,6 +40,13 @@ def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
     assert text.startswith("It worked") and "on mug" in text and f"{better.closed:.0%}" in text
 
 
+def test_a_gain_without_a_known_target_has_no_room():
+    found = {"ns": detections(8), "learned": detections(24)}
+    alone, beside = Resampled.of(found, TEST, 2).gain(["mug"], [0], False), gain(8, 24, 32)
+    assert alone.gain == beside.gain and alone.room is None and alone.closed is None
+    assert verdict(alone).endswith(f"to {100 * alone.ap['learned']:.1f}.")
+
+
 def test_a_class_without_boxes_is_in_no_mean():
     found = {"ns": detections(8), "learned": detections(24), "matched": detections(32)}
     both = Resampled.of(found, TEST, 2)

@@ -30,14 +30,16 @@ def bin_colours(factor: str, bins: int) -> list[str]:
 
 def psi_chart(
     history: Sequence[Sequence[float]],
-    target: Sequence[float],
+    target: Sequence[float] | None,
     groups: Sequence[Sequence[int]],
     factor: str,
 ) -> str:
     """One object's probabilities over the iterations, the target's beside them; arguments as in
     :func:`figures.psi_panel`."""
     figure = Figure(figsize=(3.4, 2.1), layout="constrained")
-    figures.psi_panel(figure.add_subplot(), history, target, groups, figures.bin_colours(factor, len(target)))
+    figures.psi_panel(
+        figure.add_subplot(), history, target, groups, figures.bin_colours(factor, len(history[0]))
+    )
     return data_uri(figure)
 
 

@@ -31,7 +31,7 @@ EXAMPLES = 8
 class Shown:
     """Images for the page. ``before`` and ``after`` are training images from the initial and the learned distribution,
     drawn with the same random numbers, an equal number of every object in the order of their labels. ``detections``
-    are those of ns, learned and matched on ``test``; empty without scores."""
+    are those of ns, learned and, where it is known, matched on ``test``; empty without scores."""
 
     before: LabelledImages
     after: LabelledImages
@@ -41,12 +41,12 @@ class Shown:
 
 @dataclass(frozen=True)
 class PsiChart:
-    """One object's distribution of a factor: the chart, and the distances from the target."""
+    """One object's distribution of a factor: the chart, and the distances of ``initial`` and ``learned`` from the
+    target, empty where that is not known."""
 
     name: str
     chart: str
-    initial: float
-    learned: float
+    distances: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,11 @@ def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, G
 
 
 def _same(results: RunResults, label: int) -> bool:
-    """Whether an object's initial distribution is its target's."""
+    """Whether an object's initial distribution is known to be its target's."""
     p = results.probabilities
-    return all(torch.equal(p["initial"][f][label], p["target"][f][label]) for f in results.factors)
+    return "target" in p and all(
+        torch.equal(p["initial"][f][label], p["target"][f][label]) for f in results.factors
+    )
 
 
 def _psi(results: RunResults) -> list[FactorCharts]:
@@ -138,15 +140,17 @@ def _psi(results: RunResults) -> list[FactorCharts]:
     order = sorted(range(len(results.names)), key=lambda label: results.names[label] not in results.biased)
     drawn = []
     for factor in results.factors if results.records else ():
-        learned, target = (results.probabilities[which][factor] for which in ("learned", "target"))
+        learned, target = results.probabilities["learned"][factor], results.probabilities.get("target")
         panels = []
         for label in order:
             name = results.names[label]
             history = [*(record["probabilities"][factor][label] for record in results.records)]
             history.append(learned[label].tolist())
-            chart = charts.psi_chart(history, target[label].tolist(), results.groups(name, factor), factor)
-            panels.append(PsiChart(name, chart, **distances[name][factor]))
-        drawn.append(FactorCharts(factor, tuple(charts.bin_colours(factor, target.shape[-1])), tuple(panels)))
+            wanted = None if target is None else target[factor][label].tolist()
+            chart = charts.psi_chart(history, wanted, results.groups(name, factor), factor)
+            panels.append(PsiChart(name, chart, distances[name].get(factor, {})))
+        colours = charts.bin_colours(factor, learned.shape[-1])
+        drawn.append(FactorCharts(factor, tuple(colours), tuple(panels)))
     return drawn
 
 

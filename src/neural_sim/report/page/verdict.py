@@ -27,7 +27,7 @@ class Gain:
     """AP (or accuracy) of a set of classes, as fractions.
 
     ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % bootstrap intervals over test images.
-    ``room`` is None where matched and ns are one distribution.
+    ``room`` is None where matched and ns are one distribution, and where matched is not known.
     """
 
     names: tuple[str, ...]
@@ -53,11 +53,12 @@ class Gain:
 @dataclass(frozen=True)
 class Resampled:
     """AP (or accuracy) of every class by the detections of ns, learned and matched on one test set, and under resampled
-    images.
+    images; without matched where the target's distribution is not known.
 
-    ``point`` is [3, classes], ``spread`` [draws, 3, classes]; nan for a class without a box.
+    ``point`` is [which, classes], ``spread`` [draws, which, classes]; nan for a class without a box.
     """
 
+    which: tuple[str, ...]
     point: Float[np.ndarray, "which classes"]
     spread: Float[np.ndarray, "draws which classes"]
 
@@ -70,8 +71,9 @@ class Resampled:
         score: Score = "AP",
     ) -> Resampled:
         """All classes under the same resampled images, so that differences between any of them are paired."""
+        known = tuple(which for which in WHICH if which in detections)
         matches = [
-            [match(detections[which], test, label, score) for label in range(classes)] for which in WHICH
+            [match(detections[which], test, label, score) for label in range(classes)] for which in known
         ]
         random, count = np.random.default_rng(0), len(test)
 
@@ -79,7 +81,9 @@ class Resampled:
             return [[class_score(m, weights) for m in row] for row in matches]
 
         weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
-        return Resampled(np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights]))
+        return Resampled(
+            known, np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights])
+        )
 
     @property
     def present(self) -> list[int]:
@@ -90,9 +94,9 @@ class Resampled:
         """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
         the target's distribution is the initial one."""
         point, spread = (_mean(part[..., list(labels)]) for part in (self.point, self.spread))
-        gain, room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
-        ap = dict(zip(WHICH, point.tolist(), strict=True))
-        return Gain(tuple(names), ap, gain, None if same_target else room)
+        gain, *room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
+        ap = dict(zip(self.which, point.tolist(), strict=True))
+        return Gain(tuple(names), ap, gain, None if same_target or not room else room[0])
 
 
 def _mean(ap: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
