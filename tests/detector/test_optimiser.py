@@ -80,7 +80,7 @@ def test_a_floor_under_adamws_denominator_bounds_its_pull_back(generator):
     second[:3] = first[:3] = gradient[:3] = 0.0
     plain = AdamW(0.02)
     usual = (end / (1 - slow**120)).sqrt()
-    rule = plain.floored((theta, first, end), 120, 1e-2)
+    rule = plain.floored((theta, first, end), 120, 1e-2, [1] * 6)
     torch.testing.assert_close(rule.floor, 1e-2 * (usual + plain.eps))
     still = torch.zeros_like(theta)
     (_, by_first, by_second), along = pulled_back(
@@ -96,5 +96,15 @@ def test_a_floor_under_adamws_denominator_bounds_its_pull_back(generator):
 
 def test_rules_without_a_floor_are_themselves():
     state = (torch.ones(2), torch.ones(2), torch.ones(2))
-    assert AdamW().floored(state, 3, 0.0) == AdamW()
-    assert SGD(0.1).floored(state[:2], 3, 0.5) == SGD(0.1)
+    assert AdamW().floored(state, 3, 0.0, [2]) == AdamW()
+    assert SGD(0.1).floored(state[:2], 3, 0.5, [2]) == SGD(0.1)
+
+
+def test_an_entry_without_usual_gradients_takes_the_level_of_its_tensor():
+    """The root mean square of the tensor's denominators, where the entry's own is smaller."""
+    end = torch.tensor([1e-14, 9.0, 16.0, 4.0], dtype=DOUBLE).square()
+    state = (torch.zeros_like(end), torch.zeros_like(end), end * (1 - 0.999**50))
+    rule = AdamW().floored(state, 50, 0.3, [3, 1])
+    level = ((81 + 256) / 3) ** 0.5
+    wanted = 0.3 * torch.tensor([level, level, 16.0, 4.0], dtype=DOUBLE)
+    torch.testing.assert_close(rule.floor, wanted, rtol=1e-7, atol=0.0)

@@ -148,7 +148,8 @@ def last_state(made):
 
 def test_with_a_floor_it_is_the_derivative_of_a_training_with_that_floor(micro, generator):
     """A training whose denominators are at least those that a plain one ended with."""
-    rule = RULES[-1].floored(last_state(micro.trained(RULES[-1], micro.examples)), len(SHAPE), 1.0)
+    sizes = [part.numel() for part in micro.like.values()]
+    rule = RULES[-1].floored(last_state(micro.trained(RULES[-1], micro.examples)), len(SHAPE), 1.0, sizes)
     direction = torch.randn(8, generator=generator, dtype=DOUBLE)
     found = float(micro.accumulated(rule).images @ direction)
 
@@ -180,7 +181,7 @@ def test_with_a_floor_it_has_the_size_of_a_finite_change_where_the_first_gradien
     finite = float(trained(0.15).end - trained(0.0).end) / 0.15
     assert 1 / 3 < derivative(0.3) / finite < 3.0
     # The loss is linear, so that a floor changes no gradient: it is the derivative of a training with that floor.
-    floored = rule.floored(last_state(trained(0.0)), len(rows), 0.3)
+    floored = rule.floored(last_state(trained(0.0)), len(rows), 0.3, [1])
     smooth = extrapolated(lambda weight: float(trained(weight, floored).end), 1e-4)
     assert derivative(0.3) == pytest.approx(smooth, rel=1e-6)
     assert derivative(0.0) < 1e6 * finite < 0.0

@@ -85,3 +85,29 @@ def test_what_scatters_between_trainings_is_no_evidence():
     for _ in range(2):
         average = average.joined(centred(0.3 * normal(generator, 2000, 8)), variance)
     assert float((average.p_values <= 0.05).double().mean()) < 0.1
+
+
+def test_an_object_whose_derivatives_scatter_wildly_does_not_hide_the_others():
+    """Each of six objects has a derivative three times its noise, and one of them once one of a thousand times that."""
+    generator = torch.Generator().manual_seed(0)
+    truth = centred(3.0 * normal(generator, 6, 8))
+    variance = torch.full_like(truth, 7 / 8)
+    average = Average.zeros(truth)
+    for training in range(2):
+        size, noise = torch.ones(6, 1, dtype=DOUBLE), centred(normal(generator, 6, 8))
+        size[0] = 1000.0 if training else 1.0
+        average = average.joined(size * (truth + noise), size.square() * variance)
+    assert float(average.p_values[1:].max()) < 1e-3
+    assert float(average.between[1:].max()) < 3.0 < float(average.between[0])
+
+
+def test_objects_with_small_derivatives_are_held_to_their_own_scatter():
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([0.01, 1.0], dtype=DOUBLE).repeat(200)[:, None]
+    average = Average.zeros(size.expand(400, 8))
+    for _ in range(2):
+        noise = size * centred(2.0 * normal(generator, 400, 8))
+        average = average.joined(noise, (size**2 * 7 / 8).expand(400, 8))
+    # Noise has the variance 4, of which images explain 1.
+    small, large = average.between[::2].mean(), average.between[1::2].mean()
+    assert float(large) == pytest.approx(3.0, rel=0.15) and float(small) == pytest.approx(3e-4, rel=0.15)

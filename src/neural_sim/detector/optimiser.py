@@ -24,9 +24,10 @@ class Rule(Protocol):
 
     def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State: ...
 
-    def floored(self, end: State, done: int, fraction: float) -> Self:
+    def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> Self:
         """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``; itself for a
-        ``fraction`` of 0, or a rule that divides by nothing."""
+        ``fraction`` of 0, or a rule that divides by nothing. ``sizes`` are the numbers of entries of theta's tensors,
+        in their order."""
         ...
 
 
@@ -56,19 +57,23 @@ class AdamW:
         theta = (1.0 - rate * self.weight_decay) * theta - rate * corrected / denominator
         return theta, first, second
 
-    def floored(self, end: State, done: int, fraction: float) -> AdamW:
-        """With a least denominator of ``fraction`` times that of the last step.
+    def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> AdamW:
+        """With a least denominator of ``fraction`` times the larger of the entry's in the last step and the root mean
+        square of those of its tensor.
 
         Where an entry's gradients have been tiny so far (a level of the pyramid before the first batch with an object
         of its size), a step is the moments' ratio, whatever their size, and its derivative is about 1 / |g|: thousands
         of times that of other entries. A finite change of the batch's images brings a gradient of the usual size, moves
         the moments with it, and changes the step by no more than the learning rate. The last step's second moment
-        averages the whole training, and is that usual size.
+        averages the whole training, and is that usual size. Where the entry's gradients stayed tiny to the end (a
+        class's weight on a channel that is dark in all images of the present distribution), the other entries of its
+        tensor say what is usual.
         """
         if fraction == 0.0:
             return self
         usual = _root(end[2] / (1.0 - self.betas[1] ** done)) + self.eps
-        return replace(self, floor=fraction * usual)
+        levels = [part.square().mean().sqrt().expand(len(part)) for part in usual.split(list(sizes))]
+        return replace(self, floor=fraction * torch.maximum(usual, torch.cat(levels)))
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ class SGD:
         buffer = self.momentum * buffer + gradient + self.weight_decay * theta
         return theta - rate * buffer, buffer
 
-    def floored(self, end: State, done: int, fraction: float) -> SGD:
+    def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> SGD:
         return self
 
 

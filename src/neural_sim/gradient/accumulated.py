@@ -102,8 +102,8 @@ class Unrolled:
         score_every: mean length of a block of steps; one step of each block, drawn at random, scores probes with the
             block's weight, see :func:`step_weights`.
         chunk_size: probes whose losses are computed at a time.
-        floor: least denominator of an entry of theta in AdamW's steps, as a fraction of the last step's, see
-            :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
+        floor: least denominator of an entry of theta in AdamW's steps, as a fraction of what is usual for it and for
+            its tensor, see :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.

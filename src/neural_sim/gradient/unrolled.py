@@ -153,7 +153,8 @@ def reversed_steps(
             state, gradient = replayed.pop()
             rate = trajectory.rates[step]
             if step + 1 == len(trajectory):
-                rule = rule.floored(rule.step(state, gradient, rate, step), len(trajectory), floor)
+                sizes = [part.numel() for part in like.values()]
+                rule = rule.floored(rule.step(state, gradient, rate, step), len(trajectory), floor, sizes)
             cotangents, along = pulled_back(rule, state, gradient, rate, step, cotangents)
             rows = trajectory.rows[step]
             if one_sided:

@@ -51,14 +51,29 @@ class Average:
     @property
     def between(self) -> Float[Tensor, "objects"]:
         """Variance of a component between trainings, estimated from an object's derivatives at one psi: their scatter
-        beyond that of their images. The mean over all objects counts as one more pair of derivatives of each. 0 where
-        no object has two derivatives at one psi."""
-        known = self.variances.isfinite().all(2)
-        excess, freedom = (
-            torch.zeros_like(self.directions[:1].sum((0, 2))),
-            torch.zeros_like(self.moves[:1].sum(0)),
-        )
+        beyond that of their images. What the median object's ratio of the two would give counts as one more pair of
+        derivatives of each: a ratio, because objects' derivatives differ in size, and the median, so that one object
+        whose derivatives scatter wildly does not hide those of others. 0 where no object has two derivatives at one
+        psi."""
+        excess, freedom = self._excess
+        if not bool((freedom > 0).any()):
+            return torch.zeros_like(excess)
+        own = excess / freedom.clamp_min(1.0)
+        known = self.variances.isfinite()
+        images = torch.where(known, self.variances, 0.0).sum((0, 2)) / known.sum((0, 2)).clamp_min(1)
+        noisy = images > 0.0
+        ratios = (own / images)[noisy & (freedom > 0)]
+        usual = torch.where(noisy, ratios.quantile(0.5).clamp_min(0.0) * images, own) if len(ratios) else own
         pair = self.directions.shape[2] - 1
+        return ((excess + pair * usual) / (freedom + pair)).clamp_min(0.0)
+
+    @property
+    def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
+        """The squares of derivatives' differences from their mean at one psi, beyond what their images explain, and the
+        degrees of freedom."""
+        known = self.variances.isfinite().all(2)
+        excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
+        freedom = torch.zeros_like(excess)
         for moves in self.moves.unique():
             here = (known & (self.moves == moves)).to(self.directions)[..., None]
             count = here.sum(0)
@@ -67,11 +82,8 @@ class Average:
             images = torch.where(here > 0.0, self.variances, 0.0).sum((0, 2))
             several = (count[:, 0] - 1.0).clamp_min(0.0)
             excess = excess + scatter - several / count[:, 0].clamp_min(1.0) * images
-            freedom = freedom + several * pair
-        if not bool((freedom > 0).any()):
-            return torch.zeros_like(excess)
-        mean = (excess.sum() / freedom.sum()).clamp_min(0.0)
-        return ((excess + pair * mean) / (freedom + pair)).clamp_min(0.0)
+            freedom = freedom + several * (self.directions.shape[2] - 1)
+        return excess, freedom
 
     @property
     def _weights(self) -> Float[Tensor, "n objects 1"]:
