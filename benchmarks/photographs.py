@@ -92,8 +92,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="a new folder")
     options = parser.parse_args()
     options.root, options.out = options.root.resolve(), options.out.resolve()
-    if not (options.out / "telephone").exists():
-        make_captures(options)
+    make_captures(options)
     annotations = make_target(options, options.names)
     for kind, rounds in (("exact", 0), ("telephone", 0), ("telephone", 6)):
         objects = of_photographs(options, kind, rounds)
@@ -102,16 +101,16 @@ def main() -> None:
         results = json.loads((folder / "results.json").read_text())
         for what, ap in results["ap"].items():
             printed(f"{kind}, {rounds} rounds of correction, {what}", ap["per_class"])
-    exported = run(
+    run(
         options, options.out / "exported", *objects, "stages=[export]", f"export.psi={folder}", "export.count=200",
         f"export.folder={options.out / 'export'}",
     )  # fmt: skip
-    print(f"exported: {exported}")
     predicted = run(
         options, options.out / "predicted", "stages=[predict]", f"predict.model={folder}",
         f"predict.images={annotations.parent / 'images'}", f"predict.annotations={annotations}",
     )  # fmt: skip
-    print((predicted / "scores.json").read_text())
+    scores = json.loads((predicted / "scores.json").read_text())
+    printed(f"predicted, all {scores['images']} images of the target", scores["per_class"])
 
 
 if __name__ == "__main__":

@@ -133,11 +133,16 @@ class Graph:
     @cached_property
     def targets(self) -> TargetSetsStage:
         imaging = self.experiment.imaging
-        rendered = self.fields if getattr(imaging.target, "renders", True) else ()
+        rendered = self.fields if self.renders_target else ()
         return TargetSetsStage(
             imaging.target, self.objects.digests, imaging.distribution, imaging.synthesis, self.camera,
             imaging.views.rig, self.experiment.run.seed, self._seen_as(*rendered), self.objects,
         )  # fmt: skip
+
+    @property
+    def renders_target(self) -> bool:
+        """Whether the target's images are rendered; otherwise they are photographs."""
+        return getattr(self.experiment.imaging.target, "renders", True)
 
     def symmetry(self, name: str, angle: str) -> SymmetryStage:
         """Of an object's bins of an angle."""
@@ -158,8 +163,7 @@ class Graph:
     def target_psi(self) -> Psi | None:
         """The target's psi; None where its images are photographs and no configured distribution says what they show:
         uniform, the default, would then be nobody's statement."""
-        imaging = self.experiment.imaging
-        known = getattr(imaging.target, "renders", True) or imaging.distribution.states_target
+        known = self.renders_target or self.experiment.imaging.distribution.states_target
         return self.psi("target") if known else None
 
     def stated_psi(self, which: Literal["initial", "target"], key: str) -> Psi:
