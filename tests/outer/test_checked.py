@@ -176,6 +176,21 @@ def test_an_object_whose_radius_is_too_small_rests():
     assert torch.equal(tried, steps.accepted)
 
 
+@pytest.mark.parametrize(("part", "moves"), [(0.1, False), (0.3, True)])
+def test_an_object_of_little_gain_waits_until_the_large_steps_are_done(part, moves):
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), waits_below=0.2)
+    gradient = gradients([1, 2], steps.accepted) * torch.tensor([[1.0], [part]], dtype=torch.float64)
+    small = torch.full_like(gradient, 1e-6)
+    tried, p_values = proposed(steps, gradient, small)
+    assert p_values["b"]["pose"] < 1e-6
+    assert not torch.equal(tried[0], steps.accepted[0])
+    assert torch.equal(tried[1], steps.accepted[1]) != moves
+    assert ("b" in steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))) == moves
+    # Now that the derivative of the first is zero, that of the second counts.
+    after, _ = proposed(steps, gradient * torch.tensor([[-1.0], [1.0]], dtype=torch.float64), small)
+    assert not torch.equal(after[1], tried[1])
+
+
 def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     bad = torch.full((2, 4), math.nan, dtype=torch.float64)
@@ -197,6 +212,7 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
         {"shrink": 1.0},
         {"momentum": -0.1},
         {"max_step": 0.0},
+        {"waits_below": 1.1},
     ],
 )
 def test_settings_out_of_range_are_refused(bad):

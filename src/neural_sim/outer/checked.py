@@ -121,7 +121,8 @@ class CheckedSteps:
             self.trial = self.accepted
             return self.trial
         self._averages = dict(self._joined)
-        psi, moved = self.distribution.split(self.accepted), {}
+        psi = self.distribution.split(self.accepted)
+        moved, gains = {}, {}
         for factor in self.distribution.factors:
             name = factor.name
             taken = psi[name].new_tensor(fractions(certificate, self.names, name, self.shrink))
@@ -130,9 +131,14 @@ class CheckedSteps:
             direction = self._averages[name].value
             moved[name] = within(factor, psi[name], direction, radius, self.settings.max_step)
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
-            self._expected = self._expected + (direction * change).sum(1)
+            gains[name] = (direction * change).sum(1)
+        due = self.settings.waits_below * torch.stack([*gains.values()]).max()
+        for name, gain in gains.items():
+            moves = (gain >= due) & (moved[name] != psi[name]).any(1)
+            moved[name] = torch.where(moves[:, None], moved[name], psi[name])
+            self._moved[name] = moves
+            self._expected = self._expected + torch.where(moves, gain, 0.0)
         self.trial = self.distribution.join(moved)
-        self._moved = {name: (moved[name] != psi[name]).any(1) for name in moved}
         return self.trial
 
 

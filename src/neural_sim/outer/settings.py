@@ -74,6 +74,9 @@ class Checks:
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
         errors: standard errors by which an object's score must rise for its step to be accepted.
+        waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
+            largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
+            present mistakes in it, and another once they have moved.
         grow, shrink: factors of the radius after an accepted and a rejected step.
         momentum: factor of a derivative's weight in the average for every later move of its object.
         max_step: largest change of a logit (or a weight) in one step.
@@ -88,6 +91,7 @@ class Checks:
     largest: float = 0.7
     smallest: float = 0.05
     errors: float = 1.0
+    waits_below: float = 0.2
     grow: float = 1.3
     shrink: float = 0.4
     momentum: float = 0.5
@@ -101,6 +105,8 @@ class Checks:
             )
         at_least(where, 1, grow=self.grow, trainings=self.trainings, folds=self.folds)
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
+        if not 0.0 <= self.waits_below <= 1.0:
+            raise ValueError(f"{where}: want waits_below in [0, 1], got {self.waits_below}")
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
             raise ValueError(
                 f"{where}: want shrink in (0, 1), momentum in [0, 1] and max_step above 0, got {self.shrink}, "
