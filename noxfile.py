@@ -68,5 +68,5 @@ def bench(session: nox.Session) -> None:
     _install(session)
     if not session.posargs:
         session.run("python", "-m", "src.main", "+experiment=work_precision")
-    for name in session.posargs or ["field", "render", "outer", "left_out"]:
+    for name in session.posargs or ["field", "render", "outer"]:
         session.run("python", f"benchmarks/{name}.py")
