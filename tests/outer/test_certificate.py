@@ -195,13 +195,13 @@ def test_steps_that_were_not_trusted_are_counted():
         judge(result(), 0.9),
         judge(result(stationarity=9.0), 0.1),
         judge(result(residual=0.5, p_values=(0.3, 0.01))),
-        judge(result(p_values=(0.3, 0.01)), on_untrusted="skip"),
+        judge(result(p_values=(0.3, 0.01)), on_untrusted="skip").waiting({("a", "pose"), ("b", "pose")}),
     ]
     records = [
         {"certificate": dataclasses.asdict(certificate), "verdicts": {}} for certificate in certificates
     ]
     assert untrusted(records) == {
-        "steps": 8, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
+        "steps": 8, "waited": 1, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
         "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1},
         "judged": 0, "rejected": 0, "cosines": [0.9, 0.1],
     }  # fmt: skip

@@ -185,7 +185,9 @@ def test_an_object_of_little_gain_waits_until_the_large_steps_are_done(part, mov
     assert p_values["b"]["pose"] < 1e-6
     assert not torch.equal(tried[0], steps.accepted[0])
     assert torch.equal(tried[1], steps.accepted[1]) != moves
+    waiting = steps.waiting
     assert ("b" in steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))) == moves
+    assert (("b", "pose") in waiting) != moves
     # Now that the derivative of the first is zero, that of the second counts.
     after, _ = proposed(steps, gradient * torch.tensor([[-1.0], [1.0]], dtype=torch.float64), small)
     assert not torch.equal(after[1], tried[1])

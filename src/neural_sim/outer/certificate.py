@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.settings import OnUntrusted, Trust
 from neural_sim.solver.solution import Status
 
-Action = Literal["kept", "shrunk", "skipped", "stopped"]
+Action = Literal["kept", "shrunk", "waited", "skipped", "stopped"]
 _ACTIONS: Mapping[OnUntrusted, Action] = {
     "shrink": "shrunk", "keep": "kept", "skip": "skipped", "stop": "stopped"
 }  # fmt: skip
 
 
 Actions = dict[str, dict[str, Action]]
-"""What happens to the steps, by object and factor."""
+"""What happens to the steps, by object and factor. A trusted step waits where a checked loop does not take it yet."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Certificate:
     ``cosine`` is with the reference of ``outer.certify``, nan where that was not measured. ``doubts`` names the
     conditions on the whole hypergradient that fail. ``p_values``, by object and factor, are those of the null that a
     derivative is zero: this iteration's, or, for checked steps, of the average over iterations that steps follow.
-    ``actions`` has the learned objects; a step is kept if no condition fails and its derivative is significant.
+    ``actions`` has the learned objects; a step is kept if no condition fails and its derivative is significant. What
+    waited is recorded by :meth:`waiting`.
     """
 
     stationarity: float
@@ -65,6 +66,17 @@ class Certificate:
     def void(self) -> bool:
         """Whether this iteration's derivative is discarded, also from the momentum."""
         return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
+
+    def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
+        """This certificate with the trusted ones among ``steps``, of an object and a factor, as waited."""
+        actions: Actions = {
+            name: {
+                factor: "waited" if action == "kept" and (name, factor) in steps else action
+                for factor, action in by_factor.items()
+            }
+            for name, by_factor in self.actions.items()
+        }
+        return replace(self, actions=actions)
 
     @property
     def _taken(self) -> set[Action]:
@@ -191,9 +203,9 @@ def _adjoint(c: Certificate) -> list[str]:
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Counts over recorded iterations: steps (one for each object and factor), untrusted ones, what happened to these
-    and why (failed conditions, or ``signal``: no significance), objects' steps that were judged, and those that
-    were rejected; and every measured cosine."""
+    """Counts over recorded iterations: steps (one for each object and factor), trusted ones that waited, untrusted
+    ones, what happened to these and why (failed conditions, or ``signal``: no significance), objects' steps that were
+    judged, and those that were rejected; and every measured cosine."""
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
         (action, certificate["doubts"] or ["signal"])
@@ -201,10 +213,11 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for by_factor in certificate["actions"].values()
         for action in by_factor.values()
     ]
-    doubted = [(action, doubts) for action, doubts in actions if action != "kept"]
+    doubted = [(action, doubts) for action, doubts in actions if action not in ("kept", "waited")]
     accepted = [verdict["accepted"] for record in records for verdict in record["verdicts"].values()]
     return {
         "steps": len(actions),
+        "waited": sum(action == "waited" for action, _ in actions),
         "untrusted": len(doubted),
         "actions": dict(Counter(action for action, _ in doubted)),
         "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),

@@ -64,6 +64,16 @@ class CheckedSteps:
         return bool(self._pending.any())
 
     @property
+    def waiting(self) -> set[tuple[str, str]]:
+        """Their radius is too small, or their gain beside the largest one."""
+        return {
+            (name, factor)
+            for factor, moved in self._moved.items()
+            for name, moves in zip(self.names, moved.tolist(), strict=True)
+            if not moves
+        }
+
+    @property
     def _pending(self) -> Bool[Tensor, "objects"]:
         """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
         return torch.stack([*self._moved.values()]).any(0)

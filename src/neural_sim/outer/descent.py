@@ -76,11 +76,13 @@ class GradientLoop(OuterLoop, ABC):
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
         norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
         products, by_class, images = _products(result), self._before.sum(1), rendered.images
+        after = self.steps.next(certificate)
+        certificate = certificate.waiting(self.steps.waiting)
         self.record(
             self.psi, images, training_loss, seconds, certificate, norms, products, by_class, verdicts
         )
         self._stopped = certificate.stopped
-        self._go_to(self.steps.next(certificate))
+        self._go_to(after)
 
     def _differentiated(
         self, seconds: dict[str, float], whole: bool

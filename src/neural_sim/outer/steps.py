@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -54,6 +54,11 @@ class Steps(Protocol):
         ...
 
     @property
+    def waiting(self) -> Collection[tuple[str, str]]:
+        """Objects and factors that the last step did not move, whatever the certificate allowed."""
+        ...
+
+    @property
     def pending(self) -> bool:
         """Whether the last step waits for :meth:`judge`."""
         ...
@@ -82,6 +87,8 @@ class FreeSteps:
         self._states = {name: UpdateState.zeros(part) for name, part in distribution.split(psi).items()}
         self._gradient = self._error = torch.zeros_like(psi)
         self._steps, self.pending = 0, False
+
+    waiting: Collection[tuple[str, str]] = ()
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]

@@ -182,6 +182,8 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
     for part in ("actions", "doubts"):
         if trust[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in trust[part].items())
+    if trust["waited"]:
+        text += f"; of the others, {trust['waited']} waited until larger steps were done"
     if trust["judged"]:
         text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
     if trust["cosines"]:

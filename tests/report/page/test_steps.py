@@ -32,8 +32,10 @@ def test_a_step_is_judged_by_the_next_record():
 
 
 def test_free_steps_are_taken_without_a_verdict_and_doubts_are_named():
-    (row,) = step_rows([record({"a": "kept"}), record({"a": "stopped"}, doubts=["solver"])], ["a"])
-    assert [cell.kind for cell in row.cells] == ["taken", "stopped"] and "doubts: solver" in row.cells[1].note
+    records = [record({"a": "kept"}), record({"a": "waited"}), record({"a": "stopped"}, doubts=["solver"])]
+    (row,) = step_rows(records, ["a"])
+    assert [cell.kind for cell in row.cells] == ["taken", "waited", "stopped"]
+    assert "doubts: solver" in row.cells[2].note
 
 
 def test_objects_that_are_not_learned_and_methods_without_a_derivative_have_no_steps():

@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Kind = Literal["accepted", "rejected", "taken", "shrunk", "skipped", "stopped", "none"]
+Kind = Literal["accepted", "rejected", "taken", "shrunk", "waited", "skipped", "stopped", "none"]
 SYMBOLS: Mapping[Kind, str] = {
-    "accepted": "✓", "rejected": "✗", "taken": "→", "shrunk": "⇢", "skipped": "·", "stopped": "■", "none": ""
+    "accepted": "✓", "rejected": "✗", "taken": "→", "shrunk": "⇢", "waited": "…", "skipped": "·", "stopped": "■",
+    "none": "",
 }  # fmt: skip
 _UNJUDGED: Mapping[str, Kind] = {
     "kept": "taken",
     "shrunk": "shrunk",
     "stopped": "stopped",
+    "waited": "waited",
     "skipped": "skipped",
 }
 """What a step is that nothing has judged, by the certificate's action; the first that any factor of it has."""
