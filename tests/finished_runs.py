@@ -47,7 +47,7 @@ def results(experiment, method, seed, gap="disjoint", initial=4, target=1, learn
     }
     return {
         "experiment": experiment, "gap": gap, "method": method, "seed": seed, "biased": ["can", "mug"],
-        "psi": {name: {"pose": p} for name in ("can", "mug")}, "curve": [{}],
+        "psi": {name: {"pose": p} for name in ("can", "mug")}, "curve": [{"images": 30, "seconds": 9.0}],
         "total_variation": {name: {"pose": away} for name in ("can", "mug")}, "symmetric_bins": {},
         "scoring": f"{gap} {target}", "configuration": f"{method} {gap} {target}", "test_set": f"images of {seed}",
         "config": config, "files": {"objects": {"can": "1" * 64, "mug": "2" * 64}},

@@ -39,6 +39,7 @@ def results(method, seed, ap, scoring="s", config=(), **changes):
         "experiment": "gap", "gap": "disjoint", "method": method, "seed": seed, "biased": ["mug"], "curve": curve,
         "psi": {"mug": {}}, "total_variation": {"mug": {"pose": {"initial": 0.8, "learned": 1.0 - ap}}},
         "scoring": scoring, "configuration": f"{method} {scoring}", "test_set": f"images of {seed}",
+        "iterations": [{"seconds": {"render": 1.0, "train": 2.0}}], "peak_memory_mb": 700.0,
         "config": {**CONFIG, **dict(config)}, "files": {"objects": {"mug": "1" * 64}},
         "code": {"scoring": "a" * 12, "method": "b" * 12}, **changes,
     }  # fmt: skip

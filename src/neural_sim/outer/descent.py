@@ -74,12 +74,11 @@ class GradientLoop(OuterLoop, ABC):
         factors = self.scene.distribution.names
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
-        norms = [float(result.psi_gradients[name].norm()) for name in self.scene.names]
         products, by_class, images = _products(result), self._before.sum(1), rendered.images
         after = self.steps.next(certificate)
         certificate = certificate.waiting(self.steps.waiting)
         self.record(
-            self.psi, images, training_loss, seconds, certificate, norms, products, by_class, verdicts
+            self.psi, images, training_loss, seconds, certificate, result, products, by_class, verdicts
         )
         self._stopped = certificate.stopped
         self._go_to(after)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neural_sim.devices import trainer_on
+from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.records import IterationRecord, LearnedPsi
@@ -59,7 +60,7 @@ class OuterLoop(pl.LightningModule):
         training_loss: float,
         seconds: dict[str, float],
         certificate: Certificate | None = None,
-        gradient_norms: list[float] | None = None,
+        gradient: Hypergradient | None = None,
         products: int = 0,
         scores: Tensor | None = None,
         verdicts: Mapping[str, Verdict] | None = None,
@@ -75,7 +76,8 @@ class OuterLoop(pl.LightningModule):
                 entropies={
                     name: (-torch.special.xlogy(p, p).sum(-1)).tolist() for name, p in p_by_factor.items()
                 },
-                gradient_norms=gradient_norms or [],
+                gradient_norms=self._lengths({} if gradient is None else gradient.psi_gradients),
+                gradient_errors=self._lengths({} if gradient is None else gradient.standard_errors),
                 validation_loss=self.inner.validation_loss(),
                 training_loss=training_loss,
                 certificate=certificate,
@@ -96,6 +98,10 @@ class OuterLoop(pl.LightningModule):
         else:
             logger.info(line(certificate, number, self.rounds, last.validation_loss) + _outcomes(last))
         return last
+
+    def _lengths(self, values: Mapping[str, Tensor]) -> list[float]:
+        """By object, in the order of the scene's."""
+        return [float(values[name].norm()) for name in self.scene.names] if values else []
 
 
 def learn_psi(

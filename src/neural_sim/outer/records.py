@@ -19,16 +19,19 @@ class IterationRecord:
     """One outer iteration.
 
     ``probabilities`` and ``entropies`` (nats), by factor and object, are of the distribution that the images were drawn
-    from, before the step. ``images`` counts labelled images, probes included, ``detector_steps`` optimiser steps and
-    ``products`` Hessian products. ``seconds`` are wall-clock times by phase, ``cpu_seconds`` the processor time over
-    all cores, which other processes on the machine disturb less. ``certificate`` is None for methods without a
-    hypergradient, and in an iteration that takes none. ``scores`` [classes] are those of the loop's objective, more is
-    better. ``verdicts`` are of the objects whose last step was accepted or rejected.
+    from, before the step. ``gradient_norms`` and ``gradient_errors`` are, by object, the length of dL_val/dpsi and that
+    of its standard errors; empty without a derivative. ``images`` counts labelled images, probes included,
+    ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase,
+    ``cpu_seconds`` the processor time over all cores, which other processes on the machine disturb less.
+    ``certificate`` is None for methods without a hypergradient, and in an iteration that takes none. ``scores``
+    [classes] are those of the loop's objective, more is better. ``verdicts`` are of the objects whose last step was
+    accepted or rejected.
     """
 
     probabilities: dict[str, list[list[float]]]
     entropies: dict[str, list[float]]
     gradient_norms: list[float]
+    gradient_errors: list[float]
     validation_loss: float
     training_loss: float
     certificate: Certificate | None

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 from neural_sim.detector.metrics import IN_FULL
 from neural_sim.report import figures, logged, tracking
+from neural_sim.report.costs import costs, costs_table
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
 from neural_sim.report.page.comparison_page import Section, write_comparison_page
@@ -93,10 +94,12 @@ class Compare:
             comparison = dataclasses.replace(comparison, setting=group.label)
             comparisons.append(comparison)
             parts.append(markdown(comparison, runs, group.heading))
-            documents.append(dataclasses.asdict(comparison) | _sources(group))
+            spent = costs(runs)
+            document = {"costs": {method: dataclasses.asdict(cost) for method, cost in spent.items()}}
+            documents.append(dataclasses.asdict(comparison) | document | _sources(group))
             drawn = curves(comparison, runs)
             figures.save(drawn, folder / "figures" / f"{_slug(comparison)}.png")
-            sections.append(Section(comparison, drawn, group.heading, runs[0].results["biased"]))
+            sections.append(Section(comparison, drawn, group.heading, runs[0].results["biased"], spent))
         text = "\n\n".join([*parts, *left_out_table(chosen.left_out)])
         left = [dataclasses.asdict(run) for run in chosen.left_out]
         (folder / "compare.json").write_text(
@@ -138,7 +141,7 @@ def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
 
 
 def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
-    """The table of one setting, its differences, and the distances of the learned distributions. ``heading`` is
+    """The table of one setting, its differences, the distances of the learned distributions, and costs. ``heading`` is
     how these runs differ from others of the setting."""
     c, count = comparison, len(comparison.seeds)
     unit = "seconds" if c.clock == "seconds" else "CPU seconds"
@@ -171,7 +174,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
               "labelled validation images are not counted. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
               "iterations linear in log seconds.", ""]  # fmt: skip
-    return "\n".join(lines + _distances(c, runs))
+    return "\n".join([*lines, *_distances(c, runs), "", costs_table(runs)])
 
 
 def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from neural_sim.configuration import conf_directory
 from neural_sim.report import figures
 from neural_sim.report.compare import left_out_table
+from neural_sim.report.costs import costs_table
 from neural_sim.report.layouts import LAYOUTS, Paper, Shown
 from neural_sim.report.selection import LeftOut
 from neural_sim.report.settings import Settings
@@ -138,7 +139,9 @@ class Experiments:
         if not found:
             return row, None, left_out
         table = self._tables.get(row.table) if row.table else None
-        return row, LAYOUTS[row.layout](found, table, settings.draws, settings.seed), left_out
+        shown = LAYOUTS[row.layout](found, table, settings.draws, settings.seed)
+        spent = costs_table([run for setting in found for run in setting.runs])
+        return row, replace(shown, text="\n\n".join(part for part in (shown.text, spent) if part)), left_out
 
     def _page(
         self, shown: Mapping[str, tuple[Row, Shown | None, list[LeftOut]]], budget: Mapping[str, Any]

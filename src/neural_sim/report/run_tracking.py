@@ -129,7 +129,10 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
         if certificate:
             p_values, actions = (certificate[key].get(name, {}) for key in ("p_values", "actions"))
             metrics |= {f"psi/{name}/{factor}/p_value": value for factor, value in p_values.items()}
-            metrics |= {f"psi/{name}/{factor}/trusted": float(a in ("kept", "waited")) for factor, a in actions.items()}
+            metrics |= {
+                f"psi/{name}/{factor}/trusted": float(a in ("kept", "waited"))
+                for factor, a in actions.items()
+            }
             metrics[f"psi/{name}/gradient_norm"] = record["gradient_norms"][i]
         if record["scores"]:
             metrics[f"psi/{name}/score"] = record["scores"][i]

@@ -157,7 +157,7 @@ def area_under(
 def ap_at(seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], budget: float) -> float:
     """AP at a budget of seconds: linear in log seconds between scored points, the start's until the first of them."""
     begun = seconds > 0.0
-    if not begun.any() or budget <= seconds[begun][0]:
+    if not begun.any() or budget < seconds[begun][0]:
         return float(ap[0])
     return float(np.interp(math.log(budget), np.log(seconds[begun]), ap[begun]))
 

@@ -5,6 +5,7 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
+from neural_sim.report.costs import HEAD, NOTE, Costs
 from neural_sim.report.page.comparison_page import Section, verdict, write_comparison_page
 from neural_sim.report.statistics import Comparison, Estimate
 
@@ -33,8 +34,9 @@ def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
 
 
 def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
+    spent = {"first": Costs(dict.fromkeys(HEAD, 3.0), 12.0, 700.0, None)}
     page = write_comparison_page(
-        [Section(comparison, Figure(figsize=(2, 2)), "size=<1>", ["mug"])],
+        [Section(comparison, Figure(figsize=(2, 2)), "size=<1>", ["mug"], spent)],
         {"older & smaller": ["a run"]},
         tmp_path,
     ).read_text()
@@ -43,3 +45,5 @@ def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
     assert "data:image/svg+xml;base64," in page and not re.findall(r'(?:src|href)="(?!data:)', page)
     assert '<td class="accepted">\n20.0' in page or re.search(r'class="accepted">\s*20\.0', page)
     assert re.search(r'class="rejected">\s*-10\.0', page)
+    cells = "".join(f'<td class="n">{cell}</td>' for cell in [*["3"] * len(HEAD), "700", "12", ""])
+    assert f"<tr><th>first</th>{cells}</tr>" in page and NOTE in page

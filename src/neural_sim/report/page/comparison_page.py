@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from neural_sim.detector.metrics import IN_FULL
+from neural_sim.report.costs import HEAD, NOTE, Costs, cells
 from neural_sim.report.page import charts, render
 from neural_sim.report.page.verdict import POINTS, interval, listed
 from neural_sim.report.statistics import Comparison
@@ -19,17 +20,31 @@ FILE = "report.html"
 @dataclass(frozen=True)
 class Section:
     """One setting's comparison: its AP against cost drawn, how its runs differ from others of the setting, and the
-    classes whose AP is compared."""
+    classes whose AP is compared, and what each method cost."""
 
     comparison: Comparison
     curves: Figure
     heading: str
     biased: Sequence[str]
+    costs: Mapping[str, Costs]
 
     @property
     def chart(self) -> str:
         """The source of an ``<img>``."""
         return charts.data_uri(self.curves)
+
+    @property
+    def cost_rows(self) -> dict[str, list[str]]:
+        """By method, under the heads of ``cost_head``."""
+        return {method: cells(cost) for method, cost in self.costs.items()}
+
+    @property
+    def cost_head(self) -> list[str]:
+        return [*(f"{column}, s" for column in HEAD), "MB", "images", "error of the gradient"]
+
+    @property
+    def cost_note(self) -> str:
+        return NOTE
 
     @property
     def verdict(self) -> str:

@@ -1,0 +1,100 @@
+"""What methods cost: seconds by phase, images, memory, and how exact the gradients were that they followed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, median
+from typing import Any
+
+from neural_sim.report.finished import FinishedRun
+
+PHASES: Mapping[str, tuple[str, ...]] = {
+    "images": ("pool", "probes", "render", "features"),
+    "training": ("train",),
+    "derivative": ("hypergradient",),
+    "scores": ("judge", "reward", "certify"),
+}
+"""Phases of an iteration of the psi loop, as its records have them, by the columns of a table."""
+HEAD = ("warm start", *PHASES, "in all")
+NOTE = (
+    "Seconds on the wall, of the warm start and of the psi loop by phase. MB: the most that the process of a run had "
+    "in memory. Images: those rendered for both. Error of the gradient: its standard error over images relative to "
+    "its length, median over iterations and objects."
+)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Of one method. ``seconds``, by column of ``HEAD``, and ``images`` are means over runs, ``memory`` is the largest
+    of any run in MB (None: not recorded), ``error`` the median standard error of a gradient relative to its length
+    (None: the method has no gradient, or its error is not known)."""
+
+    seconds: Mapping[str, float]
+    images: float
+    memory: float | None
+    error: float | None
+
+
+def costs(runs: Sequence[FinishedRun]) -> dict[str, Costs]:
+    """By method, in the order of the runs."""
+    by_method: dict[str, list[Mapping[str, Any]]] = {}
+    for run in runs:
+        by_method.setdefault(run.method, []).append(run.results)
+    return {method: _costs(results) for method, results in by_method.items()}
+
+
+def _costs(runs: Sequence[Mapping[str, Any]]) -> Costs:
+    spent = [_seconds(run) for run in runs]
+    memory = [run["peak_memory_mb"] for run in runs if "peak_memory_mb" in run]
+    errors = [error for run in runs for error in _errors(run["iterations"])]
+    return Costs(
+        {column: fmean(each[column] for each in spent) for column in HEAD},
+        fmean(run["curve"][-1]["images"] for run in runs),
+        max(memory, default=None),
+        median(errors) if errors else None,
+    )
+
+
+def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
+    """By column of ``HEAD``; phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    loop = {
+        column: sum(record["seconds"].get(phase, 0.0) for record in run["iterations"] for phase in phases)
+        for column, phases in PHASES.items()
+    }
+    total = run["curve"][-1]["seconds"]
+    # What the store had is charged with the seconds that it took, so not the stage's own in this run.
+    return {"warm start": max(total - sum(loop.values()), 0.0), **loop, "in all": total}
+
+
+def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
+    """Of every object's gradient in every iteration; a gradient that is zero, or of unknown error, has none."""
+    pairs = [
+        pair
+        for record in records
+        for pair in zip(record.get("gradient_errors", ()), record.get("gradient_norms", ()), strict=True)
+    ]
+    return [
+        error / norm for error, norm in pairs if norm > 0.0 and error > 0.0 and math.isfinite(error / norm)
+    ]
+
+
+def costs_table(runs: Sequence[FinishedRun]) -> str:
+    """Markdown, a method a row."""
+    lines = [
+        "| cost | "
+        + " | ".join(f"{column}, s" for column in HEAD)
+        + " | MB | images | error of the gradient |",
+        "|---" * (len(HEAD) + 4) + "|",
+    ]
+    for method, cost in costs(runs).items():
+        lines.append("| " + " | ".join([method, *cells(cost)]) + " |")
+    return "\n".join([*lines, "", NOTE])
+
+
+def cells(cost: Costs) -> list[str]:
+    """A row's numbers as text, after the method's name."""
+    seconds = [f"{cost.seconds[column]:.0f}" for column in HEAD]
+    memory = "" if cost.memory is None else f"{cost.memory:.0f}"
+    return [*seconds, memory, f"{cost.images:.0f}", "" if cost.error is None else f"{cost.error:.2f}"]
