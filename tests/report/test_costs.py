@@ -46,6 +46,8 @@ def test_the_error_of_gradients_is_the_median_and_leaves_out_those_that_have_non
     records[1]["gradient_errors"][1] = float("inf")
     assert costs([run("ours", records, 2.0)])["ours"].error == 0.5  # of 0.5, 0.1 and 0.75
     assert costs([run("lts", [record(train=1.0)], 2.0)])["lts"].error is None
+    older = {"seconds": {"train": 1.0}, "gradient_norms": [1.0]}
+    assert costs([run("ours", [older], 2.0)])["ours"].error is None
 
 
 def test_a_table_has_a_row_for_each_method():

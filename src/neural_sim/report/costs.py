@@ -69,11 +69,13 @@ def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
-    """Of every object's gradient in every iteration; a gradient that is zero, or of unknown error, has none."""
+    """Of every object's gradient in every iteration; a gradient that is zero, or of unknown error, has none, nor
+    has one of a run from before errors were recorded."""
     pairs = [
         pair
         for record in records
-        for pair in zip(record.get("gradient_errors", ()), record.get("gradient_norms", ()), strict=True)
+        if "gradient_errors" in record
+        for pair in zip(record["gradient_errors"], record["gradient_norms"], strict=True)
     ]
     return [
         error / norm for error, norm in pairs if norm > 0.0 and error > 0.0 and math.isfinite(error / norm)
