@@ -7,7 +7,7 @@ from small_loop import small_loop
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.loop import learn_psi
-from neural_sim.outer.settings import Outer, Trust
+from neural_sim.outer.settings import Checks, Outer, Trust
 from neural_sim.parameter.update import Mirror
 
 CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
@@ -59,6 +59,17 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     for label, name in enumerate(("a", "b")):
         accepted = name in last.verdicts and last.verdicts[name].accepted
         torch.testing.assert_close(after[label], (tried if accepted else before)[label])
+
+
+def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
+    learned = learn_psi(
+        checked_loop(scene, trust=Trust(level=None), checks=Checks(waits_below=1.0)), progress=False
+    )
+    first, second, _ = learned.records
+    assert first.certificate
+    actions = {name: by_factor["pose"] for name, by_factor in first.certificate.actions.items()}
+    assert sorted(actions.values()) == ["kept", "waited"]
+    assert [name for name, action in actions.items() if action == "kept"] == list(second.verdicts)
 
 
 def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
