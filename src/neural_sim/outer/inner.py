@@ -45,9 +45,10 @@ def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bo
 class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
-    The backbone is that of ``params``, frozen. Pyramid and head are trained for ``settings.epochs`` epochs at a time on
-    the device of ``params``, where the scene's fields are too. Relaxed draws, and images under a light that moves, are
-    always rendered anew; all others come from a pool of poses of every bin.
+    The backbone is that of ``params``, frozen. Pyramid and head are trained for ``settings.epochs`` epochs at a time,
+    more where ``settings.least_steps`` asks for them, on the device of ``params``, where the scene's fields are too.
+    Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a pool of poses
+    of every bin.
 
     Args:
         scene: what images are drawn from.
@@ -152,7 +153,9 @@ class InnerLoop:
         """
         if self.settings.epochs == 0:
             return math.nan
-        how = replace(self.training.of(self.settings.epochs), learning_rate=self.settings.learning_rate)
+        sampling = self._sampling(images)
+        how = self.training.of(self._epochs(len(images), sampling))
+        how = replace(how, learning_rate=self.settings.learning_rate)
         # The proximal term replaces weight decay: with both, its Hessian would not be the inner problem's.
         if self.detector.proximal > 0.0:
             how = replace(how, weight_decay=0.0)
@@ -165,11 +168,18 @@ class InnerLoop:
             how,
             self.warm_start,
             recording,
-            self._sampling(images),
+            sampling,
         )
         self.steps += history.steps
         self.trajectory = history.trajectory
         return history.losses[-1]
+
+    def _epochs(self, images: int, sampling: Sampling | None) -> int:
+        """As many as ``outer.epochs`` and ``outer.least_steps`` ask for."""
+        if self.settings.start == "previous":
+            return self.settings.epochs
+        steps = math.ceil(images / self.training.batch_size) if sampling is None else sampling.steps
+        return max(self.settings.epochs, math.ceil(self.settings.least_steps / steps))
 
     @torch.no_grad()
     def loss(self, images: CachedSet) -> float:

@@ -123,6 +123,9 @@ class Outer:
         iterations: outer iterations.
         images_per_object: training images of each object in an iteration.
         epochs, learning_rate: of an iteration's training.
+        least_steps: of that training, which has more epochs where these would give fewer steps: the images of one or
+            two objects fill few batches, and so short a training says little about psi. Not of a training that goes on
+            from the iteration before.
         start: initial pyramid and head of that training: those of the iteration before (``previous``, the paper's), of
             the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that goes on remembers
             bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
@@ -163,6 +166,7 @@ class Outer:
     iterations: int = 10
     images_per_object: int = 50
     epochs: int = 12
+    least_steps: int = 0
     learning_rate: float = 3e-3
     start: Start = "fresh"
     train_first: bool = True
@@ -189,7 +193,9 @@ class Outer:
     def __post_init__(self) -> None:
         at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
         at_least("outer", 1, certify_per_bin=self.certify_per_bin)
-        at_least("outer", 0, epochs=self.epochs, learning_rate=self.learning_rate)
+        at_least(
+            "outer", 0, epochs=self.epochs, learning_rate=self.learning_rate, least_steps=self.least_steps
+        )
         at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         at_least("outer", 0, certify_every=self.certify_every)
         if self.quality is not None and self.quality not in get_args(Quality):
