@@ -183,7 +183,7 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
         if trust[part]:
             text += "; " + ", ".join(f"{name} {count}" for name, count in trust[part].items())
     if trust["waited"]:
-        text += f"; of the others, {trust['waited']} waited until larger steps were done"
+        text += f"; of the others, {trust['waited']} waited (little gain, or a spent trust radius)"
     if trust["judged"]:
         text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
     if trust["cosines"]:
