@@ -11,6 +11,7 @@ from neural_sim.configuration import conf_directory
 from neural_sim.report import experiments as module
 from neural_sim.report.experiments import Experiments, Row
 from neural_sim.report.layouts import LAYOUTS, Paper
+from neural_sim.report.measured import Measured
 from neural_sim.report.selection import LeftOut
 
 TABLE = {
@@ -41,10 +42,14 @@ ROWS = {
         "table": "one",
     },
     "figure": {"title": "Figure", "experiment": "illumination_interpolation"},
+    "own": {"title": "Own", "experiment": "nerf_vs_mesh", "document": "nerf_vs_mesh.md"},
     "planned": {"title": "Planned", "experiment": "no_such_file", "runs": ["gap"], "layout": "gaps"},
 }
 MEASURED = {
-    "gap": [setting(gap=gap, methods=(("neural_sim", 0.75), ("lts", 0.5))) for gap in ("same", "disjoint")]
+    "gap": [
+        setting(gap="same", methods=(("neural_sim", 0.75), ("lts", 0.5))),
+        setting(gap="disjoint", methods=(("neural_sim", 0.75), ("lts", 0.5)), commit="1234567"),
+    ]
 }
 
 
@@ -54,6 +59,8 @@ def page(monkeypatch, tmp_path):
         return MEASURED.get(runs[0], []), [LeftOut("lts seed 3", "0123456789", runs[0], "it failed")]
 
     monkeypatch.setattr(module.Settings, "read", read)
+    own = {"nerf_vs_mesh": Measured(["below"], "A table of its own.", ["abc1234"])}
+    monkeypatch.setattr(module, "newest_document", lambda uri, name, file, budget: own.get(name))
 
     def write(**arguments):
         step = Experiments(**{"rows": ROWS, "paper": PAPER, "draws": 5, **arguments})
@@ -70,9 +77,13 @@ def test_the_page_has_what_was_measured_and_says_what_was_not(page, tmp_path):
     assert (tmp_path / "page.md").read_text() == (tmp_path / "experiments.md").read_text() == text
     rows = {line.split(" | ")[0].strip("| "): line for line in text.splitlines() if line.startswith("| ")}
     assert "| `python -m src.main +experiment=gap_levels` | gap, can: NSO 75.2" in rows["Gaps"]
+    assert (
+        "<br>(commit 1234567, unknown) |" in rows["Gaps"] and "| below<br>(commit abc1234) |" in rows["Own"]
+    )
+    assert "## own\n\nOwn.\n\nA table of its own.\n" in text
     assert rows["Gaps"].endswith("over LTS 34 (Sec. 4.2, l. 845) |  |")
     assert "| not yet measured | Table 1: below |" in rows["Large"]
-    assert "in the run's folder" in rows["Figure"] and "Planned" not in text
+    assert "figures in the run's folder" in rows["Figure"] and "Planned" not in text
     assert (
         "84 views of 96 pixels" in text and "## gaps" in text and "\n| gap | can | the target's | 0 |" in text
     )
@@ -80,7 +91,7 @@ def test_the_page_has_what_was_measured_and_says_what_was_not(page, tmp_path):
     assert "Table 2" in text.split("without an experiment here")[1]
     assert (tmp_path / "figures" / "gaps_levels.png").stat().st_size > 5000
     data = json.loads((tmp_path / "experiments.json").read_text())
-    assert list(data["rows"]) == ["gaps", "large", "figure"] and data["rows"]["large"]["ours"] is None
+    assert list(data["rows"]) == ["gaps", "large", "figure", "own"] and data["rows"]["large"]["ours"] is None
     assert [run["reason"] for run in data["left_out"]] == ["it failed"] * 2
     assert "it failed" in (tmp_path / "left_out.md").read_text()
 
@@ -88,6 +99,31 @@ def test_the_page_has_what_was_measured_and_says_what_was_not(page, tmp_path):
 def test_some_rows_alone(page):
     text = page(only=["large"])
     assert "| Large |" in text and "| Gaps |" not in text and "Table 2" not in text
+
+
+def test_a_page_keeps_what_it_said_of_experiments_without_runs_here(page, tmp_path, monkeypatch):
+    at = str(tmp_path / "page.md")
+    first = page(page=at)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(module.Settings, "read", lambda self, runs: ([], []))
+        elsewhere.setattr(module, "newest_document", lambda *arguments: None)
+        assert page(page=at) == first == page(page=at, only=["large"])
+        assert "not yet measured" in page(only=["gaps"]), "only a page keeps"
+        newer = Measured(["newer"], "", ["7654321"])
+        elsewhere.setattr(module, "newest_document", lambda *arguments: newer)
+        second = page(page=at, only=["own"])
+    assert "newer<br>(commit 7654321)" in second and "below" not in second.split("| Own |")[1].splitlines()[0]
+    assert [line for line in second.splitlines() if "| Gaps |" in line] == [
+        line for line in first.splitlines() if "| Gaps |" in line
+    ]
+    assert set(json.loads((tmp_path / "page.json").read_text())["rows"]) == {"gaps", "own"}
+    smaller = {**BUDGET, "outer": {"iterations": 2}}
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(module.Settings, "read", lambda self, runs: ([], []))
+        step = Experiments(rows=ROWS, paper=PAPER, draws=5, page=at, only=["large"])
+        assert "NSO 75.2" not in step.write("uri", {"budget": smaller, "seed": 0}, tmp_path), (
+            "of another scale"
+        )
 
 
 def test_our_scores_stand_beside_those_of_the_papers_table():
@@ -110,7 +146,6 @@ def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
     [
         ({"only": ["none"]}, r"experiments.only: no row \['none'\], want some of gaps"),
         ({"draws": 1}, "experiments.draws"),
-        ({"only": ["gaps"], "page": "page.md"}, "want all rows on the page"),
         (
             {"paper": {"claims": {}, "tables": {"one": TABLE}}},
             r"gap_levels: the paper's numbers have no \['gains'\]",
@@ -118,6 +153,7 @@ def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
         ({"paper": {**PAPER, "tables": {"one": {**TABLE, "columns": ["NS"]}}}}, "a number for each of"),
         ({"rows": {"x": {"title": "", "experiment": "x", "runs": ["x"], "layout": "pie"}}}, "layout of gaps"),
         ({"rows": {"x": {"title": "", "experiment": "x", "layout": "gaps"}}}, "want runs and a layout"),
+        ({"rows": {"x": {**ROWS["gaps"], "document": "gaps.md"}}}, "or a document"),
     ],
 )
 def test_bad_settings_are_refused(arguments, message):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,14 @@ from neural_sim.configuration import conf_directory
 from neural_sim.report import figures
 from neural_sim.report.compare import left_out_table
 from neural_sim.report.costs import costs_table
-from neural_sim.report.layouts import LAYOUTS, Paper, Shown
+from neural_sim.report.layouts import LAYOUTS, Paper
+from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
 from neural_sim.report.selection import LeftOut
 from neural_sim.report.settings import Settings
+from neural_sim.report.tracking import UNKNOWN
 
 NOT_YET = "not yet measured"
+BY_FIGURES = "figures in the run's folder"
 COMMAND = "python -m src.main +experiment=experiments_table experiments.page=docs/experiments.md"
 
 
@@ -28,30 +31,32 @@ class Row:
         title: what the paper calls it, and where.
         experiment: the file in conf/experiment; a row without its file is left out.
         runs: the MLflow experiments of its runs.
-        layout: how they are shown, one of ``LAYOUTS``; null: by the run's own report.
+        layout: how they are shown, one of ``LAYOUTS``; null: by the runs' own ``document``.
+        document: a Markdown file that a run leaves, of which the newest is shown; null: its figures alone say it.
         command: what runs it; null: ``python -m src.main +experiment=<experiment>``.
         claims: entries of the paper's ``claims``.
         table: the paper's table that stands beside ours.
         differs: what differs from the paper's setting.
 
     Raises:
-        ValueError: an unknown layout, or one without runs.
+        ValueError: an unknown layout, one without runs, or a document besides.
     """
 
     title: str
     experiment: str
     runs: Sequence[str] = ()
     layout: str | None = None
+    document: str | None = None
     command: str | None = None
     claims: Sequence[str] = ()
     table: str | None = None
     differs: str = ""
 
     def __post_init__(self) -> None:
-        if self.layout is not None and (self.layout not in LAYOUTS or not self.runs):
+        if self.layout is not None and (self.layout not in LAYOUTS or not self.runs or self.document):
             raise ValueError(
-                f"experiments.rows, {self.experiment}: want runs and a layout of {', '.join(LAYOUTS)}, got "
-                f"{self.layout!r}, {list(self.runs)}"
+                f"experiments.rows, {self.experiment}: want runs and a layout of {', '.join(LAYOUTS)}, or a "
+                f"document, got {self.layout!r}, {list(self.runs)} and {self.document!r}"
             )
 
     @property
@@ -71,13 +76,13 @@ class Experiments:
     Args:
         rows: the constructor arguments of each :class:`Row`, by a name of its own.
         paper: ``claims`` and ``tables`` of conf/paper/numbers.yaml.
-        only: names of the rows to make; null: all.
-        page: where the page goes besides the run's folder; null: nowhere.
+        only: names of the rows to read runs of; null: all.
+        page: where the page goes besides the run's folder, with all rows; null: nowhere.
         reference: the method that the others are compared with.
         draws: of the bootstrap.
 
     Raises:
-        ValueError: an unknown row, claim or table, fewer than two draws, or a ``page`` of some rows ``only``.
+        ValueError: an unknown row, claim or table, or fewer than two draws.
     """
 
     rows: Mapping[str, Mapping[str, Any]]
@@ -93,8 +98,6 @@ class Experiments:
             raise ValueError(f"experiments.only: no row {unknown}, want some of {', '.join(self.rows)}")
         if self.draws < 2:
             raise ValueError(f"experiments.draws must be at least 2, got {self.draws}")
-        if self.page is not None and self.only is not None:
-            raise ValueError("experiments.page: want all rows on the page, so experiments.only=null")
         for row in (Row(**arguments) for arguments in self.rows.values()):
             missing = [c for c in row.claims if c not in self.paper["claims"]]
             missing += [t for t in (row.table,) if t is not None and t not in self.paper["tables"]]
@@ -108,49 +111,61 @@ class Experiments:
 
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
         """experiments.md, experiments.json and figures in ``folder``, and the page where it is asked for; returns the
-        page's text. Only runs with the ``budget`` of ``config`` count."""
-        settings = Settings(uri, config["budget"], self.reference, self.draws, config["seed"])
-        made = {
-            name: Row(**arguments)
-            for name, arguments in self.rows.items()
-            if self.only is None or name in self.only
-        }
-        shown = {name: self._shown(row, settings) for name, row in made.items() if row.exists}
-        for name, (_, result, _) in shown.items():
-            for called, figure in (result.figures if result else {}).items():
+        page's text. Only runs with the ``budget`` of ``config`` count. A page keeps what it said of experiments without
+        runs here, from the file beside it."""
+        budget = config["budget"]
+        settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
+        rows = {name: Row(**arguments) for name, arguments in self.rows.items()}
+        rows = {name: row for name, row in rows.items() if row.exists}
+        asked = {name: row for name, row in rows.items() if self.only is None or name in self.only}
+        found = {name: self._found(row, settings) for name, row in asked.items()}
+        for name, (_, shown, _) in found.items():
+            for called, figure in shown.items():
                 figures.save(figure, folder / "figures" / f"{name}_{called}.png")
-        text = self._page(shown, config["budget"])
-        lost = list(dict.fromkeys(run for _, _, left in shown.values() for run in left))
-        (folder / "experiments.md").write_text(text)
+        made = {name: measured for name, (measured, _, _) in found.items() if measured is not None}
+        lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
         (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n")
-        data = {name: {"command": row.run, "ours": list(result.lines) if result else None}
-                for name, (row, result, _) in shown.items()}  # fmt: skip
+        data = {name: {"command": row.run, "ours": list(made[name].lines) if name in made else None}
+                for name, row in asked.items()}  # fmt: skip
         (folder / "experiments.json").write_text(
             json.dumps({"rows": data, "left_out": [asdict(run) for run in lost]}, indent=1)
         )
-        if self.page is not None:
+        if self.page is None:
+            text = self._page(asked, made, budget)
+        else:
+            kept = read_measured(beside(self.page), budget)
+            made = {name: own for name, own in {**kept, **made}.items() if name in rows}
+            text = self._page(rows, made, budget)
+            write_measured(beside(self.page), budget, made)
             Path(self.page).write_text(text)
+        (folder / "experiments.md").write_text(text)
         return text
 
-    def _shown(self, row: Row, settings: Settings) -> tuple[Row, Shown | None, list[LeftOut]]:
+    def _found(
+        self, row: Row, settings: Settings
+    ) -> tuple[Measured | None, Mapping[str, Any], list[LeftOut]]:
+        """What its finished runs gave, None without such; their figures by name, and runs that do not count."""
+        if row.document is not None:
+            return newest_document(settings.uri, row.experiment, row.document, settings.budget), {}, []
         if row.layout is None:
-            return row, Shown(["in the run's folder"]), []
+            return None, {}, []
         found, left_out = settings.read(row.runs)
         if not found:
-            return row, None, left_out
+            return None, {}, left_out
         table = self._tables.get(row.table) if row.table else None
         shown = LAYOUTS[row.layout](found, table, settings.draws, settings.seed)
-        spent = costs_table([run for setting in found for run in setting.runs])
-        return row, replace(shown, text="\n\n".join(part for part in (shown.text, spent) if part)), left_out
+        runs = [run for setting in found for run in setting.runs]
+        text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
+        commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
+        return Measured(list(shown.lines), text, commits), shown.figures, left_out
 
-    def _page(
-        self, shown: Mapping[str, tuple[Row, Shown | None, list[LeftOut]]], budget: Mapping[str, Any]
-    ) -> str:
+    def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
         lines = [
             "# Experiments",
             "",
-            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit.",
+            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments without runs there it "
+            "keeps what it said before.",
             "",
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
@@ -160,20 +175,21 @@ class Experiments:
             "| the paper's experiment | command | ours | the paper | what differs |",
             "|---|---|---|---|---|",
         ]
-        for row, result, _ in shown.values():
-            ours = "<br>".join(result.lines) if result else NOT_YET
+        for name, row in rows.items():
+            ours = made[name].cell if name in made else NOT_YET if row.runs or row.document else BY_FIGURES
             lines.append(
                 f"| {row.title} | `{row.run}` | {ours} | {'<br>'.join(self._claims(row))} | {row.differs} |"
             )
-        for name, (row, result, _) in shown.items():
-            parts = [result.text] if result and result.text else []
-            if row.table and not parts:
-                parts = [self._tables[row.table].markdown()]
+        for name, row in rows.items():
+            parts = [made[name].text] if name in made and made[name].text else []
+            # A layout sets the paper's table beside ours.
+            if row.table and not (parts and row.layout):
+                parts.append(self._tables[row.table].markdown())
             if parts:
-                lines += ["", f"## {name.replace('_', ' ')}", "", f"{row.title}.", "", *parts]
-        used = {row.table for row, _, _ in shown.values()}
+                lines += ["", f"## {name.replace('_', ' ')}", "", f"{row.title}.", "", "\n\n".join(parts)]
+        used = {row.table for row in rows.values()}
         others = [table for name, table in self._tables.items() if name not in used]
-        if others and self.only is None:
+        if others and set(rows) >= {name for name, row in self.rows.items() if Row(**row).exists}:
             lines += ["", "## Tables of the paper without an experiment here", ""]
             lines += ["\n\n".join(table.markdown() for table in others)]
         return "\n".join(lines) + "\n"

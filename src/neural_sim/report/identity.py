@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neural_sim.digests import digest, tensor_digest
+from neural_sim.report.commit import commit
 from neural_sim.report.tracking import flatten
 from neural_sim.types import LabelledImages
 
@@ -36,7 +37,8 @@ def identity(
     Returns:
         ``scoring``: digest of all that must be equal for the AP of two methods to be comparable; ``configuration``:
         digest of all settings but ``RUN_KEYS``, so that a method's seeds share it; ``test_set``: digest of the test
-        images and labels; and ``config``, ``files`` and ``code``, to say what differs.
+        images and labels; ``config``, ``files`` and ``code``, to say what differs; and the ``commit`` of the code, None
+        outside a checkout.
     """
     scored = {"config": scored_config(config), "files": files, "names": list(files["objects"])}
     settings = {key: value for key, value in config.items() if key not in RUN_KEYS}
@@ -47,6 +49,7 @@ def identity(
         "config": dict(config),
         "files": dict(files),
         "code": dict(code),
+        "commit": commit(),
     }
 
 

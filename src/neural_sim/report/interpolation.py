@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +18,7 @@ from torch import Tensor
 from neural_sim.cameras import orbit
 from neural_sim.field.base import RadianceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.report import figures, tracking
 from neural_sim.report.figures import INK, MUTED
 from neural_sim.types import PinholeCamera
 
@@ -104,6 +108,44 @@ def interpolate(
     if not change <= UNCHANGED:
         raise RuntimeError(f"interpolate: opacity changes by {change:.3g} with the light, want {UNCHANGED:g}")
     return InterpolatedViews(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
+
+
+def report_interpolation(
+    views: Mapping[str, InterpolatedViews],
+    title: str,
+    experiment: str,
+    config: Mapping[str, Any],
+    uri: str,
+    folder: Path,
+    begun: float,
+) -> tracking.Run:
+    """The figure, interpolation.md and interpolation.json in ``folder``, and a run in MLflow that began at ``begun``
+    (seconds since 1970)."""
+    figures.save(interpolation_figure(views, title), folder / "figures" / "interpolation.png")
+    changes = {name: own.opacity_change for name, own in views.items()}
+    (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))
+    text = table(views, title)
+    (folder / "interpolation.md").write_text(text + "\n")
+    print(text)
+    metrics = {f"{name}/opacity_change": change for name, change in changes.items()}
+    seed = str(config["seed"])
+    named = uri, experiment, f"seed {seed}", {"seed": seed}
+    return tracking.log_run(*named, tracking.flatten(config), metrics, {}, folder, begun)
+
+
+def table(views: Mapping[str, InterpolatedViews], title: str) -> str:
+    """Markdown: how much colour and opacity change on the way."""
+    count = len(next(iter(views.values())).images)
+    lines = [
+        f"{title} in {count} images from one camera. Colours are of 0 to 1.",
+        "",
+        "| object | largest change of opacity | mean change of colour from the first light to the last |",
+        "|---|---|---|",
+    ]
+    for name, own in views.items():
+        colour = float((own.images[-1] - own.images[0]).abs().mean())
+        lines.append(f"| {name} | {own.opacity_change:.0e} | {colour:.3f} |")
+    return "\n".join(lines)
 
 
 def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> Figure:

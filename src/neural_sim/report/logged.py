@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.report.tracking import connect, quiet, where
+from neural_sim.report.tracking import COMMIT, UNKNOWN, connect, quiet, where
 
 
 @dataclass(frozen=True)
 class LoggedRun:
-    """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one."""
+    """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one;
+    ``parameters`` is its configuration as MLflow keeps it, flat and as text."""
 
     run_id: str
     name: str
     status: str
+    commit: str
+    parameters: Mapping[str, str]
     files: frozenset[str]
     fetch: Callable[[str], Path]
 
@@ -35,7 +38,7 @@ def runs(uri: str, experiment: str) -> list[LoggedRun]:
         experiment_id = _experiment_id(client, uri, experiment)
         while token != "":
             page = client.search_runs([experiment_id], order_by=order, page_token=token)
-            logged += [_logged(client, run.info) for run in page]
+            logged += [_logged(client, run) for run in page]
             token = page.token or ""
     return logged
 
@@ -56,13 +59,15 @@ def where_runs(uri: str, experiment: str) -> str:
         return where(uri, _experiment_id(connect(uri), uri, experiment))
 
 
-def _logged(client: Any, info: Any) -> LoggedRun:
+def _logged(client: Any, run: Any) -> LoggedRun:
+    info = run.info
     files = frozenset(item.path for item in client.list_artifacts(info.run_id))
 
     def fetch(name: str) -> Path:
         return Path(client.download_artifacts(info.run_id, name))
 
-    return LoggedRun(info.run_id, info.run_name, info.status, files, fetch)
+    commit = run.data.tags.get(COMMIT, UNKNOWN)
+    return LoggedRun(info.run_id, info.run_name, info.status, commit, run.data.params, files, fetch)
 
 
 def _experiment_id(client: Any, uri: str, experiment: str) -> str:

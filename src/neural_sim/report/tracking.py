@@ -13,6 +13,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from neural_sim.report.commit import commit
+
 _log = logging.getLogger(__name__)
 
 KIND = ("mlflow.experimentKind", "custom_model_development")
@@ -20,6 +22,9 @@ KIND = ("mlflow.experimentKind", "custom_model_development")
 TRAINING = "workflowType=machine_learning"
 """What an address says for versions whose pages go by a switch, which stands at GenAI in a new browser: without it they
 show an empty page of traces."""
+COMMIT = "mlflow.source.git.commit"
+"""The tag from which MLflow shows the commit of a run's code, or ``UNKNOWN``."""
+UNKNOWN = "unknown"
 BATCH = 100
 """Rows of one kind in a request; MLflow takes no more parameters at once."""
 
@@ -164,7 +169,7 @@ def opened(
             client = connect(uri)
             with _guard(uri):
                 experiment_id = _experiment_id(client, uri, experiment)
-                tags = {**tags, "source": "neural-sim"}
+                tags = {**tags, "source": "neural-sim", COMMIT: commit() or UNKNOWN}
                 created = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
         except MlflowException as error:
             raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import time
 from dataclasses import dataclass
 
-from neural_sim.report import figures
-from neural_sim.report.interpolation import Interpolation, interpolation_figure
+from neural_sim.report.interpolation import Interpolation, report_interpolation
 from neural_sim.stages.context import Context
 
 
@@ -15,12 +14,13 @@ class InterpolationStep(Interpolation):
     """See :class:`Interpolation`."""
 
     def run(self, context: Context) -> None:
-        """The figure, and how little opacity changed, to the run's folder.
+        """The figure, and how little opacity changed, to the run's folder and MLflow.
 
         Raises:
             ValueError: a light that is fixed.
         """
-        views, folder = context.experiment.imaging.views, context.folder
+        x, begun = context.experiment, time.time()
+        views = x.imaging.views
         if views.rig is None:
             raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
         scene = context.results(context.graph.scene)
@@ -29,7 +29,7 @@ class InterpolationStep(Interpolation):
             fields, scene.lit_renderer, views.camera(self.image_size), views.rig.anchors
         )
         title = "From light {} to light {}".format(*self.ends)
-        figures.save(interpolation_figure(interpolated, title), folder / "figures" / "interpolation.png")
-        changes = {name: images.opacity_change for name, images in interpolated.items()}
-        (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))
-        print(f"largest change of opacity: {max(changes.values()):.1e}\nresults: {folder}")
+        run = report_interpolation(
+            interpolated, title, x.run.name, x.config, context.uri, context.folder, begun
+        )
+        print(f"results: {context.folder}\n{run.where}")

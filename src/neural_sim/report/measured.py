@@ -1,0 +1,58 @@
+"""What a page says of measured experiments, kept in a file beside it: so runs of several machines fill one page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neural_sim.report import logged
+from neural_sim.report.tracking import flatten
+
+
+@dataclass(frozen=True)
+class Measured:
+    """``lines`` for the page's table, ``text`` in Markdown below it, and the ``commits`` of the runs' code."""
+
+    lines: Sequence[str]
+    text: str
+    commits: Sequence[str]
+
+    @property
+    def cell(self) -> str:
+        """In the page's table."""
+        return "<br>".join([*self.lines, f"(commit {', '.join(self.commits)})"])
+
+
+def beside(page: str) -> Path:
+    """The file that keeps the measured rows of a page."""
+    return Path(page).with_suffix(".json")
+
+
+def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
+    """The rows by name; none where there is no such file, or where it is of another ``budget`` (the scale)."""
+    if not file.is_file():
+        return {}
+    document = json.loads(file.read_text())
+    rows = document["rows"] if document["budget"] == budget else {}
+    return {name: Measured(**row) for name, row in rows.items()}
+
+
+def write_measured(file: Path, budget: Mapping[str, Any], rows: Mapping[str, Measured]) -> None:
+    """What :func:`read_measured` reads."""
+    document = {"budget": budget, "rows": {name: dataclasses.asdict(row) for name, row in rows.items()}}
+    file.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+
+
+def newest_document(uri: str, experiment: str, name: str, budget: Mapping[str, Any]) -> Measured | None:
+    """The Markdown file ``name`` of the newest finished run of an experiment at the scale ``budget``; None without."""
+    if experiment not in logged.experiments(uri):
+        return None
+    scale = {key: str(value) for key, value in flatten({"budget": budget}).items()}
+    for run in logged.runs(uri, experiment):
+        if run.status == "FINISHED" and name in run.files and scale.items() <= run.parameters.items():
+            return Measured(["below"], run.fetch(name).read_text().strip(), [run.commit])
+    return None

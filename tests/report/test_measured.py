@@ -1,0 +1,62 @@
+"""Measured rows: what is written is read at the same scale alone; documents come from the newest finished run."""
+
+import pytest
+
+from neural_sim.report import tracking
+from neural_sim.report.commit import commit
+from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
+
+BUDGET = {"views": {"count": 84}, "field": {"batches": [1024, 8192], "background": None}}
+ROWS = {
+    "large": Measured(["mAP of NSO 80.0 (70.0 to 90.0)", "ψ"], "| a |\n|---|", ["abc1234"]),
+    "small": Measured([], "", []),
+}
+
+
+def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
+    file = beside(str(tmp_path / "page.md"))
+    assert file.name == "page.json" and read_measured(file, BUDGET) == {}
+    write_measured(file, BUDGET, ROWS)
+    assert read_measured(file, BUDGET) == ROWS
+    assert read_measured(file, {**BUDGET, "views": {"count": 12}}) == {}
+
+
+def test_the_cell_names_the_commits():
+    assert ROWS["large"].cell == "mAP of NSO 80.0 (70.0 to 90.0)<br>ψ<br>(commit abc1234)"
+
+
+@pytest.fixture
+def uri(tmp_path):
+    return tracking.tracking_uri(str(tmp_path / "mlflow.db"))
+
+
+def log(uri, folder, name, budget=BUDGET, begun=None, fail=False):
+    folder.mkdir()
+    (folder / "study.md").write_text(f"{name}\n")
+    try:
+        with tracking.opened(
+            uri, "study", name, {}, tracking.flatten({"budget": budget, "seed": 0}), begun
+        ) as run:
+            run.log_files(folder)
+            if fail:
+                raise RuntimeError("stopped")
+    except RuntimeError:
+        pass
+
+
+def test_the_newest_finished_run_of_the_scale_is_shown(uri, tmp_path):
+    smaller = {**BUDGET, "views": {"count": 12}}
+    log(uri, tmp_path / "a", "first", begun=1000.0)
+    log(uri, tmp_path / "b", "second", begun=2000.0)
+    log(uri, tmp_path / "c", "smaller", smaller, begun=3000.0)
+    log(uri, tmp_path / "d", "failed", begun=4000.0, fail=True)
+    assert newest_document(uri, "study", "study.md", BUDGET) == Measured(
+        ["below"], "second", [commit() or "unknown"]
+    )
+    assert newest_document(uri, "study", "study.md", smaller).text == "smaller"
+
+
+def test_without_runs_there_is_no_document(uri, tmp_path):
+    log(uri, tmp_path / "a", "first")
+    assert newest_document(uri, "study", "other.md", BUDGET) is None
+    assert newest_document(uri, "another", "study.md", BUDGET) is None
