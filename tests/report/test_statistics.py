@@ -104,6 +104,27 @@ def test_all_methods_are_read_at_the_cost_of_the_cheapest():
     assert "AP after 100 seconds" in markdown(found, [_with_distances(each) for each in runs])
 
 
+def test_leads_by_budget_reach_from_the_first_scored_iteration_of_any_run_to_the_last():
+    runs = [run("ours", s, 0.7, (10.0, 100.0)) for s in range(3)]
+    runs += [run("other", s, 0.5 + 0.2 * s, (100.0, 1000.0)) for s in range(3)]
+    found = compare(runs, "ours", draws=50)
+    np.testing.assert_allclose(found.budgets, np.geomspace(10.0, 1000.0, 6))
+    leads = found.ahead_at["other"]
+    # Ours has 0.45 after 10 s and 0.7 after 100; the other 0.2 before 100 s, then 0.45 and 0.7 on average over seeds.
+    assert [lead.value for lead in leads] == pytest.approx([0.25, 0.35, 0.45, 0.2, 0.1, 0.0])
+    assert leads[0].certain and leads[0].low == pytest.approx(0.25) and not leads[-1].certain
+    text = markdown(found, [_with_distances(each) for each in runs])
+    assert "| ours ahead after so many seconds, of | 10 | 25 | 63 | 158 | 398 | 1000 |" in text
+    assert "| other | **25.0** (25.0 to 25.0) | **35.0** (35.0 to 35.0) | " in text
+
+
+def test_one_method_alone_leads_nobody():
+    found = compare([run("ours", 0, 0.7)], "ours", draws=5)
+    assert found.ahead_at == {} and "ahead after" not in markdown(
+        found, [_with_distances(run("ours", 0, 0.7))]
+    )
+
+
 def _with_distances(each):
     distances = {"mug": {"pose": {"initial": 0.8, "learned": 0.1}}}
     more = {"iterations": [], "total_variation": distances, "config": {"trainer": {"accelerator": "cpu"}}}

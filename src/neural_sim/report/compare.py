@@ -174,7 +174,24 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
               "labelled validation images are not counted. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
               "iterations linear in log seconds.", ""]  # fmt: skip
-    return "\n".join([*lines, *_distances(c, runs), "", costs_table(runs)])
+    return "\n".join([*lines, *_leads(c, unit), *_distances(c, runs), "", costs_table(runs)])
+
+
+def _leads(c: Comparison, unit: str) -> list[str]:
+    """The reference's lead by budget; empty without another method."""
+    if not c.ahead_at:
+        return []
+    head = (
+        f"| {c.reference} ahead after so many {unit}, of | "
+        + " | ".join(f"{b:.0f}" for b in c.budgets)
+        + " |"
+    )
+    rows = [
+        f"| {method} | " + " | ".join(points(lead, sure=True) for lead in leads) + " |"
+        for method, leads in c.ahead_at.items()
+    ]
+    note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."
+    return [head, "|---|" + "---|" * len(c.budgets), *rows, "", note, ""]
 
 
 def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:

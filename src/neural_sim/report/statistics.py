@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,8 @@ BOUNDS = ("ns", "matched")
 ``oracle``, whose own runs are not compared again. The second is missing where the target's distribution is not known.
 """
 FIXED = ("ns", "oracle")
+BUDGETS = 6
+"""Seconds at which the methods are compared, evenly spaced in their logarithm."""
 Clock = Literal["seconds", "cpu_seconds"]
 """What a method has taken: by the clock on the wall, or of all processor cores together."""
 
@@ -49,8 +51,10 @@ class Comparison:
     empty without matched; ``ahead`` the
     reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
     unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
-    took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`. ``spent`` are means over seeds, the warm
-    start included. Where ``score`` is accuracy, that stands in the place of AP.
+    took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`; ``ahead_at`` is the reference method's
+    lead over each other one at each of ``budgets`` seconds, which reach from the first scored iteration of any run to
+    the last; a method that has ended by then keeps its last AP. ``spent`` are means over seeds, with the warm start.
+    Where ``score`` is accuracy, that stands in the place of AP.
     """
 
     setting: str
@@ -64,6 +68,8 @@ class Comparison:
     spent: Mapping[str, Mapping[str, float]]
     at_equal_cost: Mapping[str, Estimate]
     equal_cost: float
+    budgets: Sequence[float] = ()
+    ahead_at: Mapping[str, Sequence[Estimate]] = field(default_factory=dict)
     clock: Clock = "seconds"
     score: Score = "AP"
 
@@ -110,8 +116,8 @@ def compare(
         runs[0].setting, seeds, methods, reference, ap, won,
         dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
         {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
-         for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock), clock,
-        runs[0].score,
+         for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock),
+        *_ahead_at(table, seeds, methods, draws, seed, clock), clock, runs[0].score,
     )  # fmt: skip
 
 
@@ -178,6 +184,29 @@ def _at_equal_cost(
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
     reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
     return over_seeds(reached, draws, seed), _mean(budgets.values())
+
+
+def _ahead_at(
+    table: Mapping[tuple[str, int], FinishedRun],
+    seeds: Sequence[int],
+    methods: Sequence[str],
+    draws: int,
+    seed: int,
+    clock: Clock,
+) -> tuple[list[float], dict[str, list[Estimate]]]:
+    """Budgets of seconds, and the first method's lead over each other one at each of them."""
+    curves = {(m, s): biased_ap(table[m, s], clock) for m in methods for s in seeds}
+    spent = np.concatenate([times[times > 0.0] for times, _ in curves.values()])
+    if not len(spent):
+        return [], {}
+    budgets = np.unique(np.geomspace(spent.min(), spent.max(), BUDGETS)).tolist()
+    ahead: dict[str, list[Estimate]] = {m: [] for m in methods[1:]}
+    for budget in budgets:
+        reached = {key: ap_at(*curve, budget) for key, curve in curves.items()}
+        leads = {m: [reached[methods[0], s] - reached[m, s] for s in seeds] for m in methods[1:]}
+        for method, lead in over_seeds(leads, draws, seed).items():
+            ahead[method].append(lead)
+    return budgets, ahead
 
 
 def _areas(

@@ -22,7 +22,8 @@ def comparison():
         "gap", (0, 1), methods, "ours", {m: Estimate(0.5, 0.4, 0.6) for m in (*methods, "ns", "matched")},
         {m: Estimate(0.9, 0.8, 1.0) for m in methods}, ahead, {"first": Estimate(0.2, 0.1, 0.3)},
         {m: {"images": 10.0, "detector_steps": 5.0, "products": 1.0, "seconds": 7.0} for m in methods},
-        {m: Estimate(0.45) for m in methods}, 6.0,
+        {m: Estimate(0.45) for m in methods}, 6.0, [5.0, 60.0],
+        {"first": [Estimate(0.05, -0.1, 0.2), Estimate(0.15, 0.11, 0.2)]},
     )  # fmt: skip
 
 
@@ -47,3 +48,6 @@ def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
     assert re.search(r'class="rejected">\s*-10\.0', page)
     cells = "".join(f'<td class="n">{cell}</td>' for cell in [*["3"] * len(HEAD), "700", "12", ""])
     assert f"<tr><th>first</th>{cells}</tr>" in page and NOTE in page
+    row = page.split("<tr><th>ours ahead after so many s, of</th>")[1]
+    assert re.match(r'<th class="n">5</th><th class="n">60</th></tr>\s*<tr><th>first</th>\s*<td>\s*5\.0', row)
+    assert re.search(r'<td class="accepted">\s*15\.0 <span class="note">\(11\.0 to 20\.0\)', row)
