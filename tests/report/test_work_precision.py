@@ -59,6 +59,15 @@ def test_the_tables_are_written_from_the_json_alone():
     assert "field" not in text and "a processor" in text
 
 
+@pytest.mark.parametrize(
+    ("error", "words"), [(0.99, "1% less error"), (0.4, "2.5 times less error"), (0.0, "no error")]
+)
+def test_how_much_better_a_setting_is_than_the_default(error, words):
+    two = (Point("default", 1.0, 4.0, None, True, "a"), Point("clever", error, 2.0, None, False, "a"))
+    held = document([Series("field/can", "error", two, ())], MACHINE, [])
+    assert f"clever has {words} and takes 0.50 of the time." in markdown(held, "field")
+
+
 def test_files_and_figures(tmp_path):
     text = write(SERIES, document(SERIES, MACHINE, ["a note"]), tmp_path)
     assert (tmp_path / "work_precision.md").read_text() == text + "\n" and text.endswith("a note")

@@ -7,7 +7,7 @@ import pytest
 from neural_sim.report.work_precision_loop import half, seconds_to_half, series
 
 
-def run(method, seed, aps, seconds, learned, loss=1.0):
+def run(method, seed, aps, seconds, learned, loss=1.0, objective="ap"):
     """A run with ns at 0.2 and matched at 0.8: half of the gap is at 0.5."""
 
     def scores(ap):
@@ -20,6 +20,7 @@ def run(method, seed, aps, seconds, learned, loss=1.0):
     return {
         "method": method, "seed": seed, "biased": ["can", "mug"], "curve": curve,
         "ap": {"ns": scores(0.2), "matched": scores(0.8)},
+        "config": {"outer": {"objective": objective}},
         "iterations": [{"validation_loss": 9.0}, {"validation_loss": loss}],
         "total_variation": {name: {"pose": {"initial": 0.8, "learned": learned}} for name in ("can", "mug", "rest")},
     }  # fmt: skip
@@ -44,6 +45,13 @@ def test_every_method_has_errors_against_the_seconds_it_took():
     assert [(p.setting, p.error) for p in loss.points] == [("neural_sim", 1.0), ("lts", 2.0)]
     assert [p.error for p in away.points] == pytest.approx([0.2, 0.5]) and away.pareto == (True, False)
     assert ap.name == "loop/pose_gap, AP"
+
+
+def test_validation_losses_of_two_objectives_are_not_compared():
+    other = run("auto_sim", 0, (0.2, 0.4), (0.0, 5.0), 0.5, loss=0.1, objective="loss")
+    _, first, second, _ = series("pose_gap", [*FAST, other], "neural_sim", "seconds")
+    assert (first.name, second.name) == ("loop/pose_gap, objective ap", "loop/pose_gap, objective loss")
+    assert first.pareto == (True,) and [p.error for p in second.points] == [0.1]
 
 
 def test_half_of_the_gap_by_either_clock():

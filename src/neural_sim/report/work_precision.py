@@ -94,7 +94,9 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def _shown(value: float | None) -> str:
-    return "not a number" if value is None else f"{value:.2g}"
+    if value is None:
+        return "not a number"
+    return f"{value:.0f}" if 100.0 <= value < 1e5 else f"{value:.2g}"
 
 
 def _order(order: Row) -> str:
@@ -106,9 +108,12 @@ def _order(order: Row) -> str:
 
 def _overtaken(each: Row) -> str:
     ratio = each["error_ratio"]
-    less = (
-        "no error" if ratio is None else "the same error" if ratio < 1.01 else f"{ratio:.2g} times less error"
-    )
+    if ratio is None:
+        less = "no error"
+    elif ratio < 1.01:
+        less = "the same error"
+    else:
+        less = f"{1.0 - 1.0 / ratio:.0%} less error" if ratio < 2.0 else f"{ratio:.2g} times less error"
     faster = (
         f"takes {1.0 / each['seconds_ratio']:.2f} of the time" if each["seconds_ratio"] else "takes no time"
     )

@@ -51,11 +51,12 @@ class Loops:
 def series(
     label: str, runs: Sequence[Results], reference: str, clock: Clock, more: str = ""
 ) -> Iterator[Series]:
-    """AP of the biased classes, validation loss and distance to the target, means over seeds."""
+    """AP of the biased classes, validation loss by objective and distance to the target, means over seeds."""
     methods = {run["method"]: [r for r in runs if r["method"] == run["method"]] for run in runs}
     seeds = sorted({run["seed"] for run in runs})
     note = f"{', '.join(runs[0]['biased'])}; seeds {', '.join(map(str, seeds))}; the warm start is included.{more}"
-    scored, losses, distances = [], [], []
+    scored, distances = [], []
+    losses: dict[str, list[Point]] = {}  # by objective: the validation losses of two have no common scale
     for method, mine in methods.items():
         for place in range(min(len(run["curve"]) for run in mine)):
             points = [(run["curve"][place], run) for run in mine]
@@ -81,10 +82,12 @@ def series(
         ends, default = fmean(run["curve"][-1][clock] for run in mine), method == reference
         if all(run["iterations"] for run in mine):
             loss = fmean(run["iterations"][-1]["validation_loss"] for run in mine)
-            losses.append(Point(method, loss, ends, None, default, method))
+            point = Point(method, loss, ends, None, default, method)
+            losses.setdefault(mine[0]["config"]["outer"]["objective"], []).append(point)
         distances.append(Point(method, fmean(distance(run) for run in mine), ends, None, default, method))
     kinds = (
-        ("AP", "1 - AP of the biased classes", scored), ("validation loss", "validation loss", losses),
+        ("AP", "1 - AP of the biased classes", scored),
+        *((f"objective {name}", "validation loss", points) for name, points in losses.items()),
         ("distance", "total variation to the target", distances),
     )  # fmt: skip
     for kind, error, points in kinds:
