@@ -55,8 +55,9 @@ def measured(
     loop = stage.loop(context.results)
     if not isinstance(loop, SimulatorModule):
         raise ValueError("foretold: wants a method that follows the hypergradient")
-    p = context.experiment.imaging.distribution.probabilities(psi)
-    p = torch.cat([*p.values()], -1)
+    distribution = context.experiment.imaging.distribution
+    parts = distribution.split(psi)
+    scale = distribution.join({f.name: f.log_slopes(parts[f.name]).exp() for f in distribution.factors})
     found = {"response": response(loop.inner, psi).value}
     own = loop.inner.settings
     exact, implicit = (
@@ -69,7 +70,7 @@ def measured(
         inner.settings = how
         loop = SimulatorModule(inner, psi, loop.estimator, solver)
         slopes = loop.derivative().psi_gradients
-        found[way] = -torch.stack([slopes[name] for name in loop.scene.names]) / p
+        found[way] = -torch.stack([slopes[name] for name in loop.scene.names]) / scale
     return found
 
 

@@ -88,6 +88,18 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
         assert verdicts[name].expected_gain == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
 
 
+def test_the_best_bin_wins_though_its_probability_is_at_the_floor():
+    """Derivatives by logits are p - floor times those by p: over p, that of a bin at the floor would be near 0."""
+    floored = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi, floor=0.005)
+    psi = torch.tensor([[4.0, 0.0, 0.0, -8.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    scores = torch.tensor([[0.0, 0.0, 0.5, 1.0], [0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
+    (by_logits,) = torch.autograd.grad((floored.log_probabilities(psi).exp() * scores).sum(), psi)
+    steps = steps_at(psi.detach(), factors=(floored,))
+    steps.observe(hypergradient(-by_logits, torch.zeros_like(by_logits)))
+    direction = steps._joined["pose"].value
+    torch.testing.assert_close(direction, scores - scores.mean(1, keepdim=True))
+
+
 def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorter():
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi)

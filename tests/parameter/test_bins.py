@@ -15,6 +15,27 @@ def test_logits_invert_log_probabilities():
         torch.testing.assert_close(back, p, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("floor", [0.0, 0.005])
+def test_log_slopes_turn_derivatives_by_p_into_those_by_logits(floor, generator):
+    psi = torch.tensor(
+        [[3.0, 0.0, -12.0, 1.0], [0.1, -0.2, 0.3, 0.0]], dtype=torch.float64, requires_grad=True
+    )
+    by_p = torch.randn(2, 4, generator=generator, dtype=torch.float64)
+    (by_logits,) = torch.autograd.grad((by_p * binned.log_probabilities(psi, floor).exp()).sum(), psi)
+    scale = binned.log_slopes(psi.detach(), floor).exp()
+    mean = (scale * by_p).sum(-1, keepdim=True) / scale.sum(-1, keepdim=True)
+    torch.testing.assert_close(by_logits, scale * (by_p - mean), rtol=1e-9, atol=1e-18)
+
+
+def test_bounded_logits_keep_p_near_the_floor_and_return_in_a_few_steps():
+    psi = torch.tensor([4.0, -20.0, 1.0, 0.0], dtype=torch.float64)
+    near = binned.bounded(psi, 0.005)
+    assert torch.equal(near[[0, 2, 3]], psi[[0, 2, 3]]) and torch.equal(binned.bounded(near, 0.005), near)
+    p = binned.log_probabilities(near, 0.005).exp()
+    assert 0.005 < float(p[1]) < 1.25 * 0.005
+    assert torch.equal(binned.bounded(psi, 0.0), psi)
+
+
 def test_floor_out_of_range_is_refused():
     with pytest.raises(ValueError, match="floor"):
         binned.log_probabilities(torch.zeros(4), 0.25)

@@ -115,11 +115,11 @@ class CheckedSteps:
         p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
         for factor in self.distribution.factors:
             name = factor.name
-            p = factor.log_probabilities(psi[name]).exp()
-            # The derivative by p: that by logits is p times it, and would hardly move a bin of small p.
-            direction = -slope[name] / p
+            scale = factor.log_slopes(psi[name]).exp()
+            # The derivative by p: that by logits is scaled by p, and would hardly move a bin of small p.
+            direction = -slope[name] / scale
             direction = direction - direction.mean(-1, keepdim=True)
-            self._joined[name] = self._joined[name].joined(direction, (noise[name] / p).square())
+            self._joined[name] = self._joined[name].joined(direction, (noise[name] / scale).square())
             for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
                 p_values[object_name][name] = value
         return p_values

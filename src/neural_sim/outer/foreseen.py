@@ -71,11 +71,11 @@ def expected(
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
-        p, scale = factor.p_of(own), factor.log_probabilities(own).exp()
+        p, scale = factor.p_of(own), factor.log_slopes(own).exp()
         average = Average.zeros(own)
         for result in results:
             gradient, error = (distribution.split(v)[factor.name] for v in stacked(result, names, psi))
-            # By p, as in CheckedSteps: the derivative by logits is p times it.
+            # By p, as in CheckedSteps: the derivative by logits is scaled.
             direction = -gradient / scale
             direction = direction - direction.mean(-1, keepdim=True)
             average = average.joined(direction, (error / scale).square())

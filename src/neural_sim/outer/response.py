@@ -45,7 +45,7 @@ class Response:
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
-            p = factor.log_probabilities(at[factor.name]).exp()
+            p = factor.log_slopes(at[factor.name]).exp()
             value = values[factor.name]
             mean = (p * value).sum(1, keepdim=True) / p.sum(1, keepdim=True)
             parts[factor.name] = -p * (value - mean) / len(psi)
@@ -87,7 +87,7 @@ def agreement(
     for label in learned:
         gradient = distribution.split(result.psi_gradients[inner.scene.names[label]])
         for factor in distribution.factors:
-            p = factor.log_probabilities(distribution.split(psi[label])[factor.name]).exp()
+            p = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
             cosines.append(centred_cosine(gradient[factor.name] / p, truth[factor.name][label] / p))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
     return sum(known) / len(known) if known else math.nan

@@ -121,7 +121,7 @@ class FreeSteps:
         """One factor's step in logits of bins, or in weights of lights, which are projected on their constraint."""
         update: Update = getattr(self.settings, factor.update)
         moved, self._states[factor.name] = update.step(
-            psi, factor.log_probabilities(psi), slope, noise, self._states[factor.name]
+            psi, factor.log_slopes(psi), slope, noise, self._states[factor.name]
         )
         return factor.project(moved)
 

@@ -29,6 +29,20 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
     return torch.logaddexp(log_softmax + math.log1p(-bins * floor), torch.full_like(psi, math.log(floor)))
 
 
+def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
+    """log w, for which the derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)): w = p - ``floor``, computed
+    without cancellation. Divided by p in its place, derivatives of bins at the floor would vanish."""
+    return torch.log_softmax(psi, -1) + math.log1p(-psi.shape[-1] * floor)
+
+
+def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
+    """psi with no logit further below the largest than log(4 / ``floor``). There a bin's p is within a quarter of the
+    floor; further down p hardly changes, yet a step of some logits would not bring the bin back."""
+    if floor == 0.0:
+        return psi
+    return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(4.0 / floor))
+
+
 def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Centred logits whose :func:`log_probabilities` are log ``probabilities``, clamped to just above the floor."""
     bins = probabilities.shape[-1]

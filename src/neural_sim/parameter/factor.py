@@ -63,7 +63,8 @@ class Factor(Protocol):
     depend on.
 
     ``psi`` is the configured ``initial`` or ``target`` psi of an object, float64. ``psi_of`` maps probabilities of bins
-    or weights of lights to psi; ``p_of`` is its inverse. ``log_probabilities`` are 0 for lights, whose steps are
+    or weights of lights to psi; ``p_of`` is its inverse. A derivative by psi, divided by the exponential of
+    ``log_slopes``, is that by p but for a constant. These and ``log_probabilities`` are 0 for lights, whose steps are
     Euclidean. ``project`` returns the nearest psi that meets the factor's constraint. ``stratum_of`` returns the
     stratum of each draw. ``reach`` converts a score to the units of psi and gives the largest step, for a method whose
     steps are at most ``step`` logits.
@@ -85,6 +86,7 @@ class Factor(Protocol):
     def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
@@ -178,9 +180,13 @@ class BinnedFactor:
         """log p over the bins, floored."""
         return binned.log_probabilities(psi, self.floor)
 
+    def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """log (p - floor)."""
+        return binned.log_slopes(psi, self.floor)
+
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """psi itself: logits are unconstrained."""
-        return psi
+        """Logits within reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
+        return binned.bounded(psi, self.floor)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The bin of each draw's coordinate, which a relaxed draw may not share with the bin that it was drawn for."""

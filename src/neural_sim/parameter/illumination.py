@@ -128,6 +128,10 @@ class Illumination:
         """0: nothing is drawn, and steps are Euclidean."""
         return torch.zeros_like(psi)
 
+    def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """0: psi are the weights."""
+        return torch.zeros_like(psi)
+
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
