@@ -40,9 +40,9 @@ def context_of(overrides: list[str]) -> Context:
 
 
 def visited(trajectory: Float[Tensor, "n objects K"]) -> dict[str, Float[Tensor, "objects K"]]:
-    """Where a loop started, was after its first step that counted, and ended."""
+    """Where a loop started, was after its first step, and ended. No step: the start alone."""
     moved = [psi for psi in trajectory if not torch.equal(psi, trajectory[0])]
-    places = {"after one step": moved[0], "end": moved[-1]} if moved else {}
+    places = {"after one step": moved[0], "end": trajectory[-1]} if moved else {}
     return {"start": trajectory[0], **places}
 
 

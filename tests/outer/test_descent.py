@@ -49,16 +49,26 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     # The last training judges and takes no derivative.
     assert last.certificate is None and "hypergradient" not in last.seconds
     assert set(middle.verdicts) == {"a", "b"} and set(last.verdicts) <= {"a", "b"}
-    assert torch.equal(learned.trajectory[1], learned.trajectory[0])  # nothing was judged yet
-    # An iteration's derivative is that at the psi which its verdicts accepted.
-    for number, record in enumerate(learned.records[:-1], 1):
-        reported = module.scene.distribution.probabilities(learned.trajectory[number])["pose"]
-        torch.testing.assert_close(torch.tensor(record.probabilities["pose"], dtype=torch.float64), reported)
-    tried = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
-    before, after = (module.scene.distribution.probabilities(psi)["pose"] for psi in learned.trajectory[-2:])
-    for label, name in enumerate(("a", "b")):
-        accepted = name in last.verdicts and last.verdicts[name].accepted
-        torch.testing.assert_close(after[label], (tried if accepted else before)[label])
+
+    def pose(psi):
+        return module.scene.distribution.probabilities(psi)["pose"]
+
+    start, *tried = (pose(psi) for psi in learned.trajectory)
+    assert bool((tried[0] != start).any(1).all())  # not judged yet
+    # An iteration's derivative is that at the psi which its verdicts accepted, and so is the result.
+    accepted = start
+    for number, record in enumerate((middle, last), 1):
+        rose = torch.tensor(
+            [name in record.verdicts and record.verdicts[name].accepted for name in ("a", "b")]
+        )
+        accepted = torch.where(rose[:, None], tried[number - 1], accepted)
+        if record is middle:
+            torch.testing.assert_close(
+                torch.tensor(record.probabilities["pose"], dtype=torch.float64), accepted
+            )
+    torch.testing.assert_close(pose(learned.last), accepted)
+    tested = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
+    torch.testing.assert_close(tested, tried[1])
 
 
 def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
@@ -87,7 +97,11 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
     assert [part[:2] for part in trained] == [(0, True), (1, True), (1, False), (2, True), (2, False)]
     start, again, tried, accepted, last = (psi for _, _, psi in trained)
     assert torch.equal(start, again) and bool((tried != start).any(1).all())
-    assert torch.equal(accepted, learned.trajectory[2]) and not torch.equal(last, accepted)
+    assert torch.equal(tried, learned.trajectory[1]) and torch.equal(last, learned.trajectory[2])
+    rose = [learned.records[1].verdicts[name].accepted for name in ("a", "b")]
+    assert torch.equal(accepted, torch.where(torch.tensor(rose)[:, None], tried, start)) and not torch.equal(
+        last, accepted
+    )
 
 
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):

@@ -57,7 +57,8 @@ class CheckedSteps:
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        return self.accepted
+        """With the last step: until a training has judged it, its expected gain speaks for it."""
+        return self.trial
 
     @property
     def pending(self) -> bool:
@@ -93,7 +94,7 @@ class CheckedSteps:
         if bool(pending.any()) and bool(rose[pending].all()) and total < -self.settings.errors * of_total:
             rose = torch.zeros_like(rose)
         accepted = pending & rose
-        self.accepted = torch.where(accepted[:, None], self.trial, self.accepted)
+        self.accepted = self.trial = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
             scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
             self.radius[name] = torch.where(

@@ -66,9 +66,12 @@ def record_of(stored: Mapping[str, Any]) -> IterationRecord:
 
 @dataclass(frozen=True)
 class LearnedPsi:
-    """The loop's result. ``trajectory`` has the method's psi before the first iteration and after each, a checked step
-    once it is accepted. ``before`` is the cost before the first iteration: the warm start, whose backbone every loop
-    uses."""
+    """The loop's result.
+
+    ``trajectory`` has the method's psi before the first iteration and after each; a checked step is in it at once, and
+    undone an iteration later if it is rejected. ``before`` is the cost before the first iteration: the warm start,
+    whose backbone every loop uses.
+    """
 
     trajectory: Float[Tensor, "iterations+1 objects K"]
     records: list[IterationRecord]

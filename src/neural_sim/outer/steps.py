@@ -46,7 +46,8 @@ class Steps(Protocol):
         ...
 
     def observe(self, result: Hypergradient) -> PValues:
-        """Add a derivative at ``reported``; p-values of the null that the derivative which steps follow is zero."""
+        """Add a derivative at ``reported``, after :meth:`judge` where a step was pending; p-values of the null that the
+        derivative which steps follow is zero."""
         ...
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
