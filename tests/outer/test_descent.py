@@ -83,7 +83,7 @@ def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
 
 
 def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
+    module = checked_loop(scene, trust=Trust(level=None), checks=Checks(trainings=2))
     trained, inner = [], module.inner
     train = inner.train
 
@@ -105,7 +105,7 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
 
 
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):
-    module = checked_loop(scene, 4, trust=Trust(level=None))
+    module = checked_loop(scene, 4, trust=Trust(level=None), checks=Checks(trainings=2))
     seen, derivative = [], module._derivative
 
     def watched(*arguments):
@@ -123,7 +123,7 @@ def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(sc
 
 
 def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene):
-    module = checked_loop(scene, 3, trust=Trust(level=None), certify_every=2)
+    module = checked_loop(scene, 3, trust=Trust(level=None), checks=Checks(trainings=2), certify_every=2)
     seen, derivative = [], module._derivative
 
     def watched(*arguments):

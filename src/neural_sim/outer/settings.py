@@ -67,7 +67,8 @@ class Checks:
     """Trust-region steps, which another training accepts or rejects.
 
     Args:
-        trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter.
+        trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter. After
+            one, the test knows the scatter of images alone; the next training accepts or rejects all the same.
         folds: disjoint parts of the validation images; each derivative is that of L_val on one of them, so that the
             scatter between derivatives has that of the validation images in it.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
@@ -85,7 +86,7 @@ class Checks:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    trainings: int = 2
+    trainings: int = 1
     folds: int = 2
     radius: float = 0.5
     largest: float = 0.7
