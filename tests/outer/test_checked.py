@@ -88,7 +88,7 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
         assert verdicts[name].expected_gain == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=0.05)
 
 
-def test_the_best_bin_wins_though_its_probability_is_at_the_floor():
+def test_directions_are_derivatives_by_p_where_a_bin_is_at_the_floor():
     """Derivatives by logits are p - floor times those by p: over p, that of a bin at the floor would be near 0."""
     floored = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi, floor=0.005)
     psi = torch.tensor([[4.0, 0.0, 0.0, -8.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)

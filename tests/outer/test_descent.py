@@ -57,18 +57,12 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
     assert bool((tried[0] != start).any(1).all())  # not judged yet
     # An iteration's derivative is that at the psi which its verdicts accepted, and so is the result.
     accepted = start
-    for number, record in enumerate((middle, last), 1):
-        rose = torch.tensor(
-            [name in record.verdicts and record.verdicts[name].accepted for name in ("a", "b")]
-        )
-        accepted = torch.where(rose[:, None], tried[number - 1], accepted)
-        if record is middle:
-            torch.testing.assert_close(
-                torch.tensor(record.probabilities["pose"], dtype=torch.float64), accepted
-            )
-    torch.testing.assert_close(pose(learned.last), accepted)
-    tested = torch.tensor(last.probabilities["pose"], dtype=torch.float64)
-    torch.testing.assert_close(tested, tried[1])
+    after = (middle.probabilities["pose"], pose(learned.last))
+    for record, step, result in zip((middle, last), tried, after, strict=False):
+        rose = [name in record.verdicts and record.verdicts[name].accepted for name in ("a", "b")]
+        accepted = torch.where(torch.tensor(rose)[:, None], step, accepted)
+        torch.testing.assert_close(torch.as_tensor(result, dtype=torch.float64), accepted)
+    torch.testing.assert_close(torch.tensor(last.probabilities["pose"], dtype=torch.float64), tried[1])
 
 
 def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
@@ -99,9 +93,8 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
     assert torch.equal(start, again) and bool((tried != start).any(1).all())
     assert torch.equal(tried, learned.trajectory[1]) and torch.equal(last, learned.trajectory[2])
     rose = [learned.records[1].verdicts[name].accepted for name in ("a", "b")]
-    assert torch.equal(accepted, torch.where(torch.tensor(rose)[:, None], tried, start)) and not torch.equal(
-        last, accepted
-    )
+    assert torch.equal(accepted, torch.where(torch.tensor(rose)[:, None], tried, start))
+    assert not torch.equal(last, accepted)
 
 
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):

@@ -27,7 +27,7 @@ def test_log_slopes_turn_derivatives_by_p_into_those_by_logits(floor, generator)
     torch.testing.assert_close(by_logits, scale * (by_p - mean), rtol=1e-9, atol=1e-18)
 
 
-def test_bounded_logits_keep_p_near_the_floor_and_return_in_a_few_steps():
+def test_bounded_logits_keep_p_near_the_floor():
     psi = torch.tensor([4.0, -20.0, 1.0, 0.0], dtype=torch.float64)
     near = binned.bounded(psi, 0.005)
     assert torch.equal(near[[0, 2, 3]], psi[[0, 2, 3]]) and torch.equal(binned.bounded(near, 0.005), near)

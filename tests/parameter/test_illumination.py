@@ -70,7 +70,7 @@ def nearest_by_enumeration(point, constraint):
 
 def step(illumination, update, psi, gradient, standard_error, state):
     """A step of the psi loop: an update's in the Euclidean metric, then the projection."""
-    moved, after = update.step(psi, illumination.log_probabilities(psi), gradient, standard_error, state)
+    moved, after = update.step(psi, illumination.log_slopes(psi), gradient, standard_error, state)
     return illumination.project(moved), after
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import MixedDerivative
-from neural_sim.parameter.factor import Factor
+from neural_sim.parameter.factor import BinnedFactor, Factor
 
 LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
@@ -62,9 +62,9 @@ def by_strata(
     """The derivative by one factor's psi from the scores of its probes, stratum after stratum, by :func:`stratified`;
     for lights :func:`across_lights` instead."""
     table = scores.view(factor.size, -1)
-    if factor.lights:
-        return across_lights(table, weight)
-    return stratified(table, psi, factor.log_probabilities, weight)
+    if isinstance(factor, BinnedFactor):
+        return stratified(table, psi, factor.log_probabilities, weight)
+    return across_lights(table, weight)
 
 
 def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDerivative:

@@ -117,7 +117,7 @@ class CheckedSteps:
         for factor in self.distribution.factors:
             name = factor.name
             scale = factor.log_slopes(psi[name]).exp()
-            # The derivative by p: that by logits is scaled by p, and would hardly move a bin of small p.
+            # The derivative by p: that by logits is p - floor times it, and would hardly move a bin of small p.
             direction = -slope[name] / scale
             direction = direction - direction.mean(-1, keepdim=True)
             self._joined[name] = self._joined[name].joined(direction, (noise[name] / scale).square())

@@ -75,7 +75,7 @@ def expected(
         average = Average.zeros(own)
         for result in results:
             gradient, error = (distribution.split(v)[factor.name] for v in stacked(result, names, psi))
-            # By p, as in CheckedSteps: the derivative by logits is scaled.
+            # By p, as in CheckedSteps: that by logits is p - floor times it.
             direction = -gradient / scale
             direction = direction - direction.mean(-1, keepdim=True)
             average = average.joined(direction, (error / scale).square())

@@ -45,10 +45,10 @@ class Response:
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
-            p = factor.log_slopes(at[factor.name]).exp()
+            scale = factor.log_slopes(at[factor.name]).exp()
             value = values[factor.name]
-            mean = (p * value).sum(1, keepdim=True) / p.sum(1, keepdim=True)
-            parts[factor.name] = -p * (value - mean) / len(psi)
+            mean = (scale * value).sum(1, keepdim=True) / scale.sum(1, keepdim=True)
+            parts[factor.name] = -scale * (value - mean) / len(psi)
         return distribution.join(parts)
 
 
@@ -87,8 +87,8 @@ def agreement(
     for label in learned:
         gradient = distribution.split(result.psi_gradients[inner.scene.names[label]])
         for factor in distribution.factors:
-            p = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
-            cosines.append(centred_cosine(gradient[factor.name] / p, truth[factor.name][label] / p))
+            scale = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
+            cosines.append(centred_cosine(gradient[factor.name] / scale, truth[factor.name][label] / scale))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
     return sum(known) / len(known) if known else math.nan
 

@@ -23,10 +23,8 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
     bins = psi.shape[-1]
     if not 0.0 <= floor < 1.0 / bins:
         raise ValueError(f"parameter: floor must lie in [0, 1/{bins}), got {floor}")
-    log_softmax = torch.log_softmax(psi, -1)
-    if floor == 0.0:
-        return log_softmax
-    return torch.logaddexp(log_softmax + math.log1p(-bins * floor), torch.full_like(psi, math.log(floor)))
+    above = log_slopes(psi, floor)
+    return above if floor == 0.0 else torch.logaddexp(above, torch.full_like(psi, math.log(floor)))
 
 
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:

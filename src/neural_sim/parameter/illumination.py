@@ -124,12 +124,8 @@ class Illumination:
         """psi itself."""
         return psi
 
-    def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """0: nothing is drawn, and steps are Euclidean."""
-        return torch.zeros_like(psi)
-
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """0: psi are the weights."""
+        """0: psi are the weights, and steps are Euclidean."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:

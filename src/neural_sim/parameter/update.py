@@ -1,9 +1,9 @@
 """Steps of psi along a hypergradient, bounded so that one noisy gradient cannot collapse p.
 
-For bins, psi are logits and ``log_p`` [objects, k] their log probabilities; steps are in logits. For lights, psi are
-weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's ``project`` returns the
-result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and ``standard_error`` have psi's
-shape, in units of the outer loss over those of psi.
+For bins, psi are logits and ``log_p`` [objects, k] the factor's ``log_slopes``, log p without the floor; steps are in
+logits. For lights, psi are weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's
+``project`` returns the result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and
+``standard_error`` have psi's shape, in units of the outer loss over those of psi.
 """
 
 from __future__ import annotations

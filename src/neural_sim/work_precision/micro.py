@@ -60,6 +60,6 @@ def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[Bi
     backbone, warm = detector.split(params)
     held = CachedSet.of(detector, backbone, LabelledImages.concatenate(probes)).double()
     bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
-    factor = scene.distribution.factors[0]
+    factor = scene.distribution.binned[0]
     problem = BinnedProblem(held.losses, bins, factor.log_probabilities, 0.0, as_double(warm))
     return problem, CachedSet.of(detector, backbone, validation).double().mean_terms()
