@@ -36,6 +36,35 @@ def test_bounded_logits_keep_p_near_the_floor():
     assert torch.equal(binned.bounded(psi, 0.0), psi)
 
 
+def test_balanced_draws_have_the_bins_expected_numbers_and_each_follows_p(generator):
+    p = torch.tensor([0.47, 0.3, 0.17, 0.05, 0.01], dtype=torch.float64)
+    n, trials = 20, 4_000
+    first = torch.zeros(5, dtype=torch.float64)
+    counts = torch.zeros(trials, 5, dtype=torch.float64)
+    for trial in range(trials):
+        noise = binned.gumbel((n, 5), generator, torch.float64)
+        drawn = binned.balanced(p.log(), noise, float(torch.rand((), generator=generator)))
+        first[drawn[0]] += 1.0 / trials
+        counts[trial] = torch.bincount(drawn, minlength=5)
+    assert ((counts - n * p).abs() < 1.0).all() and (counts.sum(1) == n).all()
+    torch.testing.assert_close(counts.mean(0), n * p, rtol=0.0, atol=4 * 0.5 / trials**0.5)
+    assert ((first - p).abs() < 4 * (p * (1 - p) / trials).sqrt()).all()
+
+
+def test_balanced_draws_that_are_balanced_already_stay_and_few_follow_a_small_change(generator):
+    noise = binned.gumbel((200, 8), generator, torch.float64)
+    uniform = torch.full((8,), 1 / 8, dtype=torch.float64)
+    before = binned.balanced(uniform.log(), noise, 0.5)
+    moved = 0.9 * uniform
+    moved[2] += 0.1
+    after = binned.balanced(moved.log(), noise, 0.5)
+    assert 0.1 * 7 / 8 - 0.02 <= float((before != after).double().mean()) < 0.2
+    free = noise.argmax(-1)
+    wanted = torch.bincount(free, minlength=8).double() / 200
+    settled = binned.balanced(wanted.log(), noise - wanted.log(), 0.5)
+    assert torch.equal(settled, free)
+
+
 def test_floor_out_of_range_is_refused():
     with pytest.raises(ValueError, match="floor"):
         binned.log_probabilities(torch.zeros(4), 0.25)

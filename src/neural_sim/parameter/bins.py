@@ -69,6 +69,30 @@ def gumbel(
     return -(-(uniform.clamp(1e-12, 1.0 - 1e-12)).log()).log().to(dtype)
 
 
+def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: float) -> Int[Tensor, "n"]:
+    """Bins of n draws of which each follows p, and bin b has n p_b, rounded down or up.
+
+    The counts are those of systematic sampling: the numbers ``offset``, ``offset`` + 1, ... below n (``offset`` uniform
+    in [0, 1)) that fall between the cumulated n p. The draws begin at the Gumbel-max ones; those of bins with too many
+    that lose least change to bins with too few. So most draws stay when p moves under the same noise.
+    """
+    count, k = gumbel.shape
+    p = log_p.double().softmax(-1)
+    ends = torch.cat([p.new_zeros(1), (count * p[:-1].cumsum(-1) - offset).ceil(), p.new_tensor([count])])
+    wanted = ends.diff().long()
+    values = log_p.double() + gumbel.double()
+    chosen = values.argmax(-1)
+    have = torch.bincount(chosen, minlength=k)
+    while bool((have > wanted).any()):
+        loss = values.gather(1, chosen[:, None]) - values
+        barred = (have <= wanted)[chosen][:, None] | (have >= wanted)
+        row, into = divmod(int(loss.masked_fill(barred, torch.inf).argmin()), k)
+        have[chosen[row]] -= 1
+        have[into] += 1
+        chosen[row] = into
+    return chosen
+
+
 def exponential(shape: tuple[int, int, int], generator: torch.Generator, dtype: torch.dtype) -> Tensor | None:
     """Standard exponential noise of (draws, conditional, bins) for :func:`conditional_gumbel`; None for none of it."""
     if not shape[1]:

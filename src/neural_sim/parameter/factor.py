@@ -199,6 +199,11 @@ class BinnedFactor:
         """Exact samples of the bins by the Gumbel-max trick; no derivative reaches psi."""
         return (self.log_probabilities(psi.detach()) + noise.gumbel).argmax(-1)
 
+    def balanced(self, psi: Float[Tensor, "k"], noise: BinNoise, offset: float) -> Int[Tensor, "n"]:
+        """Samples of which each is exact and whose numbers in the bins are n p, rounded, see
+        :func:`~neural_sim.parameter.bins.balanced`."""
+        return binned.balanced(self.log_probabilities(psi.detach()), noise.gumbel, offset)
+
     def at(self, bins: Int[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """The coordinate in given bins, at the fraction ``within`` of each."""
         return self._place(self._centres(within)[bins], within)

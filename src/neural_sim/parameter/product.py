@@ -186,6 +186,15 @@ class SceneDistribution:
         bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
+    def balanced(self, psi: Float[Tensor, "K"], noise: SceneNoise, generator: torch.Generator) -> SceneDraw:
+        """Samples of p_psi, each exact, whose numbers in every factor's bins are n p, rounded; no derivative reaches
+        psi."""
+        parts, bins = self.split(psi), {}
+        for f in self.binned:
+            offset = float(torch.rand((), generator=generator, dtype=torch.float64))
+            bins[f.name] = f.balanced(parts[f.name], noise.bins[f.name], offset)
+        return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
+
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:
         """Samples in given bins of every factor, uniform within each; without a light."""
         placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.binned}

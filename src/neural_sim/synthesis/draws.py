@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.noise import SceneNoise
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,22 @@ class RelaxedDraws:
 
 @dataclass(frozen=True)
 class HardDraws:
-    """Exact samples of p_psi. ``explore``: lights around psi's, for estimators that need a density."""
+    """Exact samples of p_psi, balanced over the bins. ``explore``: independent ones, and lights around psi's, for
+    estimators that need the density of the draws together."""
 
     explore: bool = False
+
+    def of(
+        self,
+        distribution: SceneDistribution,
+        psi: Float[Tensor, "K"],
+        noise: SceneNoise,
+        generator: torch.Generator,
+    ) -> SceneDraw:
+        """The draws of one object; ``generator`` draws how the bins' numbers are rounded."""
+        if self.explore:
+            return distribution.hard(psi, noise)
+        return distribution.balanced(psi, noise, generator)
 
 
 Draws = HardDraws | RelaxedDraws

@@ -84,7 +84,7 @@ class ImagePool:
             raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
         noise = self.scene.distribution.draw_noise(count, generator)
         within = torch.randint(self.objects[label].per_cell, (count,), generator=generator)
-        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, within)
+        return self._taken(label, how.of(self.scene.distribution, psi.float(), noise, generator).bins, within)
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator

@@ -102,7 +102,7 @@ class Scene:
         if isinstance(how, RelaxedDraws):
             return self._drawn_relaxed(label, logits, count, generator, how)
         noise = self.distribution.draw_noise(count, generator, self.dtype(label), explore=how.explore)
-        return self.render(label, self.distribution.hard(logits, noise), noise)
+        return self.render(label, how.of(self.distribution, logits, noise, generator), noise)
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
