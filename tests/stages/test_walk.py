@@ -24,8 +24,8 @@ from neural_sim.synthesis.export.coco import write_coco
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
-    "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64", "training.cold_epochs=12",
-    "training.warm_epochs=12", "training.images_per_object=24", "target.val_per_object=8",
+    "views.held_out=2", "budget.grid.steps=20", "budget.grid.resolution=64", "training.cold_epochs=30",
+    "training.warm_epochs=30", "training.images_per_object=24", "target.val_per_object=8",
     "objects.names=[pitcher,drill]", "stages=[views,field,target_sets,warm_start,psi,evaluate]",
 ]  # fmt: skip
 

@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from jaxtyping import Int
@@ -27,12 +28,18 @@ from neural_sim.types import LabelledImages
 class Training:
     """Training settings of every detector, whatever the method that chose its images.
 
-    ``image_size`` is the side of the square images in pixels; ``warm_epochs`` are those of the warm start,
-    ``cold_epochs`` those of the detectors that are scored; ``real`` says whether labelled photographs train too. For
-    the rest see :class:`Optimisation`."""
+    ``image_size`` is the side of the square images in pixels; ``warm_start`` says which distribution the images of the
+    warm start have, psi's initial one or all parameters uniform; ``warm_epochs`` are its epochs, ``cold_epochs`` those
+    of the detectors that are scored; ``real`` says whether labelled photographs train too. For the rest see
+    :class:`Optimisation`.
+
+    Raises:
+        ValueError: any of these out of its range, with the key and the value.
+    """
 
     image_size: int = 96
     images_per_object: int = 100
+    warm_start: Literal["uniform", "initial"] = "initial"
     warm_epochs: int = 30
     cold_epochs: int = 30
     batch_size: int = 32
@@ -41,6 +48,8 @@ class Training:
     real: Real = field(default_factory=Real)
 
     def __post_init__(self) -> None:
+        if self.warm_start not in ("uniform", "initial"):
+            raise ValueError(f"training.warm_start must be uniform or initial, got {self.warm_start!r}")
         at_least("training", 1, images_per_object=self.images_per_object, batch_size=self.batch_size)
         at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
         at_least("training", 16, image_size=self.image_size)

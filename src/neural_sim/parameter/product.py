@@ -125,6 +125,11 @@ class SceneDistribution:
             [torch.cat([factor.psi(which, name) for factor in self.factors]) for name in objects]
         )
 
+    @property
+    def uniform(self) -> Float[Tensor, "K"]:
+        """The psi of uniform bins and equal weights of lights."""
+        return torch.cat([f.psi_of(torch.full((f.size,), 1 / f.size).double()) for f in self.factors])
+
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
         """Every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
@@ -187,8 +192,7 @@ class SceneDistribution:
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def balanced(self, psi: Float[Tensor, "K"], noise: SceneNoise, generator: torch.Generator) -> SceneDraw:
-        """Samples of p_psi, each exact, whose numbers in every factor's bins are n p, rounded; no derivative reaches
-        psi."""
+        """Samples of p_psi, each exact, whose numbers in every factor's bins are n p, rounded; without a derivative."""
         parts, bins = self.split(psi), {}
         for f in self.binned:
             offset = float(torch.rand((), generator=generator, dtype=torch.float64))

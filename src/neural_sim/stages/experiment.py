@@ -73,7 +73,8 @@ class Experiment:
     the report writes of the final detector.
 
     Raises:
-        ValueError: a detector, an objective or images that are not of the task.
+        ValueError: a detector, an objective or images that are not of the task; a first hypergradient at a warm start
+            of another distribution than psi's.
     """
 
     run: Run
@@ -95,6 +96,11 @@ class Experiment:
         wanted = {"AP": "average_precision", "accuracy": "accuracy"}[score]
         if objective not in (wanted, "loss"):
             raise ValueError(f"outer.objective: want {wanted} or loss for task={task}, got {objective}")
+        if not self.loop.outer.train_first and self.training.warm_start != "initial":
+            raise ValueError(
+                "outer.train_first=false takes the first hypergradient at the warm start: want "
+                f"training.warm_start=initial, got {self.training.warm_start}"
+            )
         if score == "AP" and not getattr(self.imaging.target, "boxed", True):
             raise ValueError(
                 f"target: its photographs have no boxes, want task=classification, got task={task}"

@@ -182,10 +182,13 @@ class Graph:
 
     @cached_property
     def warm_start(self) -> DetectorStage:
-        """The detector that the psi loop begins with; with equal epochs, and unless scored detectors are fine-tuned, it
-        is also the one scored as ``ns``."""
-        epochs = self.experiment.training.warm_epochs
-        return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
+        """The detector whose backbone the psi loop trains on, and that some methods begin with. Of the initial
+        distribution, with equal epochs, and unless scored detectors are fine-tuned, it is also scored as ``ns``."""
+        training, initial = self.experiment.training, self.psi("initial")
+        if training.warm_start == "initial":
+            return self._detector(initial, training.warm_epochs, "warm_start", "the initial distribution")
+        uniform = self.experiment.imaging.distribution.uniform.expand_as(initial)
+        return self._detector(uniform, training.warm_epochs, "warm_start", "the uniform distribution")
 
     def _detector(
         self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True
@@ -195,6 +198,9 @@ class Graph:
         combined = photographs and training.real.combined
         if not combined:  # so that its key is that of a run without photographs
             training = replace(training, real=Real())
+        training = replace(
+            training, warm_start="initial"
+        )  # of every detector's key, psi says what it is trained on
         probabilities = x.imaging.distribution.digest_of(psi)
         return DetectorStage(
             self.scene, x.detector, training, epochs, probabilities, x.run.seed, psi, name, called, self.device,
@@ -233,13 +239,17 @@ class Graph:
             psi, self.experiment.training.cold_epochs, "evaluate", called, photographs=False
         )
 
+    def before_fine_tuning(self, psi: Psi, called: str) -> DetectorStage:
+        """The detector of a distribution, without a fine-tuning that ``training.real`` may ask for."""
+        return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
+
     def trained_on(self, psi: Psi, called: str) -> TrainedStage:
         """The detector that is scored for a distribution, trained or fine-tuned on photographs as ``training.real``
         says."""
         real = self.experiment.training.real
         if real.used and real.mode == "pretrain":
             return self._on_photographs(self.synthetic(psi, called))
-        return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
+        return self.before_fine_tuning(psi, called)
 
     def scores(self, psi: Psi, called: str, part: Literal["val", "test"] = "test") -> ScoresStage:
         """Of the detector trained on a distribution."""

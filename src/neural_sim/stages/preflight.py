@@ -67,8 +67,9 @@ class PreflightStep:
         photographs, labelled = results(graph.targets).train, []
         if photographs is not None and self.labelled:
             labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
-        detections = graph.warm_start.build().predict(results(graph.warm_start).params, validation.images)
-        images = graph.warm_start.images(results(graph.scene)).images.to("cpu")
+        initial = graph.before_fine_tuning(graph.psi("initial"), "the initial distribution")
+        detections = initial.build().predict(results(initial).params, validation.images)
+        images = initial.images(results(graph.scene)).images.to("cpu")
         differ = mismatches(validation, images)
         level = 0.05 if outer.trust is None or outer.trust.level is None else outer.trust.level
         report = Preflight(
