@@ -184,11 +184,17 @@ class Graph:
     def warm_start(self) -> DetectorStage:
         """The detector whose backbone the psi loop trains on, and that some methods begin with. Of the initial
         distribution, with equal epochs, and unless scored detectors are fine-tuned, it is also scored as ``ns``."""
-        training, initial = self.experiment.training, self.psi("initial")
-        if training.warm_start == "initial":
-            return self._detector(initial, training.warm_epochs, "warm_start", "the initial distribution")
-        uniform = self.experiment.imaging.distribution.uniform.expand_as(initial)
-        return self._detector(uniform, training.warm_epochs, "warm_start", "the uniform distribution")
+        x = self.experiment
+        if x.training.warm_start == "initial":
+            return self.of_initial
+        uniform = x.imaging.distribution.uniform.expand_as(self.psi("initial"))
+        return self._detector(uniform, x.training.warm_epochs, "warm_start", "the uniform distribution")
+
+    @cached_property
+    def of_initial(self) -> DetectorStage:
+        """A detector of the initial distribution, trained as the warm start is."""
+        epochs = self.experiment.training.warm_epochs
+        return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
 
     def _detector(
         self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True
@@ -239,17 +245,13 @@ class Graph:
             psi, self.experiment.training.cold_epochs, "evaluate", called, photographs=False
         )
 
-    def before_fine_tuning(self, psi: Psi, called: str) -> DetectorStage:
-        """The detector of a distribution, without a fine-tuning that ``training.real`` may ask for."""
-        return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
-
     def trained_on(self, psi: Psi, called: str) -> TrainedStage:
         """The detector that is scored for a distribution, trained or fine-tuned on photographs as ``training.real``
         says."""
         real = self.experiment.training.real
         if real.used and real.mode == "pretrain":
             return self._on_photographs(self.synthetic(psi, called))
-        return self.before_fine_tuning(psi, called)
+        return self._detector(psi, self.experiment.training.cold_epochs, "evaluate", called)
 
     def scores(self, psi: Psi, called: str, part: Literal["val", "test"] = "test") -> ScoresStage:
         """Of the detector trained on a distribution."""

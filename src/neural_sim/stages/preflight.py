@@ -67,9 +67,8 @@ class PreflightStep:
         photographs, labelled = results(graph.targets).train, []
         if photographs is not None and self.labelled:
             labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
-        initial = graph.before_fine_tuning(graph.psi("initial"), "the initial distribution")
-        detections = initial.build().predict(results(initial).params, validation.images)
-        images = initial.images(results(graph.scene)).images.to("cpu")
+        detections = graph.of_initial.build().predict(results(graph.of_initial).params, validation.images)
+        images = graph.of_initial.images(results(graph.scene)).images.to("cpu")
         differ = mismatches(validation, images)
         level = 0.05 if outer.trust is None or outer.trust.level is None else outer.trust.level
         report = Preflight(
