@@ -79,6 +79,14 @@ def test_another_test_set_does_not_change_it(folder, returned):
     assert walk(other, steps) == returned
 
 
+def test_another_warm_start_does_not_change_what_the_initial_distribution_scores(folder, returned):
+    context, steps = _context(folder, "training.warm_start=uniform")
+    assert walk(context, steps) == returned
+    graph = context.graph
+    warm, initial = (context.results(stage).params for stage in (graph.warm_start, graph.of_initial))
+    assert any(not torch.equal(warm[name], initial[name]) for name in warm)
+
+
 def test_without_evaluation_there_is_no_score(folder, returned):
     assert walk(*_context(folder, "stages=[views,field]")) is None
 
