@@ -19,7 +19,7 @@ from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.synthesis.draws import HARD, RelaxedDraws
+from neural_sim.synthesis.draws import HardDraws, RelaxedDraws
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.types import PinholeCamera
 
@@ -151,11 +151,11 @@ def test_pairs_share_what_they_are_asked_to_share(scene):
             scene.training_set(psi, 5, torch.Generator(), odd)
 
 
-def test_straight_through_images_are_those_of_hard_draws(scene):
+def test_straight_through_images_are_those_of_independent_hard_draws(scene):
     psi = torch.tensor([0.5, -0.2, 0.1, 0.0]).expand(2, -1)
     hard, through = (
         scene.training_set(psi, 4, torch.Generator().manual_seed(2), how).images
-        for how in (HARD, RelaxedDraws("straight_through", tangents=True))
+        for how in (HardDraws(explore=True), RelaxedDraws("straight_through", tangents=True))
     )
     torch.testing.assert_close(through.images, hard.images, rtol=0.0, atol=1e-5)
     assert torch.equal(through.boxes, hard.boxes)
