@@ -161,6 +161,21 @@ def test_straight_through_images_are_those_of_independent_hard_draws(scene):
     assert torch.equal(through.boxes, hard.boxes)
 
 
+@pytest.mark.parametrize("pooled", [True, False])
+def test_training_sets_have_the_expected_number_of_images_of_every_bin_unless_draws_are_independent(
+    scene, pooled
+):
+    generator = torch.Generator().manual_seed(0)
+    source = ImagePool.render(scene, 1, generator) if pooled else None
+
+    def counts(how):
+        drawn = scene.training_set(torch.zeros(2, 4), 40, generator, how, source)
+        return torch.stack([part.draw.bins[:, 0].bincount(minlength=4) for part in drawn.objects])
+
+    assert (counts(HardDraws()) == 10).all()
+    assert not (counts(HardDraws(explore=True)) == 10).all()
+
+
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
     for mode, carried in (("forward", True), ("reverse", False)):
         drawn = small_loop(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))

@@ -65,6 +65,12 @@ def test_balanced_draws_that_are_balanced_already_stay_and_few_follow_a_small_ch
     assert torch.equal(settled, free)
 
 
+def test_balanced_draws_of_what_is_not_a_number_are_refused(generator):
+    noise = binned.gumbel((6, 3), generator, torch.float64)
+    with pytest.raises(ValueError, match="finite psi"):
+        binned.balanced(torch.tensor([math.nan, 0.0, 0.0]), noise, 0.5)
+
+
 def test_floor_out_of_range_is_refused():
     with pytest.raises(ValueError, match="floor"):
         binned.log_probabilities(torch.zeros(4), 0.25)

@@ -54,6 +54,14 @@ def test_what_photographs_do_not_train_is_shared_by_all_modes():
     assert keys("training.real.mode=pretrain", "training.real.finetune=0.5")["psi"] == none["psi"]
 
 
+def test_the_warm_start_s_images_decide_on_it_and_on_psi_alone():
+    initial, uniform = (
+        keys("training.real.mode=pretrain", f"training.warm_start={which}")
+        for which in ("initial", "uniform")
+    )
+    assert {name for name in initial if initial[name] != uniform[name]} == {"warm", "psi"}
+
+
 @pytest.mark.parametrize(
     "other",
     ["training.real.count=3", "training.real.batch_fraction=0.25", "target.train_per_object=7", "seed=1"],

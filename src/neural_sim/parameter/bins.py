@@ -75,9 +75,14 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
     The counts are those of systematic sampling: the numbers ``offset``, ``offset`` + 1, ... below n (``offset`` uniform
     in [0, 1)) that fall between the cumulated n p. The draws begin at the Gumbel-max ones; those of bins with too many
     that lose least change to bins with too few. So most draws stay when p moves under the same noise.
+
+    Raises:
+        ValueError: log p is not a number, for which no bin would ever have enough.
     """
     count, k = gumbel.shape
     p = log_p.double().softmax(-1)
+    if bool(p.isnan().any()):
+        raise ValueError(f"parameter: want finite psi to draw bins from, got log p {log_p.tolist()}")
     ends = torch.cat([p.new_zeros(1), (count * p[:-1].cumsum(-1) - offset).ceil(), p.new_tensor([count])])
     wanted = ends.diff().long()
     values = log_p.double() + gumbel.double()

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neural_sim.baseline.base import HypergradientLoop
 from neural_sim.detector.real import Real
+from neural_sim.detector.training import Training
 from neural_sim.devices import device_of
 from neural_sim.objects.photos import Photos
 from neural_sim.outer.records import IterationRecord, LearnedPsi
@@ -196,17 +197,19 @@ class Graph:
         epochs = self.experiment.training.warm_epochs
         return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
 
+    @property
+    def _training(self) -> Training:
+        """As in the keys of detectors, which say by psi what they are trained on, whatever the warm start is of."""
+        return replace(self.experiment.training, warm_start="initial")
+
     def _detector(
         self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True
     ) -> DetectorStage:
         """A detector trained on a distribution, and on photographs where the training combines both."""
-        x, training = self.experiment, self.experiment.training
+        x, training = self.experiment, self._training
         combined = photographs and training.real.combined
         if not combined:  # so that its key is that of a run without photographs
             training = replace(training, real=Real())
-        training = replace(
-            training, warm_start="initial"
-        )  # of every detector's key, psi says what it is trained on
         probabilities = x.imaging.distribution.digest_of(psi)
         return DetectorStage(
             self.scene, x.detector, training, epochs, probabilities, x.run.seed, psi, name, called, self.device,
@@ -215,7 +218,7 @@ class Graph:
 
     def _on_photographs(self, start: DetectorStage | None) -> PhotographsStage:
         """A detector trained on photographs, in as many steps as one on images, or fine-tuned on them."""
-        x, training, real = self.experiment, self.experiment.training, self.experiment.training.real
+        x, training, real = self.experiment, self._training, self._training.real
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
         if start is None:  # the same for all modes
