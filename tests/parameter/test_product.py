@@ -41,6 +41,22 @@ def test_factors_are_drawn_independently_and_by_their_own_p(generator):
     assert ((frequencies - wanted).abs() < 5 * (wanted / count).sqrt()).all()
 
 
+def test_balanced_noise_gives_every_factor_its_expected_numbers_and_a_selection_of_it_is_independent(
+    generator,
+):
+    psi = torch.zeros(10, dtype=torch.float64)
+    noise = JOINT.draw_noise(120, generator, torch.float64, balanced=True)
+    draw = JOINT.hard(psi, noise)
+    assert [draw.bins[:, i].bincount().tolist() for i in (0, 1)] == [[20] * 6, [30] * 4]
+    selected = JOINT.hard(psi, noise.select(torch.arange(120)))
+    assert torch.equal(selected.bins[:, 0], noise.bins["pose"].gumbel.argmax(-1))
+
+
+def test_uniform_psi_is_that_of_equal_probabilities_in_every_factor():
+    for p in JOINT.probabilities(JOINT.uniform).values():
+        torch.testing.assert_close(p, torch.full_like(p, 1 / len(p)))
+
+
 def test_log_prob_is_that_of_the_cell():
     psi = torch.linspace(-1.0, 1.0, 10, dtype=torch.float64)
     cells = torch.cartesian_prod(torch.arange(6), torch.arange(4))

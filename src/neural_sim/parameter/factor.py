@@ -196,13 +196,12 @@ class BinnedFactor:
         return score, step
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
-        """Exact samples of the bins by the Gumbel-max trick; no derivative reaches psi."""
-        return (self.log_probabilities(psi.detach()) + noise.gumbel).argmax(-1)
-
-    def balanced(self, psi: Float[Tensor, "k"], noise: BinNoise, offset: float) -> Int[Tensor, "n"]:
-        """Samples of which each is exact and whose numbers in the bins are n p, rounded, see
-        :func:`~neural_sim.parameter.bins.balanced`."""
-        return binned.balanced(self.log_probabilities(psi.detach()), noise.gumbel, offset)
+        """Exact samples of the bins by the Gumbel-max trick, balanced where the noise has an offset; no derivative
+        reaches psi."""
+        log_p = self.log_probabilities(psi.detach())
+        if noise.offset is None:
+            return (log_p + noise.gumbel).argmax(-1)
+        return binned.balanced(log_p, noise.gumbel, noise.offset)
 
     def at(self, bins: Int[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """The coordinate in given bins, at the fraction ``within`` of each."""

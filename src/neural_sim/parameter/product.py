@@ -14,6 +14,7 @@ from torch.nn.functional import one_hot
 from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distances import Unit, radii_in_metres
+from neural_sim.parameter.distributions import distribution
 from neural_sim.parameter.factor import COORDINATES, BinnedFactor, Factor, Relaxation
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.noise import BinNoise, SceneNoise
@@ -128,7 +129,7 @@ class SceneDistribution:
     @property
     def uniform(self) -> Float[Tensor, "K"]:
         """The psi of uniform bins and equal weights of lights."""
-        return torch.cat([f.psi_of(torch.full((f.size,), 1 / f.size).double()) for f in self.factors])
+        return torch.cat([f.psi_of(distribution("uniform", f.size)) for f in self.factors])
 
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
         """Every factor's probabilities of its bins, and the weights of the lights."""
@@ -165,21 +166,24 @@ class SceneDistribution:
         antithetic: bool = False,
         conditional: int = 0,
         explore: bool = False,
+        balanced: bool = False,
     ) -> SceneNoise:
         """Randomness of n draws; independent of psi.
 
         ``antithetic``: Gumbel noise in pairs from uniforms u and 1 - u. ``conditional``: draws of the noise given the
-        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density. Raises
-        ``ValueError`` for an odd number of antithetic draws.
+        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density.
+        ``balanced``: exact draws have n p, rounded, in every factor's bins. Raises ``ValueError`` for an odd number of
+        antithetic draws.
         """
         gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.binned}
         learned = {f.coordinate for f in self.binned}
         drawn = [c for c in COORDINATES if c != "magnification" or c in learned]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
-        noise = {
-            f.name: BinNoise(gumbel[f.name], binned.exponential((n, conditional, f.bins), generator, dtype))
-            for f in self.binned
-        }
+        noise = {}
+        for f in self.binned:
+            exponential = binned.exponential((n, conditional, f.bins), generator, dtype)
+            offset = float(torch.rand((), generator=generator, dtype=torch.float64)) if balanced else None
+            noise[f.name] = BinNoise(gumbel[f.name], exponential, offset)
         light = None
         if explore and self.lights:
             light = torch.randn((n, self.lights), generator=generator, dtype=torch.float64).to(dtype)
@@ -189,14 +193,6 @@ class SceneDistribution:
         """Exact samples of p_psi; no derivative reaches psi."""
         parts = self.split(psi)
         bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
-        return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
-
-    def balanced(self, psi: Float[Tensor, "K"], noise: SceneNoise, generator: torch.Generator) -> SceneDraw:
-        """Samples of p_psi, each exact, whose numbers in every factor's bins are n p, rounded; without a derivative."""
-        parts, bins = self.split(psi), {}
-        for f in self.binned:
-            offset = float(torch.rand((), generator=generator, dtype=torch.float64))
-            bins[f.name] = f.balanced(parts[f.name], noise.bins[f.name], offset)
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:

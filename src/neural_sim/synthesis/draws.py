@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neural_sim.parameter.factor import Relaxation
 from neural_sim.parameter.noise import SceneNoise
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.types import SceneDraw
 
 
 @dataclass(frozen=True)
@@ -59,17 +56,13 @@ class HardDraws:
 
     explore: bool = False
 
-    def of(
-        self,
-        distribution: SceneDistribution,
-        psi: Float[Tensor, "K"],
-        noise: SceneNoise,
-        generator: torch.Generator,
-    ) -> SceneDraw:
-        """The draws of one object; ``generator`` draws how the bins' numbers are rounded."""
-        if self.explore:
-            return distribution.hard(psi, noise)
-        return distribution.balanced(psi, noise, generator)
+    def noise(
+        self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
+    ) -> SceneNoise:
+        """Randomness of ``count`` draws of one object."""
+        return distribution.draw_noise(
+            count, generator, dtype, explore=self.explore, balanced=not self.explore
+        )
 
 
 Draws = HardDraws | RelaxedDraws

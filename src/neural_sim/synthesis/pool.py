@@ -82,9 +82,9 @@ class ImagePool:
         """
         if not isinstance(how, HardDraws):
             raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
-        noise = self.scene.distribution.draw_noise(count, generator)
+        noise = how.noise(self.scene.distribution, count, generator, torch.float32)
         within = torch.randint(self.objects[label].per_cell, (count,), generator=generator)
-        return self._taken(label, how.of(self.scene.distribution, psi.float(), noise, generator).bins, within)
+        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, within)
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator

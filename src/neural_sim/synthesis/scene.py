@@ -101,8 +101,8 @@ class Scene:
         logits = psi.detach().to(self.dtype(label))
         if isinstance(how, RelaxedDraws):
             return self._drawn_relaxed(label, logits, count, generator, how)
-        noise = self.distribution.draw_noise(count, generator, self.dtype(label), explore=how.explore)
-        return self.render(label, how.of(self.distribution, logits, noise, generator), noise)
+        noise = how.noise(self.distribution, count, generator, self.dtype(label))
+        return self.render(label, self.distribution.hard(logits, noise), noise)
 
     def probed(
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
