@@ -46,7 +46,11 @@ def _stored(folder, config):
 def _run(folder, config):
     """README.md, Use: the files of a run."""
     results = json.loads((folder / "results.json").read_text())
-    beside = {"synthetic_only", "real_only"} if config["training"]["real"]["mode"] != "none" else set()
+    beside = (
+        {"synthetic_only", "real_only", "views_only"}
+        if config["training"]["real"]["mode"] != "none"
+        else set()
+    )
     photographs = config["target"]["_target_"].rpartition(".")[2] != "RenderedTarget"
     stated = any(
         own.get("target", "uniform") != "uniform"

@@ -107,7 +107,7 @@ def test_a_classification_from_objects_to_a_report_and_a_comparison(tmp_path):
         assert re.search(r"^accuracy on the test set +can +pitcher +drill +mean$", printed, re.MULTILINE)
         results = json.loads((tmp_path / method / "results.json").read_text())
         assert results["score"] == "accuracy" and set(results["ap"]) == {
-            "ns", "learned", "matched", "synthetic_only", "real_only",
+            "ns", "learned", "matched", "synthetic_only", "real_only", "views_only",
         }  # fmt: skip
         for scores in results["ap"].values():
             assert scores["accuracy"] == pytest.approx(sum(scores["per_class"].values()) / 3)

@@ -17,7 +17,7 @@ def setting(mode, trained=None, methods=(("neural_sim", 0.75), ("lts", 0.5)), co
     real = {} if not trained else {"mode": mode, "photographs": trained}
     rows = {"ns": (0.3, 0.3), "matched": (0.9, 0.9)}
     if real:
-        rows |= {"real_only": (0.25, 0.25), "synthetic_only": (0.5, 0.5)}
+        rows |= {"real_only": (0.25, 0.25), "synthetic_only": (0.5, 0.5), "views_only": (0.1, 0.1)}
     runs = [
         finished(
             {**rows, "learned": (ap, ap)}, experiment="shots", method=method, seed=0, config=config, real=real
@@ -53,13 +53,16 @@ def test_numbers_of_photographs_are_columns_in_their_order_and_say_where_there_w
 def test_rows_are_ways_of_training_and_methods():
     rows = cells(photographs_table(SETTINGS))
     assert list(rows)[2:] == [
-        "photographs alone",
+        "photographs alone", "views of the fields alone",
         "synthetic alone, NS", "synthetic alone, LTS", "synthetic alone, NSO",
         "synthetic, then photographs, NS", "synthetic, then photographs, LTS", "synthetic, then photographs, NSO",
         "both together, NS", "both together, LTS", "both together, NSO",
     ]  # fmt: skip
     assert [each.split(" ")[0] for each in rows["both together, NSO"]] == ["", "79.2", "75.2"]
     assert rows["photographs alone"][0] == "" and rows["photographs alone"][1].startswith("25.")
+    assert rows["views of the fields alone"][0] == "" and rows["views of the fields alone"][1].startswith(
+        "10."
+    )
     assert rows["synthetic alone, LTS"][0].startswith("50.") and not any(rows["synthetic alone, LTS"][1:])
 
 

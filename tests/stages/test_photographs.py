@@ -20,7 +20,7 @@ SMALL = [
     "training.warm_epochs=4", "training.images_per_object=16", "training.batch_size=8", "target.val_per_object=4",
     "objects.names=[pitcher,drill]", "target.train_per_object=6",
 ]  # fmt: skip
-ROWS = {"ns", "learned", "matched", "synthetic_only", "real_only"}
+ROWS = {"ns", "learned", "matched", "synthetic_only", "real_only", "views_only"}
 
 
 def composed(*overrides):
@@ -131,7 +131,7 @@ def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
     assert history.steps == 16
     scored = evaluate(detector.predict(params, targets.test.images), targets.test, list(graph.names))
     assert results["ap"]["real_only"]["ap"] == scored.ap
-    for row in ("ns", "real_only", "synthetic_only"):
+    for row in ("ns", "real_only", "synthetic_only", "views_only"):
         steps = context.results(
             graph.compared(context.results(graph.learned))[row].trained
         ).cost.detector_steps

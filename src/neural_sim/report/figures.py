@@ -23,6 +23,7 @@ INK, MUTED, GRID = "#22262b", "#6b727b", "#e4e7ea"
 # Okabe and Ito's palette (Color Universal Design, 2008), which readers with any colour vision tell apart.
 METHOD_COLOURS = {
     "ns": "#b0b7bf", "learned": "#0072b2", "matched": "#009e73", "synthetic_only": "#56b4e9", "real_only": "#e69f00",
+    "views_only": "#cc79a7",
 }  # fmt: skip
 CLASS_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a5cc4", "#8c6d1f")
 

@@ -16,8 +16,9 @@ MEAN = "mAP"
 """The name of the mean over the biased objects among them."""
 CALLED = {"ns": "NS", "matched": "matched", "neural_sim": "NSO", "auto_sim": "Auto-Sim", "lts": "LTS"}
 """The paper's names of methods."""
-WITHOUT = ("synthetic_only", "real_only")
-"""Detectors that are scored where photographs train too: on synthetic images alone, and on photographs alone."""
+WITHOUT = ("synthetic_only", "real_only", "views_only")
+"""Detectors that are scored where photographs train too: on synthetic images alone, on photographs alone, and on the
+views of the fields alone."""
 
 
 def called(method: str) -> str:

@@ -14,7 +14,8 @@ from neural_sim.report.statistics import Estimate
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}
 """By ``training.real.mode``, in the order of a table's rows."""
-ALONE = "photographs alone"
+ALONE = {"real_only": "photographs alone", "views_only": "views of the fields alone"}
+"""By detector, first in a table."""
 
 
 def asked(setting: Setting) -> tuple[float, str]:
@@ -42,15 +43,16 @@ def photographs_table(settings: Sequence[Setting]) -> str:
     rows: dict[str, dict[str, Estimate]] = {}
     for setting in sorted(settings, key=_rank):
         number, scores = asked(setting)[1], setting.scores
-        if "real_only" in scores.ap:
-            rows.setdefault(ALONE, {})[number] = scores.ap["real_only"][MEAN]
+        for which, row in ALONE.items():
+            if which in scores.ap:
+                rows.setdefault(row, {})[number] = scores.ap[which][MEAN]
         for method in scores.methods:
             if method != "matched":
                 rows.setdefault(f"{WAYS[_mode(setting)]}, {called(method)}", {})[number] = scores.ap[method][
                     MEAN
                 ]
     lines = ["| mAP | " + " | ".join(text for _, text in columns) + " |", "|" + "---|" * (1 + len(columns))]
-    for name in sorted(rows, key=lambda row: row != ALONE):
+    for name in sorted(rows, key=lambda row: row not in ALONE.values()):
         cells = [points(rows[name][text]) if text in rows[name] else "" for _, text in columns]
         lines.append("| " + " | ".join([name, *cells]) + " |")
     return "\n".join(lines)

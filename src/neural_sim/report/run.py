@@ -38,7 +38,7 @@ class RunResults:
     ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
     (from 1), by object and angle, whose views an object's symmetry makes the same; they are scored and drawn as one.
     ``real`` says how photographs trained (``mode``) and how many (``photographs``); empty without. ``ap`` then also has
-    the scores of synthetic_only and real_only.
+    the scores of synthetic_only, real_only and views_only.
     ``score`` is what detectors are scored by: AP, or accuracy, which ``ap`` then has.
     ``identity`` says which runs this one can be compared with, see :func:`identity.identity`.
     """

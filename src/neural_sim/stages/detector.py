@@ -106,24 +106,24 @@ class DetectorStage(TrainedStage):
             return None
         return self.training.real.chosen(results(self.targets).train, self.seed)
 
-    def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
+    def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
         """The training images, equal in every call."""
         generator = self.generator() if generator is None else generator
-        return scene.training_set(self.psi, self.training.images_per_object, generator)
+        return self.shown(results).training_set(self.psi, self.training.images_per_object, generator)
+
+    def shown(self, results: Results) -> Scene:
+        """The scene of the training images."""
+        return results(self.scene)
 
     def generator(self) -> torch.Generator:
         """Of images, new parameters and the order of training."""
         return torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 1)
 
     def make(self, results: Results) -> TrainedDetector:
-        scene, detector, training, generator = (
-            results(self.scene),
-            self.build(),
-            self.training,
-            self.generator(),
-        )
+        results(self.scene)  # so that fields are not charged
+        detector, training, generator = self.build(), self.training, self.generator()
         begun, cpu_begun = time.perf_counter(), time.process_time()
-        images, sampling = self.images(scene, generator).images, None
+        images, sampling = self.images(results, generator).images, None
         drawn, photographs = len(images), self.photographs(results)
         if photographs is not None:
             images = LabelledImages.concatenate([images, photographs.to(images.images.device)])

@@ -25,6 +25,7 @@ from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.masks import MasksStage
 from neural_sim.stages.meshes import Meshes, Objects
+from neural_sim.stages.other_images import ViewsDetectorStage, trained_on
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.symmetry import SymmetryStage
@@ -188,14 +189,17 @@ class Graph:
         x = self.experiment
         if x.training.warm_start == "initial":
             return self.of_initial
-        uniform = x.imaging.distribution.uniform.expand_as(self.psi("initial"))
-        return self._detector(uniform, x.training.warm_epochs, "warm_start", "the uniform distribution")
+        return self._detector(self._uniform, x.training.warm_epochs, "warm_start", "the uniform distribution")
 
     @cached_property
     def of_initial(self) -> DetectorStage:
         """A detector of the initial distribution, trained as the warm start is."""
         epochs = self.experiment.training.warm_epochs
         return self._detector(self.psi("initial"), epochs, "warm_start", "the initial distribution")
+
+    @property
+    def _uniform(self) -> Psi:
+        return self.experiment.imaging.distribution.uniform.expand_as(self.psi("initial"))
 
     @property
     def _training(self) -> Training:
@@ -228,6 +232,11 @@ class Graph:
         return PhotographsStage(
             start, self.targets, self.camera, self.names, x.detector, training, epochs, steps, x.run.seed, self.device
         )  # fmt: skip
+
+    def _on_views(self) -> DetectorStage:
+        """A detector trained on the views that the fields are fitted to."""
+        uniform = self.synthetic(self._uniform, "the fields' own views")
+        return trained_on(uniform, ViewsDetectorStage, views=self.views)
 
     @cached_property
     def learned(self) -> PsiStage:
@@ -263,12 +272,13 @@ class Graph:
     def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
         """The scores that a run reports: of the initial distribution (``ns``), the learned one, and the target's own
         (``matched``) where that is known; where photographs train too, also without them (``synthetic_only``, of the
-        learned distribution) and on them alone (``real_only``)."""
+        learned distribution), on them alone (``real_only``), and on the fields' own views (``views_only``)."""
         psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.target_psi}
         rows = {called: self.scores(psi, called) for called, psi in psis.items() if psi is not None}
         if self.experiment.training.real.used:
             rows["synthetic_only"] = ScoresStage(self.synthetic(learned.last, "learned"), self.targets)
             rows["real_only"] = ScoresStage(self._on_photographs(None), self.targets)
+            rows["views_only"] = ScoresStage(self._on_views(), self.targets)
         return rows
 
     def on_the_way(self, learned: LearnedPsi) -> dict[int, Psi]:

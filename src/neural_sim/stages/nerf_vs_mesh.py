@@ -97,7 +97,7 @@ class NerfVsMeshStep:
             graphs, results, self.sources, lambda graph: sets_of_kinds(graph, kinds), self.draws
         )
         first, names = graphs[0], list(context.graph.names)
-        drawn = self.sources(first)["nerf"].images(results(first.scene))
+        drawn = self.sources(first)["nerf"].images(results)
         write_training_set(drawn, names, context.folder / "training_set")
         shown = pairs(first, results, self.sources(first), self.shown)
         other = found.sources[1]

@@ -1,4 +1,5 @@
-"""Detectors trained on images that do not come from the fields: of meshes, or of another program."""
+"""Detectors trained on images that do not come from the fields: of meshes, of the fields' own views, or of another
+program."""
 
 from __future__ import annotations
 
@@ -11,8 +12,10 @@ import torch
 
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.meshes import Objects
-from neural_sim.stages.stage import UNKEYED
+from neural_sim.stages.stage import UNKEYED, Results
+from neural_sim.stages.views import ViewsStage
 from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.synthesis.pictures import PictureScene
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import SubjectScene
 from neural_sim.target.coco import CocoTarget
@@ -29,9 +32,25 @@ class MeshDetectorStage(DetectorStage):
     supersample: int = field(kw_only=True)
     objects: Objects = field(kw_only=True, metadata=UNKEYED)
 
-    def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
-        subjects = tuple(self.objects.subject(name) for name in scene.names)
-        return super().images(SubjectScene.of(scene, subjects), generator)
+    def shown(self, results: Results) -> Scene:
+        subjects = tuple(self.objects.subject(name) for name in self.names)
+        return SubjectScene.of(super().shown(results), subjects)
+
+
+@dataclass(frozen=True)
+class ViewsDetectorStage(DetectorStage):
+    """A detector trained on the views that the fields are fitted to, on the same backgrounds as images of the fields
+    (the paper's "images to train NeRF", Sec. 4.4 and Table 2); psi has no part in them."""
+
+    views: tuple[ViewsStage, ...] = field(kw_only=True)
+
+    def shown(self, results: Results) -> Scene:
+        fitted = [results(each) for each in self.views]
+        fitted = [
+            views.select(torch.arange(len(views) - each.held_out))
+            for each, views in zip(self.views, fitted, strict=True)
+        ]
+        return PictureScene.of(super().shown(results), fitted)
 
 
 @dataclass(frozen=True)
@@ -40,9 +59,9 @@ class CocoDetectorStage(DetectorStage):
 
     source: CocoTarget = field(kw_only=True)
 
-    def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
-        loaded = self.source.load(scene.names, scene.camera.height, scene.camera.width)
-        return RenderedImages(loaded.to(scene.device(0)), (), (), ())
+    def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
+        loaded = self.source.load(self.names, self.camera.height, self.camera.width)
+        return RenderedImages(loaded.to(self.device), (), (), ())
 
 
 def trained_on(stage: DetectorStage, kind: type[DetectorStage], **more: Any) -> DetectorStage:

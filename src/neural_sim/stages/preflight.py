@@ -68,7 +68,7 @@ class PreflightStep:
         if photographs is not None and self.labelled:
             labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
         detections = graph.of_initial.build().predict(results(graph.of_initial).params, validation.images)
-        images = graph.of_initial.images(results(graph.scene)).images.to("cpu")
+        images = graph.of_initial.images(results).images.to("cpu")
         differ = mismatches(validation, images)
         level = 0.05 if outer.trust is None or outer.trust.level is None else outer.trust.level
         report = Preflight(

@@ -15,7 +15,6 @@ from neural_sim.renderer.subject import Subject
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
-from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import SubjectScene
 
@@ -51,10 +50,10 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
 @dataclass(frozen=True)
 class ReconstructionDetectorStage(DetectorStage):
     """A detector trained on images of reconstructed meshes at the draws, backgrounds and places of those of the fields.
-    ``shown`` are the results of ``reconstructions``, with their renderer."""
+    ``subjects`` are the results of ``reconstructions``, with their renderer."""
 
     reconstructions: tuple[ReconstructionStage, ...] = field(kw_only=True)
-    shown: tuple[Subject, ...] = field(kw_only=True, metadata=UNKEYED)
+    subjects: tuple[Subject, ...] = field(kw_only=True, metadata=UNKEYED)
 
-    def images(self, scene: Scene, generator: torch.Generator | None = None) -> RenderedImages:
-        return super().images(SubjectScene.of(scene, self.shown), generator)
+    def shown(self, results: Results) -> Scene:
+        return SubjectScene.of(super().shown(results), self.subjects)

@@ -40,7 +40,7 @@ def write_report(context: Context) -> None:
         compared = graph.compared(learned).items()
         scores = {called: results(stage) for called, stage in compared}
     report = run_results(context, scores)
-    rendered = graph.synthetic(learned.last, "learned").images(results(graph.scene))
+    rendered = graph.synthetic(learned.last, "learned").images(results)
     drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
     detections = scores["learned"].detections if scores else []
     write_figures(report, drawn.images, test, detections, folder / "figures")

@@ -75,7 +75,7 @@ class SfmVsNerfStep:
 
         def sources(graph: Graph) -> dict[str, DetectorStage]:
             nerf = graph.synthetic(graph.psi("target"), "images of the fields")
-            more = {"reconstructions": stages, "shown": meshes}
+            more = {"reconstructions": stages, "subjects": meshes}
             return {"nerf": nerf, "sfm": trained_on(nerf, ReconstructionDetectorStage, **more)}
 
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)

@@ -70,9 +70,9 @@ def compare_sources(
 def pairs(graph: Graph, results: Results, sources: Mapping[str, DetectorStage], count: int) -> LabelledImages:
     """``count`` training images of every source, source by source, spread evenly over those of the first; where
     the sources share their draws, the same ones."""
-    scene, parts = results(graph.scene), []
+    parts = []
     for stage in sources.values():
-        images = stage.images(scene).images.to("cpu")
+        images = stage.images(results).images.to("cpu")
         rows = torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
         parts.append(images.select(rows))
     return LabelledImages.concatenate(parts)
