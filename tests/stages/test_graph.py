@@ -17,7 +17,7 @@ def keys(tmp_path, *overrides):
             "config", ["+experiment=pose_gap", "scale=smoke", *overrides, f"paths.store={tmp_path}"]
         )
     graph = Graph(build(config))
-    return graph.warm_start.key, graph.targets.key
+    return graph.of_initial.key, graph.targets.key
 
 
 @pytest.mark.parametrize("other", ["floor=0.0", "temperature=1.0", "bin_mean=linear"])
@@ -39,14 +39,14 @@ def test_detectors_do_not_depend_on_the_target_but_its_images_do(tmp_path):
     assert ours[0] == other[0] and ours[1] != other[1]
 
 
-@pytest.mark.parametrize("overrides", [[], ["training.warm_start=uniform", "gap=uniform"]])
+@pytest.mark.parametrize("overrides", [["training.warm_start=initial"], ["gap=uniform"]])
 def test_the_scored_detector_of_the_start_is_the_warm_start_where_images_and_epochs_are_equal(
     tmp_path, overrides
 ):
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
         graph = Graph(build(compose("config", common + overrides)))
-        other = Graph(build(compose("config", [*common, "training.warm_start=uniform"])))
+        other = Graph(build(compose("config", common)))
     assert graph.trained_on(graph.psi("initial"), "the start").key == graph.warm_start.key
     assert graph.trained_on(graph.psi("target"), "the target").key != graph.warm_start.key
     scored = other.trained_on(other.psi("initial"), "the start").key
@@ -56,7 +56,7 @@ def test_the_scored_detector_of_the_start_is_the_warm_start_where_images_and_epo
 
 def test_a_uniform_warm_start_is_trained_on_images_of_every_bin():
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        overrides = ["+experiment=pose_gap", "parameter=[pose,zoom]", "training.warm_start=uniform"]
+        overrides = ["+experiment=pose_gap", "parameter=[pose,zoom]"]
         graph = Graph(build(compose("config", overrides)))
     p = graph.experiment.imaging.distribution.probabilities(graph.warm_start.psi)
     assert all(torch.allclose(values, torch.full_like(values, 1 / values.shape[1])) for values in p.values())
@@ -66,9 +66,9 @@ def test_a_uniform_warm_start_is_trained_on_images_of_every_bin():
 def test_a_first_hypergradient_at_a_warm_start_of_other_images_is_refused():
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         config = ["+experiment=pose_gap", "baseline=auto_sim", "outer.train_first=false"]
-        build(compose("config", config))
+        build(compose("config", [*config, "training.warm_start=initial"]))
         with pytest.raises(ValueError, match=r"training\.warm_start"):
-            build(compose("config", [*config, "training.warm_start=uniform"]))
+            build(compose("config", config))
 
 
 def test_objects_that_no_source_has_are_refused(tmp_path):

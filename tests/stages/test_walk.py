@@ -80,10 +80,9 @@ def test_another_test_set_does_not_change_it(folder, returned):
 
 
 def test_another_warm_start_does_not_change_what_the_initial_distribution_scores(folder, returned):
-    context, steps = _context(folder, "training.warm_start=uniform")
+    (uniform, _), (context, steps) = _context(folder), _context(folder, "training.warm_start=initial")
     assert walk(context, steps) == returned
-    graph = context.graph
-    warm, initial = (context.results(stage).params for stage in (graph.warm_start, graph.of_initial))
+    warm, initial = (each.results(each.graph.warm_start).params for each in (uniform, context))
     assert any(not torch.equal(warm[name], initial[name]) for name in warm)
 
 

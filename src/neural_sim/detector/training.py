@@ -29,7 +29,7 @@ class Training:
     """Training settings of every detector, whatever the method that chose its images.
 
     ``image_size`` is the side of the square images in pixels; ``warm_start`` says which distribution the images of the
-    warm start have, psi's initial one or all parameters uniform; ``warm_epochs`` are its epochs, ``cold_epochs`` those
+    warm start have, all parameters uniform or psi's initial one; ``warm_epochs`` are its epochs, ``cold_epochs`` those
     of the detectors that are scored; ``real`` says whether labelled photographs train too. For the rest see
     :class:`Optimisation`.
 
@@ -39,7 +39,7 @@ class Training:
 
     image_size: int = 96
     images_per_object: int = 100
-    warm_start: Literal["uniform", "initial"] = "initial"
+    warm_start: Literal["uniform", "initial"] = "uniform"
     warm_epochs: int = 30
     cold_epochs: int = 30
     batch_size: int = 32
