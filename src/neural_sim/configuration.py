@@ -35,6 +35,18 @@ def job_folder(number: int | str, overrides: str) -> str:
     return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
 
 
+def own_folder(wanted: Path) -> Path:
+    """Make a new folder: ``wanted``, or where there is one already, ``wanted``_2, _3, ..."""
+    folder, number = wanted, 1
+    while True:
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
+            folder = wanted.with_name(f"{wanted.name}_{number}")
+
+
 def check_top(plain: Mapping[str, Any]) -> None:
     """The top level's own values. Raises ``UserError``."""
     if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:

@@ -23,10 +23,18 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from neural_sim.configuration import UserError, check_fits, check_top, conf_directory, first_line, job_folder
+from neural_sim.configuration import (
+    UserError,
+    check_fits,
+    check_top,
+    conf_directory,
+    first_line,
+    job_folder,
+    own_folder,
+)
 
 if TYPE_CHECKING:
     from neural_sim.stages.context import Context, Step
@@ -244,6 +252,16 @@ class RefuseStudies(Callback):
             context_of(job, Path())
         except (ValueError, FileNotFoundError) as error:
             _refuse(error)
+
+
+class OwnFolder(Callback):
+    """A folder of its own for each of the runs of an experiment that begin in the same second, by which folders are
+    named. A folder that the command line names is taken as it is."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        if not any(override.startswith("hydra.run.dir=") for override in config.hydra.overrides.hydra):
+            with read_write(config):
+                config.hydra.run.dir = str(own_folder(Path(config.hydra.run.dir)))
 
 
 def _refuse(error: Exception) -> NoReturn:
