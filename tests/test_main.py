@@ -222,11 +222,15 @@ def test_every_choice_of_every_group_builds(group, choice, tmp_path):
 def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path):
     def begun(*overrides):
         wanted = str(tmp_path / "runs" / "2026-01-01_00-00-00")
-        config = OmegaConf.create({"hydra": {"run": {"dir": wanted}, "overrides": {"hydra": list(overrides)}}})
+        config = OmegaConf.create(
+            {"hydra": {"run": {"dir": wanted}, "overrides": {"hydra": list(overrides)}}}
+        )
         OmegaConf.set_readonly(config, True)
         OwnFolder().on_run_start(config)
         return Path(config.hydra.run.dir).name
 
     assert [begun(), begun(), begun()] == [f"2026-01-01_00-00-00{end}" for end in ("", "_2", "_3")]
     assert len(list((tmp_path / "runs").iterdir())) == 3
-    assert begun("hydra.run.dir=runs") == "2026-01-01_00-00-00"  # the command line's own folder may be taken again
+    assert (
+        begun("hydra.run.dir=runs") == "2026-01-01_00-00-00"
+    )  # the command line's own folder may be taken again
