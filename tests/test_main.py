@@ -231,6 +231,5 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path):
 
     assert [begun(), begun(), begun()] == [f"2026-01-01_00-00-00{end}" for end in ("", "_2", "_3")]
     assert len(list((tmp_path / "runs").iterdir())) == 3
-    assert (
-        begun("hydra.run.dir=runs") == "2026-01-01_00-00-00"
-    )  # the command line's own folder may be taken again
+    for own in ("hydra.run.dir=runs", "++hydra.run.dir=runs"):  # may be taken again
+        assert begun(own) == "2026-01-01_00-00-00"

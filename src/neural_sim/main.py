@@ -259,7 +259,9 @@ class OwnFolder(Callback):
     named. A folder that the command line names is taken as it is."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        if not any(override.startswith("hydra.run.dir=") for override in config.hydra.overrides.hydra):
+        if not any(
+            override.lstrip("+").startswith("hydra.run.dir=") for override in config.hydra.overrides.hydra
+        ):
             with read_write(config):
                 config.hydra.run.dir = str(own_folder(Path(config.hydra.run.dir)))
 

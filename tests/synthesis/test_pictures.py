@@ -47,9 +47,8 @@ def test_training_images_show_the_pictures_whatever_psi_is(objects_per_image):
     assert torch.equal(one.images, other.images) and len(one) == 12
     assert (one.bins == -1).all() and one.present.any(1).all()
     sizes = (one.boxes[..., 2:] - one.boxes[..., :2])[one.present]
-    assert (
-        sizes.max() <= 14.0 and sizes.min() > 2.0
-    )  # a square of 12 of 24 pixels, its edge blurred, shifted or hidden
+    # A square of 12 of 24 pixels, its edge blurred, shifted or hidden.
+    assert sizes.max() <= 14.0 and sizes.min() > 2.0
 
 
 def test_a_picture_keeps_its_place_and_its_colour_is_premultiplied():

@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.meshes import Objects
 from neural_sim.stages.stage import UNKEYED, Results
@@ -45,12 +43,7 @@ class ViewsDetectorStage(DetectorStage):
     views: tuple[ViewsStage, ...] = field(kw_only=True)
 
     def shown(self, results: Results) -> Scene:
-        fitted = [results(each) for each in self.views]
-        fitted = [
-            views.select(torch.arange(len(views) - each.held_out))
-            for each, views in zip(self.views, fitted, strict=True)
-        ]
-        return PictureScene.of(super().shown(results), fitted)
+        return PictureScene.of(super().shown(results), [views.fitted(results) for views in self.views])
 
 
 @dataclass(frozen=True)

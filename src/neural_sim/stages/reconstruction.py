@@ -34,8 +34,7 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
         return f"reconstruction of {self.views.object}"
 
     def make(self, results: Results) -> trimesh.Trimesh:
-        views = results(self.views)
-        return reconstruct(views.select(torch.arange(len(views) - self.views.held_out)), self.resolution)
+        return reconstruct(self.views.fitted(results), self.resolution)
 
     def pack(self, value: trimesh.Trimesh) -> dict[str, Any]:
         colours = value.visual.vertex_colors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
+
 from neural_sim.renderer.views import Views
 from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.pixels import from_bytes, to_bytes
@@ -35,6 +37,11 @@ class ViewsStage(Stage[PosedViews]):
     def held_out(self) -> int:
         """How many of the views, the last, only score the field."""
         return self.settings.held_out
+
+    def fitted(self, results: Results) -> PosedViews:
+        """The views that a field is fitted to, without those held out."""
+        views = results(self)
+        return views.select(torch.arange(len(views) - self.held_out))
 
     def make(self, results: Results) -> PosedViews:
         if not isinstance(self.objects, Meshes):

@@ -74,7 +74,7 @@ def _fitted(maps: Float[Tensor, "n h w 4"], height: int, width: int) -> Float[Te
 
 def _seen(views: PosedViews, radius: float) -> SceneDraw:
     """From where views were taken: angles in radians, distances in the unit of ``radius``, the object's."""
-    x, y, z = views.camera_to_world[:, :3, 3].cpu().unbind(-1)
-    distance = views.camera_to_world[:, :3, 3].cpu().norm(dim=-1)
+    centres = views.camera_to_world[:, :3, 3].cpu()
+    distance, (x, y, z) = centres.norm(dim=-1), centres.unbind(-1)
     none = torch.zeros(len(views), 0, dtype=torch.long)
     return SceneDraw((z / distance).acos(), torch.atan2(y, x), distance * radius, none, radius=radius)
