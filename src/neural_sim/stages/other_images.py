@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
+
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.meshes import Objects
 from neural_sim.stages.stage import UNKEYED, Results
