@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim import cameras
+from neural_sim.alpha import premultiplied
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.objective import expected_error
 from neural_sim.field.quadrature import render_weights, sum_rays
@@ -50,8 +51,7 @@ def fit_codes(
     half = views.camera.width // 2
     bundle = cameras.rays(views.camera, views.camera_to_world)
     rays = Rays(*(part[:, :, :half].reshape(-1, 3) for part in (bundle.origins, bundle.directions)))
-    images = views.images[:, :, :half].reshape(-1, 4)
-    pixels = torch.cat([images[:, :3] * images[:, 3:], images[:, 3:]], -1)
+    pixels = premultiplied(views.images[:, :, :half].reshape(-1, 4))
     with torch.no_grad():
         samples = field.sample(rays, termination)
         positions, directions = sample_points(rays, samples)
@@ -60,7 +60,7 @@ def fit_codes(
         if views.known is not None:
             weights = weights * views.known[:, :, :half].reshape(-1).index_select(0, samples.ray)[:, None]
         opacity = sum_rays(weights, samples)[:, 0]
-    view = samples.ray // (len(images) // len(views))
+    view = samples.ray // (len(pixels) // len(views))
     codes = field.anchors.detach().mean(0).repeat(len(views), 1).requires_grad_()
     optimizer = torch.optim.Adam([codes], lr=learning_rate)
     for _ in range(steps):

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from neural_sim.alpha import premultiplied
 from neural_sim.cameras import pixel_rays
 from neural_sim.types import PosedViews, Rays
 
@@ -55,6 +56,5 @@ def build_pool(views: PosedViews, border: int | None, generator: torch.Generator
     phase = torch.rand(len(index), generator=generator, device=generator.device).to(alpha)
     pixels = views.images.reshape(-1, 4).index_select(0, index)
     rays = pixel_rays(views.camera, views.camera_to_world.to(alpha), index)
-    premultiplied = torch.cat([pixels[:, :3] * pixels[:, 3:], pixels[:, 3:]], -1)
     view = index // (views.camera.height * views.camera.width)
-    return RayPool(Rays(rays.origins.contiguous(), rays.directions), premultiplied, phase, view)
+    return RayPool(Rays(rays.origins.contiguous(), rays.directions), premultiplied(pixels), phase, view)

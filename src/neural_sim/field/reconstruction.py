@@ -14,6 +14,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 from torch.nn import functional
 
+from neural_sim.alpha import premultiplied
 from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.field.hull import visual_hull
 from neural_sim.types import PosedViews
@@ -101,14 +102,13 @@ def _sampled(
     depth = (-local[:, 2]).clamp_min(1e-6)
     x, y = fx * local[:, 0] / depth + cx, -fy * local[:, 1] / depth + cy
     seen = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & (local[:, 2] < 0)
-    image = views.images[index].to(points)
+    image = premultiplied(views.images[index].to(points))
     if views.known is not None:
         known = views.known[index]
         column, row = (
             v.floor().long() for v in (x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1))
         )
         seen = seen & known[row, column]
-    image = torch.cat([image[..., :3] * image[..., 3:], image[..., 3:]], -1)
     place = torch.stack([2 * x / camera.width - 1, 2 * y / camera.height - 1], -1)
     values = functional.grid_sample(
         image.movedim(-1, 0)[None], place[None, None], align_corners=False, padding_mode="border"

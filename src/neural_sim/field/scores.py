@@ -7,15 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from neural_sim.alpha import over_white, premultiplied
 from neural_sim.field.base import RadianceField
 from neural_sim.field.rendering import render_views
 from neural_sim.types import PosedViews
-
-
-def over_white(premultiplied: Float[Tensor, "views height width 4"]) -> Float[Tensor, "views 3 height width"]:
-    """Premultiplied RGBA over a white background."""
-    rgb = premultiplied[..., :3] + (1.0 - premultiplied[..., 3:])
-    return rgb.movedim(-1, 1).clamp(0.0, 1.0)
 
 
 def score_views(
@@ -27,28 +22,28 @@ def score_views(
 
 
 def where_known(
-    premultiplied: Float[Tensor, "views height width 4"], views: PosedViews
+    rendered: Float[Tensor, "views height width 4"], views: PosedViews
 ) -> Float[Tensor, "views height width 4"]:
     """Renders without the pixels that these views do not show."""
-    return premultiplied if views.known is None else premultiplied * views.known[..., None]
+    return rendered if views.known is None else rendered * views.known[..., None]
 
 
 def compare(
-    premultiplied: Float[Tensor, "views height width 4"], images: Float[Tensor, "views height width 4"]
+    rendered: Float[Tensor, "views height width 4"], images: Float[Tensor, "views height width 4"]
 ) -> dict[str, float]:
-    """``psnr`` and ``ssim`` of whole images over white, ``psnr_foreground`` over the pixels of alpha above 0.
+    """``psnr`` and ``ssim`` of premultiplied renders and views over white, ``psnr_foreground`` over the pixels of alpha
+    above 0.
 
     PSNR in dB, mean over views of each view's value; SSIM as torchmetrics' default (Gaussian window, range 1).
     """
-    rendered, alpha = over_white(premultiplied), images[..., 3:]
-    target = over_white(torch.cat([images[..., :3] * alpha, alpha], -1))
-    psnr = peak_signal_noise_ratio(
-        rendered, target, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean"
+    shown, target = (
+        over_white(image).movedim(-1, 1).clamp(0.0, 1.0) for image in (rendered, premultiplied(images))
     )
-    ssim = structural_similarity_index_measure(rendered, target, data_range=1.0)
+    psnr = peak_signal_noise_ratio(shown, target, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean")
+    ssim = structural_similarity_index_measure(shown, target, data_range=1.0)
     foreground = [
         peak_signal_noise_ratio(image[:, mask], truth[:, mask], data_range=1.0)
-        for image, truth, mask in zip(rendered, target, alpha[..., 0] > 0.0, strict=True)
+        for image, truth, mask in zip(shown, target, images[..., 3] > 0.0, strict=True)
         if bool(mask.any())
     ]
     return {

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from neural_sim.alpha import premultiplied
 from neural_sim.cameras import focal_length, pixel_rays
 from neural_sim.objects.capture import Frame
 from neural_sim.objects.pictures import Pictures
@@ -89,9 +90,10 @@ def _view(
     place, seen = frame.lens.project(directions)
     size = place.new_tensor([frame.lens.width, frame.lens.height])
     seen &= ((place >= 0.0) & (place <= size)).all(-1)
-    premultiplied = torch.cat([photo[..., :3] * photo[..., 3:], photo[..., 3:]], -1).movedim(-1, 0)
     grid = (2.0 * place / size - 1.0).nan_to_num(2.0).float().view(1, fine.height, fine.width, 2)
-    sampled = functional.grid_sample(premultiplied[None], grid, padding_mode="border", align_corners=False)
+    sampled = functional.grid_sample(
+        premultiplied(photo).movedim(-1, 0)[None], grid, padding_mode="border", align_corners=False
+    )
     sampled = sampled * seen.view(1, 1, fine.height, fine.width)
     pooled = functional.avg_pool2d(sampled, side)[0].movedim(0, -1)
     known = functional.avg_pool2d(seen.view(1, 1, fine.height, fine.width).float(), side)[0, 0] > 1.0 - 1e-6

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 from trimesh.registration import procrustes
 
+from neural_sim.alpha import premultiplied
 from neural_sim.cameras import resized
 from neural_sim.checks import at_least
 from neural_sim.field.base import RadianceField
@@ -125,8 +126,8 @@ def reduce_views(views: PosedViews, size: int) -> PosedViews:
     if factor >= 1.0:
         return views
     camera = resized(camera, max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
-    shape, alpha = (camera.height, camera.width), views.images[..., 3:]
-    channels = torch.cat([views.images[..., :3] * alpha, alpha], -1).movedim(-1, 1)
+    shape = (camera.height, camera.width)
+    channels = premultiplied(views.images).movedim(-1, 1)
     small = functional.adaptive_avg_pool2d(channels, shape).movedim(1, -1)
     colour = small[..., :3] / small[..., 3:].clamp_min(1e-6)
     known = views.known

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from neural_sim.alpha import over_white, premultiplied
 from neural_sim.checks import at_least
 from neural_sim.field.hull import COARSEST
-from neural_sim.field.scores import compare
+from neural_sim.field.scores import compare, where_known
 from neural_sim.objects.mesh import ObjectMesh, content_digest
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
@@ -106,15 +107,11 @@ class SfmVsNerfStep:
         renderer = graph.experiment.imaging.renderer
         field = FieldSubject(mesh.name, results(graph.fields[label]).field, renderer=renderer)
         shown: Mapping[str, Subject] = {"nerf": field, "sfm": mesh}
-        rendered = {name: _premultiplied(each, unseen) for name, each in shown.items()}
+        rendered = {name: _as_seen(each, unseen) for name, each in shown.items()}
         scores = {name: compare(image, unseen.images) for name, image in rendered.items()}
-        alpha = unseen.images[..., 3:]
-        rendered = {"view": torch.cat([unseen.images[..., :3] * alpha, alpha], -1), **rendered}
-        over_white = {name: image[0, ..., :3] + 1.0 - image[0, ..., 3:] for name, image in rendered.items()}
-        return HeldOut(mesh.name, over_white, scores)
+        rendered = {"view": premultiplied(unseen.images), **rendered}
+        return HeldOut(mesh.name, {name: over_white(image[0]) for name, image in rendered.items()}, scores)
 
 
-def _premultiplied(subject: Subject, views: PosedViews) -> torch.Tensor:
-    rgba = subject.render(views.camera, views.camera_to_world)
-    image = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
-    return image if views.known is None else image * views.known[..., None]
+def _as_seen(subject: Subject, views: PosedViews) -> torch.Tensor:
+    return where_known(premultiplied(subject.render(views.camera, views.camera_to_world)), views)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchvision.transforms.v2.functional import resize
 
+from neural_sim.alpha import premultiplied
 from neural_sim.synthesis.assembly import RenderedObject
 from neural_sim.synthesis.draws import HARD, Draws
 from neural_sim.synthesis.scene import Scene
@@ -40,9 +41,7 @@ class PictureScene(Scene):
         pictures, seen = [], []
         for label, each in enumerate(views):
             rgba = each.images.to(scene.device(label), scene.dtype(label))
-            pictures.append(
-                _fitted(torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1), height, width)
-            )
+            pictures.append(_fitted(premultiplied(rgba), height, width))
             seen.append(_seen(each, 1.0 if scene.radii is None else scene.radii[label]))
         return PictureScene(
             **{f.name: getattr(scene, f.name) for f in fields(Scene)},

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.alpha import premultiplied
 from neural_sim.cameras import orbit
 from neural_sim.parameter.factor import COORDINATES
 from neural_sim.parameter.noise import BinNoise, SceneNoise
@@ -65,9 +66,7 @@ def _views(
         for within, second, turn in aligned
     ]
     poses = torch.cat([orbit(draw.phi, draw.rho, draw.distance, radius=radius) for draw in draws])
-    rgba = item.render(camera, poses)
-    premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
-    return premultiplied.unflatten(0, (bins, len(aligned), samples))
+    return premultiplied(item.render(camera, poses)).unflatten(0, (bins, len(aligned), samples))
 
 
 def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:
