@@ -53,10 +53,12 @@ def test_geometry_that_follows_the_light_is_refused(field):
 def test_the_figure_has_a_row_for_each_object(field, tmp_path):
     ends = (torch.eye(3)[0], torch.eye(3)[1])
     way = interpolate(field, NerfWRenderer(), CAMERA, POSE, ends, 4)
-    figure = interpolation_figure({"drill": way, "banana": way}, "Between two lights")
+    figure = interpolation_figure({"drill": way, "052_extra_large_clamp": way}, "Between two lights")
     axes = figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["drill", "banana"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["drill", "052_extra_large_clamp"]
     assert axes.images[0].get_array().shape == (24, 48, 3)
+    figure.draw_without_rendering()
+    assert all(label.get_window_extent().x0 >= 0.0 for label in axes.get_yticklabels())
     assert save(figure, tmp_path / "way.png").stat().st_size > 1000
 
 

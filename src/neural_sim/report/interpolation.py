@@ -154,9 +154,10 @@ def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> 
     canvas = np.concatenate(
         [np.concatenate(list(row.images.cpu().numpy()), axis=1) for row in views.values()], axis=0
     )
-    figure = Figure(figsize=(1.4 * count + 0.9, 1.4 * len(views) + 0.8))
-    left, bottom = 0.9 / (1.4 * count + 0.9), 0.35 / (1.4 * len(views) + 0.8)
-    axes = figure.add_axes((left, bottom, 1.0 - left - 0.01, 1.4 * len(views) / (1.4 * len(views) + 0.8)))
+    named = 0.2 + 0.07 * max(map(len, views))  # inches that the longest name takes
+    across, down = 1.4 * count + named, 1.4 * len(views) + 0.8
+    figure = Figure(figsize=(across, down))
+    axes = figure.add_axes((named / across, 0.35 / down, 1.4 * count / across - 0.01, 1.4 * len(views) / down))
     axes.imshow(canvas)
     axes.set_yticks([(row + 0.5) * height for row in range(len(views))], list(views))
     fractions = [f"{i / (count - 1):.2g}" for i in range(count)]
