@@ -1,6 +1,7 @@
 """Comparisons on made-up runs whose answers are known: who is ahead, by how much, and whether it is certain."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -77,11 +78,21 @@ def test_only_seeds_that_all_methods_have_are_compared():
         compare([run("other", 0, 0.4)], "ours", draws=5)
 
 
-def test_the_area_is_the_time_mean_of_what_was_reached():
+def test_the_area_is_the_mean_over_log_seconds_of_what_was_reached():
     seconds, ap = np.asarray([0.0, 10.0, 100.0]), np.asarray([0.2, 0.5, 0.8])
-    assert area_under(seconds, ap, 1.0, 100.0) == pytest.approx((0.2 + 0.5) / 2)  # a decade each
-    assert area_under(seconds, ap, 10.0, 1000.0) == pytest.approx((0.5 + 0.8) / 2)
+    assert area_under(seconds, ap, 1.0, 100.0) == pytest.approx((0.2 + 0.65) / 2)  # a decade each
+    assert area_under(seconds, ap, 10.0, 1000.0) == pytest.approx((0.65 + 0.8) / 2)
     assert area_under(seconds, ap, 100.0, 1000.0) == pytest.approx(0.8)
+    assert area_under(seconds, ap, 1.0, 9.0) == pytest.approx(0.2)
+    assert area_under(np.zeros(1), ap[:1], 1.0, 100.0) == 0.2  # nothing was learned
+
+
+@pytest.mark.parametrize(("first", "ratio"), [(0.5, 4.0), (0.5, 1e4), (5.0, 30.0), (20.5, 1.1), (400.0, 2.0)])
+def test_the_area_is_the_mean_of_ap_at_all_budgets(first, ratio):
+    seconds, ap = np.asarray([0.0, 3.0, 20.0, 21.0, 300.0]), np.asarray([0.1, 0.1, 0.6, 0.4, 0.9])
+    budgets = np.exp(np.linspace(math.log(first), math.log(first * ratio), 20_001))
+    reached = [ap_at(seconds, ap, budget) for budget in budgets]
+    assert area_under(seconds, ap, first, first * ratio) == pytest.approx(np.mean(reached), abs=1e-3)
 
 
 def test_ap_at_a_budget_lies_on_the_line_between_scored_points():
@@ -134,7 +145,7 @@ def _with_distances(each):
 def test_who_reaches_the_same_sooner_has_the_larger_area():
     runs = [run("ours", s, 0.7, (1.0, 10.0)) for s in range(2)] + [run("other", s, 0.7) for s in range(2)]
     found = compare(runs, "ours", draws=20)
-    # Over two decades from 1 to 100 s: ours has 0.45 then 0.7, the other 0.2 then 0.45.
+    # Over two decades from 1 to 100 s: ours rises from 0.45 to 0.7 and stays, the other has 0.2 and then rises so.
     assert found.area["other"].value == pytest.approx(0.25) and found.area["other"].certain
     np.testing.assert_allclose(biased_ap(runs[0], "seconds")[1], [0.2, 0.45, 0.7])
 

@@ -157,7 +157,9 @@ def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> 
     named = 0.2 + 0.07 * max(map(len, views))  # inches that the longest name takes
     across, down = 1.4 * count + named, 1.4 * len(views) + 0.8
     figure = Figure(figsize=(across, down))
-    axes = figure.add_axes((named / across, 0.35 / down, 1.4 * count / across - 0.01, 1.4 * len(views) / down))
+    axes = figure.add_axes(
+        (named / across, 0.35 / down, 1.4 * count / across - 0.01, 1.4 * len(views) / down)
+    )
     axes.imshow(canvas)
     axes.set_yticks([(row + 0.5) * height for row in range(len(views))], list(views))
     fractions = [f"{i / (count - 1):.2g}" for i in range(count)]

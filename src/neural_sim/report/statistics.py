@@ -154,10 +154,15 @@ def biased_ap(
 def area_under(
     seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
 ) -> float:
-    """Mean of AP over log seconds in [first, last], AP as a step function of the scored points."""
-    edges = np.concatenate([[first], seconds[(seconds > first) & (seconds < last)], [last]])
-    reached = np.searchsorted(seconds, edges[:-1], side="right") - 1
-    return float((ap[reached.clip(0)] * np.diff(np.log(edges))).sum() / math.log(last / first))
+    """Mean of AP over log seconds in [first, last], AP as :func:`ap_at` has it at every budget."""
+    begun = seconds > 0.0
+    if not begun.any():
+        return float(ap[0])
+    lower, upper, points = math.log(first), math.log(last), np.log(seconds[begun])
+    start = min(max(points[0], lower), upper)
+    edges = np.concatenate([[start], points[(points > start) & (points < upper)], [upper]])
+    line = np.trapezoid(np.interp(edges, points, ap[begun]), edges)
+    return float(ap[0] * (start - lower) + line) / (upper - lower)
 
 
 def ap_at(seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], budget: float) -> float:
