@@ -6,7 +6,7 @@ from pathlib import Path
 import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
-ORDER = ("types", "checks", "digests", "configuration", "cameras", "devices", "objects", "field", "renderer",
+ORDER = ("types", "alpha", "checks", "digests", "configuration", "cameras", "devices", "objects", "field", "renderer",
          "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "stress",
          "work_precision", "report", "stages", "main")  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
