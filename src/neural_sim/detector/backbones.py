@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +57,7 @@ class ResidualBlock(nn.Module):
 
 @dataclass(frozen=True)
 class Plan:
-    """Shape of a ``StridedBackbone``: output channels of its four stages, and which end in a residual block."""
+    """Shape of a strided backbone: output channels of its four stages, and which end in a residual block."""
 
     widths: tuple[int, int, int, int]
     residual: tuple[bool, bool, bool, bool]
@@ -69,67 +69,114 @@ PLANS = {
 }
 
 
-class StridedBackbone(nn.Module):
-    """Four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
+class Stages(nn.Module):
+    """Modules one after the other, of which some end a stage; the backbone's maps are those of ``strides``.
 
-    def __init__(self, plan: Plan, strides: tuple[int, ...], activation: str) -> None:
+    ``children`` are under the attribute ``under``, which is part of their parameters' names; ``ends`` gives the strides
+    of those that end a stage, from fine to coarse. ``channels`` are the maps' widths by stride.
+    """
+
+    def __init__(
+        self,
+        under: str,
+        children: Mapping[str, nn.Module],
+        ends: Mapping[str, int],
+        strides: tuple[int, ...],
+        channels: Mapping[int, int],
+    ) -> None:
         super().__init__()
-        self.channels = {8: plan.widths[2], 16: plan.widths[3]}
-        self.strides = strides
-        self.stages = nn.ModuleList()
-        before = 3
-        for after, residual in zip(plan.widths, plan.residual, strict=True):
-            layers: list[nn.Module] = [
-                nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False),
-                group_norm(after),
-                ACTIVATIONS[activation](),
-            ]
-            if residual:
-                layers.append(ResidualBlock(after, activation))
-            self.stages.append(nn.Sequential(*layers))
-            before = after
+        self._under, self._ends, self.strides, self.channels = under, dict(ends), strides, dict(channels)
+        self.add_module(under, nn.ModuleDict(children))
 
-    def forward(self, x: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        maps = {}
-        for level, stage in enumerate(self.stages):
-            x = stage(x)
-            maps[2 ** (level + 1)] = x
+    def forward(self, x: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
+        maps = self._run(x)
         return tuple(maps[stride] for stride in self.strides)
 
+    def _run(self, x: Float[Tensor, "n c h w"]) -> dict[int, Tensor]:
+        maps = {}
+        for name, child in self.get_submodule(self._under).named_children():
+            x = child(x)
+            if name in self._ends:
+                maps[self._ends[name]] = x
+        return maps
 
-class ResNetBackbone(nn.Module):
+    def divided(self, layers: int) -> tuple[Stages, LastStages]:
+        """The backbone as two, of which the second has the last ``layers`` stages. They share its parameters, and each
+        has those that it needs by their own names.
+
+        Raises:
+            ValueError: not at least 1 stage, or not fewer than there are.
+        """
+        if not 0 < layers < len(self._ends):
+            raise ValueError(
+                f"detector.backbone.loop_layers must be at least 0 and below {len(self._ends)}, got {layers}"
+            )
+        names, ends = [n for n, _ in self.get_submodule(self._under).named_children()], list(self._ends)
+        cut = names.index(ends[-layers - 1]) + 1
+        last = self._ends[ends[-layers - 1]]
+        kept = tuple(stride for stride in self.strides if stride < last)
+        first = self._part(names[:cut], (*kept, last))
+        rest = tuple(stride for stride in self.strides if stride > last)
+        return first, LastStages(self._part(names[cut:], rest), len(kept) + (last in self.strides))
+
+    def _part(self, names: Sequence[str], strides: tuple[int, ...]) -> Stages:
+        children = self.get_submodule(self._under)
+        ends = {name: self._ends[name] for name in names if name in self._ends}
+        return Stages(
+            self._under, {n: children.get_submodule(n) for n in names}, ends, strides, self.channels
+        )
+
+
+class LastStages(nn.Module):
+    """The last stages of a backbone, from the maps of the first ones to all that the whole backbone gives; parameters
+    ``backbone.*``. Of the first ones' maps, the last is continued, and the first ``kept`` are the backbone's own.
+    """
+
+    def __init__(self, stages: Stages, kept: int) -> None:
+        super().__init__()
+        self.backbone, self._kept = stages, kept
+
+    def forward(self, maps: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        return (*maps[: self._kept], *self.backbone(maps[-1]))
+
+
+def strided_backbone(plan: Plan, strides: tuple[int, ...], activation: str) -> Stages:
+    """Four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
+    stages: dict[str, nn.Module] = {}
+    before = 3
+    for number, (after, residual) in enumerate(zip(plan.widths, plan.residual, strict=True)):
+        layers: list[nn.Module] = [
+            nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False),
+            group_norm(after),
+            ACTIVATIONS[activation](),
+        ]
+        if residual:
+            layers.append(ResidualBlock(after, activation))
+        stages[str(number)] = nn.Sequential(*layers)
+        before = after
+    ends = {str(number): 2 ** (number + 1) for number in range(4)}
+    return Stages("stages", stages, ends, strides, {8: plan.widths[2], 16: plan.widths[3]})
+
+
+def resnet_backbone(
+    architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
+) -> Stages:
     """A torchvision ResNet without its classifier.
 
     With weights its batch normalisation is frozen; without, group normalisation stands in its place, because
     a frozen normalisation that has seen no data normalises nothing.
     """
-
-    def __init__(
-        self, architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
-    ) -> None:
-        super().__init__()
-        builder = {"resnet18": resnet.resnet18, "resnet50": resnet.resnet50}[architecture]
-        body = builder(norm_layer=group_norm if weights is None else FrozenBatchNorm2d)
-        del body.fc
-        if weights not in (None, SAVED):
-            body.load_state_dict(load_weights(architecture, weights), strict=False)
-        # Weights were trained with ReLU and keep it.
-        set_activation(body, activation if weights is None else "relu")
-        widening = 4 if architecture == "resnet50" else 1
-        self.channels = {4: 64 * widening, 8: 128 * widening, 16: 256 * widening, 32: 512 * widening}
-        self.strides = strides
-        self.body = body
-
-    def forward(self, x: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        body = self.body
-        x = body.maxpool(body.relu(body.bn1(body.conv1(x))))
-        maps = {}
-        for stride, layer in zip(
-            (4, 8, 16, 32), (body.layer1, body.layer2, body.layer3, body.layer4), strict=True
-        ):
-            x = layer(x)
-            maps[stride] = x
-        return tuple(maps[stride] for stride in self.strides)
+    builder = {"resnet18": resnet.resnet18, "resnet50": resnet.resnet50}[architecture]
+    body = builder(norm_layer=group_norm if weights is None else FrozenBatchNorm2d)
+    if weights not in (None, SAVED):
+        body.load_state_dict(load_weights(architecture, weights), strict=False)
+    # Weights were trained with ReLU and keep it.
+    set_activation(body, activation if weights is None else "relu")
+    widening = 4 if architecture == "resnet50" else 1
+    widths = {4: 64 * widening, 8: 128 * widening, 16: 256 * widening, 32: 512 * widening}
+    children = {name: child for name, child in body.named_children() if name not in ("avgpool", "fc")}
+    ends = {"layer1": 4, "layer2": 8, "layer3": 16, "layer4": 32}
+    return Stages("body", children, ends, strides, widths)
 
 
 def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
@@ -163,7 +210,7 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
-) -> StridedBackbone | ResNetBackbone:
+) -> Stages:
     """The backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
 
     Raises:
@@ -174,5 +221,5 @@ def build_backbone(
             raise ValueError(
                 f"detector.backbone.weights: {architecture} has no published weights, got {weights!r}, want null"
             )
-        return StridedBackbone(PLANS[architecture], strides, activation)
-    return ResNetBackbone(architecture, strides, activation, weights)
+        return strided_backbone(PLANS[architecture], strides, activation)
+    return resnet_backbone(architecture, strides, activation, weights)

@@ -46,17 +46,20 @@ class Classifier(BackboneDetector):
         self._predictor = nn.Sequential(OrderedDict(head=nn.Linear(self._widths[0], num_classes)))
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """The backbone's last map, averaged over the image, [n, c].
+        """The backbone's last map, averaged over the image, [n, c]; or the map that its last ``loop_layers`` stages
+        continue.
 
         Raises:
             ValueError: where the images are not of the classifier's size.
         """
         (maps,) = super().features(backbone, images)
-        return (maps.mean((2, 3)),)
+        return (maps.mean((2, 3)) if self._last is None else maps,)
 
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
         """Logits [n, 1, classes], and for the box a code of zeros [n, 1, 4], which says nothing."""
-        logits = functional_call(self._predictor, trainable, (features[0],), strict=True)[:, None]
+        predictor, (values,) = self.completed(trainable, features)
+        pooled = values if self._last is None else values.mean((2, 3))
+        logits = functional_call(self._predictor, predictor, (pooled,), strict=True)[:, None]
         return logits, logits.new_zeros((*logits.shape[:2], 4))
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, build_backbone
+from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, LastStages, build_backbone
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.network import NormalisedBackbone
 from neural_sim.detector.protocol import Detector, Parameters
@@ -55,7 +55,11 @@ class BackboneDetector(Detector):
         self.image_size = (height, width)
         self.proximal, self._settings, self._prior = proximal, backbone, prior
         body = build_backbone(backbone.architecture, tuple(strides), activation, backbone.weights)
-        self._backbone = NormalisedBackbone(body)
+        self._backbone = self._first = NormalisedBackbone(body)
+        self._last: LastStages | None = None
+        if backbone.loop_layers:
+            first, self._last = body.divided(backbone.loop_layers)
+            self._first = NormalisedBackbone(first)
         self._widths = [body.channels[stride] for stride in strides]
 
     def init(self, generator: torch.Generator) -> Parameters:
@@ -89,8 +93,15 @@ class BackboneDetector(Detector):
         names = {n for module in learned for n, _ in module.named_parameters()}
         return [name for name in params if name in names]
 
+    def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
+        """The backbone's parameters, but for those of the last ``loop_layers`` stages, and all others."""
+        last = set() if self._last is None else {name for name, _ in self._last.named_parameters()}
+        backbone = {n: value for n, value in params.items() if n.startswith("backbone.") and n not in last}
+        return backbone, {name: value for name, value in params.items() if name not in backbone}
+
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
+        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen; those
+        that the last ``loop_layers`` stages continue.
 
         Raises:
             ValueError: where the images are not of the detector's size.
@@ -100,7 +111,17 @@ class BackboneDetector(Detector):
                 f"detector: images want shape [n, 3, {self.image_size}], got {tuple(images.shape)}"
             )
         dtype = next(value.dtype for value in backbone.values() if value.is_floating_point())
-        return functional_call(self._backbone, backbone, (images.to(dtype),), strict=True)
+        return functional_call(self._first, backbone, (images.to(dtype),), strict=True)
+
+    def completed(
+        self, trainable: Parameters, features: Sequence[Tensor]
+    ) -> tuple[Parameters, Sequence[Tensor]]:
+        """The predictor's parameters, and all maps of the backbone."""
+        if self._last is None:
+            return trainable, features
+        last = {name: value for name, value in trainable.items() if name.startswith("backbone.")}
+        predictor = {name: value for name, value in trainable.items() if name not in last}
+        return predictor, functional_call(self._last, last, (tuple(features),), strict=True)
 
     def check_labels(self, labels: Tensor) -> None:
         """Raises ``ValueError`` where a label is not below ``num_classes``."""

@@ -102,7 +102,7 @@ class Detector(ABC):
     # --- what follows from it ---
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """Parameters of the backbone, which the psi loop freezes, and of what stands on its features."""
+        """What the psi loop freezes, which is what :meth:`features` takes: the backbone; and all other parameters."""
         backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 

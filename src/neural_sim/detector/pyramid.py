@@ -61,7 +61,8 @@ class PyramidDetector(BackboneDetector):
         self._predictor = build_predictor(self._widths, len(strides), network, head, activation)
 
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
-        out = functional_call(self._predictor, trainable, (features,), strict=True)
+        predictor, maps = self.completed(trainable, features)
+        out = functional_call(self._predictor, predictor, (maps,), strict=True)
         return out["cls_logits"], out["bbox_regression"]
 
 

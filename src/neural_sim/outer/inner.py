@@ -45,8 +45,9 @@ def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bo
 class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
-    The backbone is that of ``params``, frozen. Pyramid and head are trained for ``settings.epochs`` epochs at a time,
-    more where ``settings.least_steps`` asks for them, on the device of ``params``, where the scene's fields are too.
+    The backbone is that of ``params``; what the detector's ``split`` says stays frozen. The others are trained for
+    ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them, on the device of
+    ``params``, where the scene's fields are too.
     Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a pool of poses
     of every bin.
 
@@ -94,7 +95,8 @@ class InnerLoop:
         self.pool_seconds = time.perf_counter() - began
         self._start = params
         if settings.start != "warm":
-            self._start = {**placed(detector.init(generator), self.device), **self.backbone}
+            warm = {name: value for name, value in params.items() if name.startswith("backbone.")}
+            self._start = {**placed(detector.init(generator), self.device), **warm}
         self.objective = Objective(self.validation, validation, settings.objective, settings.smooth)
         self.differentiated = self.objective
         self.images = self.steps = self._numbers = 0

@@ -1,0 +1,77 @@
+"""Detectors of which the psi loop trains the backbone's last stages, against the same ones with all of it frozen."""
+
+import pytest
+import torch
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.classifier import Classifier
+from neural_sim.detector.fcos import Fcos
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone
+from neural_sim.detector.training import Optimisation, train_detector
+from neural_sim.types import LabelledImages
+
+KINDS = {
+    "tiny": (RetinaNet, "tiny", {}),
+    "one map": (RetinaNet, "tiny", {"anchors": Anchors(strides=(8,), sizes=((16.0,),))}),
+    "coarse": (RetinaNet, "tiny", {"anchors": Anchors(strides=(16,), sizes=((16.0,),))}),
+    "resnet18": (RetinaNet, "resnet18", {}),
+    "fcos": (Fcos, "tiny", {}),
+    "classifier": (Classifier, "tiny", {}),
+}
+
+
+def detector(kind, layers):
+    cls, architecture, settings = KINDS[kind]
+    return cls(num_classes=3, image_size=32, backbone=Backbone(architecture, loop_layers=layers), **settings)
+
+
+@pytest.fixture(scope="module")
+def images():
+    pixels = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    boxes = torch.tensor([[[4.0, 4.0, 20.0, 20.0]]]).expand(4, 1, 4)
+    return LabelledImages(
+        pixels, boxes.contiguous(), torch.tensor([[0], [1], [2], [0]]), torch.full((4, 1), -1)
+    )
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_outputs_are_those_of_the_whole_detector(kind, layers, images):
+    whole, parted = detector(kind, 0), detector(kind, layers)
+    params = whole.init(torch.Generator().manual_seed(0))
+    outputs = []
+    for each in (whole, parted):
+        backbone, trainable = each.split(params)
+        assert set(backbone) | set(trainable) == set(params) and not set(backbone) & set(trainable)
+        outputs.append(each.outputs(trainable, each.features(backbone, images.images)))
+    for one, other in zip(*outputs, strict=True):
+        torch.testing.assert_close(one, other)
+    assert params.keys() == parted.init(torch.Generator().manual_seed(0)).keys()
+
+
+def test_the_last_stages_are_trained_and_the_others_stay(images):
+    each = detector("tiny", 2)
+    params = each.init(torch.Generator().manual_seed(0))
+    cached = CachedSet.of(each, each.split(params)[0], images)
+    assert [tuple(level.shape) for level in cached.features] == [(4, 32, 8, 8)]
+    trained, _ = train_detector(
+        each, params, cached, torch.Generator().manual_seed(2), Optimisation(2, 4, 1e-2, 0.0)
+    )
+
+    moved = {
+        name.split(".")[2]
+        for name in params
+        if not torch.equal(params[name], trained[name]) and "backbone" in name
+    }
+    assert moved == {"2", "3"}
+
+
+def test_a_backbone_with_one_stage_at_least_is_left(images):
+    with pytest.raises(ValueError, match="loop_layers must be at least 0 and below 4, got 4"):
+        detector("tiny", 4)
+
+
+def test_published_weights_have_no_layers_for_the_loop():
+    with pytest.raises(ValueError, match="loop_layers: want at least 0, and 0 with"):
+        Backbone("resnet18", weights="DEFAULT", loop_layers=1)
