@@ -43,6 +43,7 @@ PAPER = [
         EVERY,
         "l. 342: conjugate gradients",
     ),
+    ("detector.backbone.loop_layers", 0, EVERY, 'l. 685: "we fix the backbone during training"'),
     ("detector.backbone.architecture", "resnet50", EVERY, "l. 684: RetinaNet (Lin et al. 2017)"),
     ("detector.anchors.strides", [8, 16, 32, 64, 128], EVERY, "l. 684: RetinaNet"),
     ("detector.anchors.ratios", [0.5, 1.0, 2.0], EVERY, "l. 684: RetinaNet"),
