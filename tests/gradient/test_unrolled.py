@@ -11,7 +11,8 @@ from recorded_training import DOUBLE, EXACT, NAMES, RULES, SHAPE, STEP, Micro, e
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.optimiser import AdamW
-from neural_sim.detector.settings import Backbone, Head
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.unrolled import Examples, reversed_steps
@@ -64,10 +65,29 @@ def test_it_is_that_of_the_same_training_of_an_anchor_free_detector(rule, genera
 
 
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)
+def test_it_is_that_of_the_same_training_with_the_backbones_last_stage(rule, generator):
+    problem = Micro(
+        detector=RetinaNet(
+            3, 32, Backbone("micro", loop_layers=1), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
+        )
+    )
+    assert any(name.startswith("backbone.stages.3") for name in problem.like)
+    direction = torch.randn(8, generator=generator, dtype=DOUBLE)
+    found = float(problem.accumulated(rule).images @ direction)
+
+    def outcome(step):
+        return problem.outer(problem.trained(rule, problem.weighted(1.0 + step * direction)).end)
+
+    # A convolution's gradients are smaller still: AdamW's steps bend within 1e-6, where rounding leaves five digits.
+    step, digits = (STEP / 100, 1e-5) if isinstance(rule, AdamW) else (STEP, 1e-6)
+    assert found == pytest.approx(extrapolated(outcome, step), rel=digits)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=NAMES)
 @pytest.mark.parametrize("wanted", ["weights", "inputs"])
 def test_it_is_that_of_the_same_training_of_a_classifier(rule, wanted, generator):
     """By the weights of images, and by their pooled features; the box says nothing and has no derivative."""
-    problem = Micro(detector=Classifier(3, 32, Backbone("micro")))
+    problem = Micro(detector=Classifier(3, 32, Backbone("micro", loop_layers=0)))
     features, box = problem.cached.inputs
     weight = torch.randn(8, generator=generator, dtype=DOUBLE)
     move = torch.randn(features.shape, generator=generator, dtype=DOUBLE) * (wanted == "inputs")

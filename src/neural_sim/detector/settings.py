@@ -37,7 +37,7 @@ class Backbone:
     architecture: str = "tiny"
     weights: str | None = None
     freeze: bool = False
-    loop_layers: int = 0
+    loop_layers: int = 1
 
     def __post_init__(self) -> None:
         check(
