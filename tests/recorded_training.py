@@ -32,7 +32,7 @@ class Micro:
     def __init__(self, proximal: float = 0.0, detector: Detector | None = None) -> None:
         generator = torch.Generator().manual_seed(3)
         detector = detector or RetinaNet(
-            3, 32, Backbone("micro", loop_layers=0), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
+            3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
         )
         params = {
             name: value.double() + 0.05 * torch.randn(value.shape, generator=generator, dtype=DOUBLE)

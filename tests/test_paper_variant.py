@@ -43,7 +43,7 @@ PAPER = [
         EVERY,
         "l. 342: conjugate gradients",
     ),
-    ("detector.backbone.loop_layers", 0, EVERY, 'l. 685: "we fix the backbone during training"'),
+    ("outer.loop_layers", 0, EVERY, 'l. 685: "we fix the backbone during training"'),
     ("detector.backbone.architecture", "resnet50", EVERY, "l. 684: RetinaNet (Lin et al. 2017)"),
     ("detector.anchors.strides", [8, 16, 32, 64, 128], EVERY, "l. 684: RetinaNet"),
     ("detector.anchors.ratios", [0.5, 1.0, 2.0], EVERY, "l. 684: RetinaNet"),
@@ -143,7 +143,7 @@ def test_another_method_gets_everything_but_the_method(name, baseline):
     # And the method itself is the one that it is without the variant.
     for group in ("baseline", "gradient", "solver"):
         assert other[group] == plain[group]
-    training = {"outer.epochs", "outer.start", "outer.steps", "outer.learning_rate"}
+    training = {"outer.epochs", "outer.start", "outer.steps", "outer.learning_rate", "outer.loop_layers"}
     outer = {key for key in _differences(plain, other) if key.startswith("outer.")}
     assert outer <= training
     assert all(value(other, key) == value(paper, key) for key in training)

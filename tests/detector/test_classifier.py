@@ -47,7 +47,7 @@ def test_with_weights_of_a_file_it_is_torchvisions_resnet(tmp_path):
     torch.save(resnet18(num_classes=1000).state_dict() | {
         k: v for k, v in theirs.state_dict().items() if not k.startswith("fc.")
     }, tmp_path / "weights.pt")  # fmt: skip
-    detector = make(size=64, backbone=Backbone("resnet18", str(tmp_path / "weights.pt"), loop_layers=0))
+    detector = make(size=64, backbone=Backbone("resnet18", str(tmp_path / "weights.pt")))
     params = detector.init(torch.Generator().manual_seed(0))
     params |= {"head.weight": theirs.fc.weight.detach(), "head.bias": theirs.fc.bias.detach()}
     images = torch.rand(2, 3, 64, 64)
@@ -57,9 +57,7 @@ def test_with_weights_of_a_file_it_is_torchvisions_resnet(tmp_path):
         found = logits_of(detector, params, LabelledImages(images, *[torch.zeros(0)] * 3))[0][:, 0]
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
     assert {"head.weight", "backbone.body.conv1.weight"} <= set(detector.learnable(params))
-    frozen = make(
-        size=64, backbone=Backbone("resnet18", str(tmp_path / "weights.pt"), freeze=True, loop_layers=0)
-    )
+    frozen = make(size=64, backbone=Backbone("resnet18", str(tmp_path / "weights.pt"), freeze=True))
     assert frozen.learnable(params) == ["head.weight", "head.bias"]
 
 
@@ -134,10 +132,7 @@ def test_it_learns_colours(tools):
     [
         (lambda: make(1), r"detector\.num_classes: want at least 2, for a classifier, got 1"),
         (lambda: make(activation="tanh"), r"detector\.activation"),
-        (
-            lambda: make(backbone=Backbone("tiny", "DEFAULT", loop_layers=0)),
-            r"detector\.backbone\.weights: tiny has no",
-        ),
+        (lambda: make(backbone=Backbone("tiny", "DEFAULT")), r"detector\.backbone\.weights: tiny has no"),
         (
             lambda: make().assign(torch.zeros(2, 2, 4), torch.tensor([[1, -1], [0, 2]])),
             r"classifier: want objects of one class in an image, got \[0, 2\] in image 1",

@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from colour_detector import ColourDetector
+from torchvision.models import resnet18
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.classifier import Classifier
@@ -23,7 +25,7 @@ KINDS = {
 
 def detector(kind, layers):
     cls, architecture, settings = KINDS[kind]
-    return cls(num_classes=3, image_size=32, backbone=Backbone(architecture, loop_layers=layers), **settings)
+    return cls(num_classes=3, image_size=32, backbone=Backbone(architecture), **settings).in_loop(layers)
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +69,32 @@ def test_the_last_stages_are_trained_and_the_others_stay(images):
     assert moved == {"2", "3"}
 
 
-def test_a_backbone_with_one_stage_at_least_is_left(images):
-    with pytest.raises(ValueError, match="loop_layers must be at least 0 and below 4, got 4"):
+@pytest.mark.parametrize(
+    ("architecture", "trained"), [("tiny", {"3"}), ("micro", {"3"}), ("resnet18", set())]
+)
+def test_a_detector_proposes_the_last_stage_of_a_small_backbone(architecture, trained):
+    each = RetinaNet(3, 32, Backbone(architecture)).in_loop(None)
+    trainable = each.split(each.init(torch.Generator().manual_seed(0)))[1]
+    assert {name.split(".")[2] for name in trainable if name.startswith("backbone.")} == trained
+
+
+def test_a_backbone_with_one_stage_at_least_is_left():
+    with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0 and below 4, got 4"):
         detector("tiny", 4)
 
 
-def test_published_weights_have_no_layers_for_the_loop():
-    with pytest.raises(ValueError, match="loop_layers: want at least 0, and 0 with"):
-        Backbone("resnet18", weights="DEFAULT", loop_layers=1)
+def test_published_weights_have_no_layers_for_the_loop(tmp_path):
+    torch.save(resnet18().state_dict(), tmp_path / "resnet18.pth")
+    each = RetinaNet(3, 32, Backbone("resnet18", str(tmp_path / "resnet18.pth")))
+    assert each.in_loop(None) is each
+    with pytest.raises(
+        ValueError, match=r"outer\.loop_layers: want null or 0 with detector\.backbone\.weights, got 1"
+    ):
+        each.in_loop(1)
+
+
+def test_a_detector_without_stages_has_no_layers_for_the_loop():
+    each = ColourDetector(num_classes=3, image_size=32)
+    assert each.in_loop(None) is each and each.in_loop(0) is each
+    with pytest.raises(ValueError, match=r"outer\.loop_layers: ColourDetector has no stages"):
+        each.in_loop(1)

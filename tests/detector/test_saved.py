@@ -70,9 +70,7 @@ def test_pretrained_weights_are_not_read_again(tools, generator, tmp_path, monke
     """A backbone with weights has another shape (frozen batch normalisation); the file alone must do for it."""
     weights = tmp_path / "resnet.pt"
     torch.save(backbones.resnet.resnet18().state_dict(), weights)
-    make = functools.partial(
-        RetinaNet, backbone=Backbone("resnet18", str(weights), freeze=True, loop_layers=0)
-    )
+    make = functools.partial(RetinaNet, backbone=Backbone("resnet18", str(weights), freeze=True))
     detector = make(num_classes=3, image_size=(32, 48))
     before = SavedDetector(make, detector.init(generator), NAMES, (32, 48))
     before.save(tmp_path)

@@ -127,7 +127,7 @@ def test_a_proximal_term_holds_training_at_its_anchor(tools, generator, images):
 def test_a_detector_may_keep_its_weights_in_every_training(tools, generator, images, tmp_path):
     torch.manual_seed(0)
     torch.save(resnet18().state_dict(), tmp_path / "resnet18.pth")
-    settings = {"architecture": "resnet18", "weights": str(tmp_path / "resnet18.pth"), "loop_layers": 0}
+    settings = {"architecture": "resnet18", "weights": str(tmp_path / "resnet18.pth")}
     detector = tools.detector({**settings, "freeze": True})
     start = detector.init(generator)
     backbone, trainable = detector.split(start)

@@ -10,7 +10,7 @@ import torch
 
 from neural_sim import cameras
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.settings import Anchors, Head
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
 from neural_sim.gradient.hypergradient import InnerProblem
@@ -167,9 +167,7 @@ class Pipeline:
         self.noise = self.distribution.draw_noise(COUNT, generator, DOUBLE)
         self.synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
         self.nuisance = self.synthesizer.draw_nuisance(COUNT, PIPELINE_CAMERA, generator)
-        self.detector = RetinaNet(
-            2, 32, Backbone(loop_layers=0), anchors=Anchors(sizes=((10,), (18,))), head=Head(8, 1)
-        )
+        self.detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,))), head=Head(8, 1))
         params = {name: value.double() for name, value in self.detector.init(generator).items()}
         self.backbone, self.trainable = self.detector.split(params)
         flat = flatten(self.trainable)

@@ -68,8 +68,8 @@ def test_it_is_that_of_the_same_training_of_an_anchor_free_detector(rule, genera
 def test_it_is_that_of_the_same_training_with_the_backbones_last_stage(rule, generator):
     problem = Micro(
         detector=RetinaNet(
-            3, 32, Backbone("micro", loop_layers=1), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
-        )
+            3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
+        ).in_loop(1)
     )
     assert any(name.startswith("backbone.stages.3") for name in problem.like)
     direction = torch.randn(8, generator=generator, dtype=DOUBLE)
@@ -87,7 +87,7 @@ def test_it_is_that_of_the_same_training_with_the_backbones_last_stage(rule, gen
 @pytest.mark.parametrize("wanted", ["weights", "inputs"])
 def test_it_is_that_of_the_same_training_of_a_classifier(rule, wanted, generator):
     """By the weights of images, and by their pooled features; the box says nothing and has no derivative."""
-    problem = Micro(detector=Classifier(3, 32, Backbone("micro", loop_layers=0)))
+    problem = Micro(detector=Classifier(3, 32, Backbone("micro")))
     features, box = problem.cached.inputs
     weight = torch.randn(8, generator=generator, dtype=DOUBLE)
     move = torch.randn(features.shape, generator=generator, dtype=DOUBLE) * (wanted == "inputs")

@@ -109,7 +109,7 @@ class Stages(nn.Module):
         """
         if not 0 < layers < len(self._ends):
             raise ValueError(
-                f"detector.backbone.loop_layers must be at least 0 and below {len(self._ends)}, got {layers}"
+                f"outer.loop_layers must be at least 0 and below {len(self._ends)}, got {layers}"
             )
         names, ends = [n for n, _ in self.get_submodule(self._under).named_children()], list(self._ends)
         cut = names.index(ends[-layers - 1]) + 1

@@ -6,6 +6,7 @@ be differentiated any number of times.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import ClassVar
@@ -15,7 +16,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, LastStages, build_backbone
+from neural_sim.detector.backbones import (
+    ACTIVATIONS,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    PLANS,
+    LastStages,
+    build_backbone,
+)
 from neural_sim.detector.initialise import initialise
 from neural_sim.detector.network import NormalisedBackbone
 from neural_sim.detector.protocol import Detector, Parameters
@@ -54,13 +62,33 @@ class BackboneDetector(Detector):
         height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
         self.image_size = (height, width)
         self.proximal, self._settings, self._prior = proximal, backbone, prior
-        body = build_backbone(backbone.architecture, tuple(strides), activation, backbone.weights)
+        self._body = body = build_backbone(
+            backbone.architecture, tuple(strides), activation, backbone.weights
+        )
         self._backbone = self._first = NormalisedBackbone(body)
         self._last: LastStages | None = None
-        if backbone.loop_layers:
-            first, self._last = body.divided(backbone.loop_layers)
-            self._first = NormalisedBackbone(first)
         self._widths = [body.channels[stride] for stride in strides]
+
+    def in_loop(self, layers: int | None) -> BackboneDetector:
+        """As the base class says. None: the last stage of our small backbones, and none of a ResNet's, which have
+        millions of parameters.
+
+        Raises:
+            ValueError: of a backbone with published weights, whose normalisation is frozen; fewer than 0 stages, or not
+                fewer than there are.
+        """
+        if layers is None:
+            layers = int(self._settings.architecture in PLANS)
+        if layers == 0:
+            return self
+        if self._settings.weights is not None:
+            raise ValueError(
+                f"outer.loop_layers: want null or 0 with detector.backbone.weights, got {layers}"
+            )
+        looped = copy.copy(self)
+        first, looped._last = self._body.divided(layers)
+        looped._first = NormalisedBackbone(first)
+        return looped
 
     def init(self, generator: torch.Generator) -> Parameters:
         """Fresh parameters in float32 on the CPU; pretrained backbones keep their weights.
@@ -94,14 +122,14 @@ class BackboneDetector(Detector):
         return [name for name in params if name in names]
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """The backbone's parameters, but for those of the last ``loop_layers`` stages, and all others."""
+        """The backbone's parameters, but for those of the last stages that the psi loop trains, and all others."""
         last = set() if self._last is None else {name for name, _ in self._last.named_parameters()}
         backbone = {n: value for n, value in params.items() if n.startswith("backbone.") and n not in last}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen; those
-        that the last ``loop_layers`` stages continue.
+        that the last stages that the psi loop trains continue.
 
         Raises:
             ValueError: where the images are not of the detector's size.

@@ -101,6 +101,19 @@ class Detector(ABC):
 
     # --- what follows from it ---
 
+    def in_loop(self, layers: int | None) -> Detector:
+        """The detector as the psi loop trains it, with the last ``layers`` stages of its backbone among what
+        :meth:`split` leaves to train; None: as many as a kind of detector proposes. The base class knows no stages.
+
+        Raises:
+            ValueError: where the backbone has no such stages.
+        """
+        if layers:
+            raise ValueError(
+                f"outer.loop_layers: {type(self).__name__} has no stages, want null or 0, got {layers}"
+            )
+        return self
+
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
         """What the psi loop freezes, which is what :meth:`features` takes: the backbone; and all other parameters."""
         backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}

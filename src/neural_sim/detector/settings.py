@@ -29,24 +29,16 @@ class Backbone:
         architecture: ``micro``, ``tiny``, ``resnet18`` or ``resnet50``.
         weights: initial weights of a ResNet: None (random), a file with a torchvision state dictionary, or
             torchvision's name of the weights. Model files have ``saved``: the shape of a backbone that had weights.
-        freeze: train the predictor only, in every training.
-        loop_layers: last stages of the backbone that the psi loop trains too, from the warm start's values; its other
-            stages are frozen there. 0: all are. Backbones of published weights have 0, their normalisation is frozen.
+        freeze: train the predictor only, in every training. Of the psi loop see ``outer.loop_layers``.
     """
 
     architecture: str = "tiny"
     weights: str | None = None
     freeze: bool = False
-    loop_layers: int = 1
 
     def __post_init__(self) -> None:
         check(
             "detector.backbone",
-            loop_layers=(
-                self.loop_layers,
-                self.loop_layers == 0 or (self.loop_layers > 0 and self.weights is None),
-                "at least 0, and 0 with detector.backbone.weights",
-            ),
             architecture=(
                 self.architecture,
                 self.architecture in ARCHITECTURES,

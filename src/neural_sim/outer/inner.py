@@ -79,6 +79,7 @@ class InnerLoop:
         draws: Draws = HARD,
         photographs: LabelledImages | None = None,
     ) -> None:
+        detector = detector.in_loop(settings.loop_layers)
         self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
         self.training, self.generator = training, generator
         self.backbone, self.warm_start = detector.split(params)

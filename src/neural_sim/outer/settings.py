@@ -127,6 +127,8 @@ class Outer:
         least_steps: of that training, which has more epochs where these would give fewer steps: the images of one or
             two objects fill few batches, and so short a training says little about psi. Not of a training that goes on
             from the iteration before.
+        loop_layers: last stages of the detector's backbone that this training changes, from the warm start's values;
+            the others are frozen. None: as many as the detector proposes (:meth:`Detector.in_loop`).
         start: initial pyramid and head of that training: those of the iteration before (``previous``, the paper's), of
             the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that goes on remembers
             bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
@@ -169,6 +171,7 @@ class Outer:
     epochs: int = 12
     least_steps: int = 0
     learning_rate: float = 3e-3
+    loop_layers: int | None = None
     start: Start = "fresh"
     train_first: bool = True
     adjoint: AdjointKind = "unrolled"
