@@ -40,10 +40,10 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
         generator = torch.Generator().manual_seed(seed)
         inner = InnerLoop(scene, detector, warm_start, validation, x.loop.outer, x.training, generator)
         images = inner.draw(psi).images
-        inner.train(CachedSet.of(detector, inner.backbone, images))
+        inner.train(CachedSet.of(inner.detector, inner.backbone, images))
         loop = FrozenLoop.at(
             scene,
-            detector,
+            inner.detector,
             inner.theta,
             psi,
             images,

@@ -69,10 +69,10 @@ def test_a_training_set_is_the_drawn_images_and_then_the_photographs(scene):
     inner = inner_loop(scene, ReinforceEstimator().draws)
     images = inner.draw(torch.zeros(2, 4)).images
     cached = inner.training_set(images)
-    drawn = CachedSet.of(DETECTOR, inner.backbone, images)
+    drawn = CachedSet.of(inner.detector, inner.backbone, images)
     assert len(cached) == 12 + 5 and inner.drawn(cached) == 12
     assert torch.equal(cached.select(torch.arange(12)).targets.labels, drawn.targets.labels)
-    photographs = CachedSet.of(DETECTOR, inner.backbone, noise(5))
+    photographs = CachedSet.of(inner.detector, inner.backbone, noise(5))
     for ours, theirs in zip(cached.features, photographs.features, strict=True):
         assert torch.equal(ours[12:], theirs)
     weights = inner.weights(cached)
