@@ -29,11 +29,10 @@ STEP = 1e-5  # of differences: AdamW's steps bend within |gradient| of their sta
 class Micro:
     """The micro detector and a few images of noise with boxes, in float64, some to train on and some to validate on."""
 
-    def __init__(self, proximal: float = 0.0, detector: Detector | None = None) -> None:
+    def __init__(self, proximal: float = 0.0, detector: Detector | None = None, layers: int = 0) -> None:
         generator = torch.Generator().manual_seed(3)
-        detector = detector or RetinaNet(
-            3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
-        )
+        micro = RetinaNet(3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48))
+        detector = (detector or micro).in_loop(layers)
         params = {
             name: value.double() + 0.05 * torch.randn(value.shape, generator=generator, dtype=DOUBLE)
             for name, value in detector.init(generator).items()

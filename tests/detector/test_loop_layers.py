@@ -11,6 +11,8 @@ from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone
 from neural_sim.detector.training import Optimisation, train_detector
+from neural_sim.outer.settings import Outer
+from neural_sim.parameter.update import SGD
 from neural_sim.types import LabelledImages
 
 KINDS = {
@@ -81,6 +83,11 @@ def test_a_detector_proposes_the_last_stage_of_a_small_backbone(architecture, tr
 def test_a_backbone_with_one_stage_at_least_is_left():
     with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0 and below 4, got 4"):
         detector("tiny", 4)
+
+
+def test_a_negative_number_is_refused_before_any_stage():
+    with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0, got -1"):
+        Outer(SGD(1.0), loop_layers=-1)
 
 
 def test_published_weights_have_no_layers_for_the_loop(tmp_path):

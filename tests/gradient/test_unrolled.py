@@ -11,8 +11,7 @@ from recorded_training import DOUBLE, EXACT, NAMES, RULES, SHAPE, STEP, Micro, e
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.optimiser import AdamW
-from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.settings import Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.unrolled import Examples, reversed_steps
@@ -66,11 +65,7 @@ def test_it_is_that_of_the_same_training_of_an_anchor_free_detector(rule, genera
 
 @pytest.mark.parametrize("rule", RULES, ids=NAMES)
 def test_it_is_that_of_the_same_training_with_the_backbones_last_stage(rule, generator):
-    problem = Micro(
-        detector=RetinaNet(
-            3, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48)
-        ).in_loop(1)
-    )
+    problem = Micro(layers=1)
     assert any(name.startswith("backbone.stages.3") for name in problem.like)
     direction = torch.randn(8, generator=generator, dtype=DOUBLE)
     found = float(problem.accumulated(rule).images @ direction)

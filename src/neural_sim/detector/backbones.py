@@ -89,16 +89,12 @@ class Stages(nn.Module):
         self.add_module(under, nn.ModuleDict(children))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
-        maps = self._run(x)
-        return tuple(maps[stride] for stride in self.strides)
-
-    def _run(self, x: Float[Tensor, "n c h w"]) -> dict[int, Tensor]:
         maps = {}
         for name, child in self.get_submodule(self._under).named_children():
             x = child(x)
             if name in self._ends:
                 maps[self._ends[name]] = x
-        return maps
+        return tuple(maps[stride] for stride in self.strides)
 
     def divided(self, layers: int) -> tuple[Stages, LastStages]:
         """The backbone as two, of which the second has the last ``layers`` stages. They share its parameters, and each
@@ -111,9 +107,11 @@ class Stages(nn.Module):
             raise ValueError(
                 f"outer.loop_layers must be at least 0 and below {len(self._ends)}, got {layers}"
             )
-        names, ends = [n for n, _ in self.get_submodule(self._under).named_children()], list(self._ends)
-        cut = names.index(ends[-layers - 1]) + 1
-        last = self._ends[ends[-layers - 1]]
+        names, before = (
+            [n for n, _ in self.get_submodule(self._under).named_children()],
+            list(self._ends)[-layers - 1],
+        )
+        cut, last = names.index(before) + 1, self._ends[before]
         kept = tuple(stride for stride in self.strides if stride < last)
         first = self._part(names[:cut], (*kept, last))
         rest = tuple(stride for stride in self.strides if stride > last)

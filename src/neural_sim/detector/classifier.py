@@ -46,8 +46,8 @@ class Classifier(BackboneDetector):
         self._predictor = nn.Sequential(OrderedDict(head=nn.Linear(self._widths[0], num_classes)))
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """The backbone's last map, averaged over the image, [n, c]; or the map that the stages which the psi loop
-        trains continue.
+        """The backbone's last map, averaged over the image, [n, c]; in the psi loop, where its last stages
+        train, the map before them.
 
         Raises:
             ValueError: where the images are not of the classifier's size.

@@ -128,8 +128,8 @@ class BackboneDetector(Detector):
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen; those
-        that the last stages that the psi loop trains continue.
+        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen. In the
+        psi loop, where its last stages train, those that come from the others.
 
         Raises:
             ValueError: where the images are not of the detector's size.

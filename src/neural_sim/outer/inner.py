@@ -45,11 +45,10 @@ def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bo
 class InnerLoop:
     """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
 
-    The backbone is that of ``params``; what the detector's ``split`` says stays frozen. The others are trained for
-    ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them, on the device of
-    ``params``, where the scene's fields are too.
-    Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a pool of poses
-    of every bin.
+    The backbone is that of ``params``, frozen but for its last ``settings.loop_layers`` stages. These, pyramid and
+    head are trained for ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them, on
+    the device of ``params``, where the scene's fields are too. Relaxed draws, and images under a light that moves,
+    are always rendered anew; all others come from a pool of poses of every bin.
 
     Args:
         scene: what images are drawn from.

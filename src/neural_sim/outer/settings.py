@@ -202,6 +202,8 @@ class Outer:
         )
         at_least("outer", 0, curvature_images=self.curvature_images, pool_per_bin=self.pool_per_bin)
         at_least("outer", 0, certify_every=self.certify_every)
+        if self.loop_layers is not None:
+            at_least("outer", 0, loop_layers=self.loop_layers)
         if self.quality is not None and self.quality not in get_args(Quality):
             raise ValueError(
                 f"outer.quality must be one of {', '.join(get_args(Quality))} or null, got {self.quality!r}"

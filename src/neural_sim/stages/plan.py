@@ -55,7 +55,7 @@ def _loop(graph: Graph) -> Iterator[Omission]:
             "psi", "fine renders in the loop", f"outer.quality={outer.quality}; the scored images are fine"
         )
     if outer.epochs > 1:
-        what, why = "backbone passes of the loop's training", "features of frozen stages are kept"
+        what, why = "passes of the backbone's frozen stages in the loop's training", "their features are kept"
         yield Omission("psi", what, why, 1.0 - 1.0 / outer.epochs)
 
 
