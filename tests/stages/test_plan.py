@@ -23,7 +23,9 @@ def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     assert "images in Hessian products" not in found
     implicit = left_out("scale=quick", "outer.adjoint=implicit")
     assert implicit["images in Hessian products"].fraction == pytest.approx(1 - 64 / 300)
-    assert found["backbone passes of the loop's training"].fraction == pytest.approx(1 - 1 / 12)
+    assert found["passes of the backbone's frozen stages in the loop's training"].fraction == pytest.approx(
+        1 - 1 / 12
+    )
 
 
 def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
@@ -51,7 +53,7 @@ def test_what_is_needed_is_not_left_out():
     )
     assert not {
         "view-dependent colour", "images in Hessian products", "renders of the loop",
-        "backbone passes of the loop's training",
+        "passes of the backbone's frozen stages in the loop's training",
     } & set(found)  # fmt: skip
 
 
