@@ -24,7 +24,7 @@ from unrolled_report import centred, report
 from worlds import SMALL
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.protocol import Parameters
+from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
@@ -58,9 +58,10 @@ FEW = ((2, 1), (1, 1), (1, 2), (1, 4))
 
 @dataclass(frozen=True)
 class World:
-    """All objects' images of every bin, under the warm start's backbone, and what every training starts from."""
+    """All objects' images of every bin, through the warm start's frozen stages, and what every training starts from."""
 
     context: Context
+    detector: Detector
     pool: CachedSet
     validation: CachedSet
     start: Parameters
@@ -73,14 +74,16 @@ class World:
         graph, results = context.graph, context.results
         scene = results(graph.scene)
         generator, psi = torch.Generator().manual_seed(5), graph.psi("initial")
-        detector = graph.warm_start.build()
-        backbone, _ = detector.split(results(graph.warm_start).params)
+        detector = graph.warm_start.build().in_loop(context.experiment.loop.outer.loop_layers)
+        warm = results(graph.warm_start).params
+        frozen, _ = detector.split(warm)
         source = ImagePool.render(scene, PER_BIN, generator)
         drawn = [scene.probes(i, "pose", PER_BIN, psi, generator, source)[0] for i in range(len(psi))]
-        pool = CachedSet.of(detector, backbone, LabelledImages.concatenate(drawn))
+        pool = CachedSet.of(detector, frozen, LabelledImages.concatenate(drawn))
         p = scene.distribution.probabilities(psi)["pose"].float()
-        validation = CachedSet.of(detector, backbone, results(graph.targets).val)
-        return World(context, pool, validation, {**detector.init(generator), **backbone}, p)
+        validation = CachedSet.of(detector, frozen, results(graph.targets).val)
+        start = {name: value for name, value in warm.items() if name.startswith("backbone.")}
+        return World(context, detector, pool, validation, {**detector.init(generator), **start}, p)
 
     def probes(self, label: int) -> Int[Tensor, "k per_bin"]:
         """Rows of one object's images, bin by bin."""
@@ -100,15 +103,14 @@ class World:
     def train(
         self, rows: Tensor, seed: int, recording: Recording | None = None
     ) -> tuple[Parameters, TrainingHistory]:
-        """As the psi loop trains; returns the trained pyramid and head."""
-        x = self.context.experiment
-        detector, generator = self.context.graph.warm_start.build(), torch.Generator().manual_seed(seed)
+        """As the psi loop trains; returns the trained part."""
+        x, generator = self.context.experiment, torch.Generator().manual_seed(seed)
         theta, history = train_detector(
-            detector, self.start, self.pool.select(rows), generator,
+            self.detector, self.start, self.pool.select(rows), generator,
             replace(x.training.of(x.loop.outer.epochs), learning_rate=x.loop.outer.learning_rate),
             recording=recording,
         )  # fmt: skip
-        return detector.split(theta)[1], history
+        return self.detector.split(theta)[1], history
 
 
 @dataclass(frozen=True)

@@ -107,3 +107,10 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
         return
     with pytest.raises(ValueError, match=r"^export\.psi=target: no distribution of the target is known"):
         graph.stated_psi("target", "export.psi")
+
+
+def test_stages_that_the_loop_cannot_train_are_refused_before_anything_is_made():
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        graph = Graph(build(compose("config", ["+experiment=pose_gap", "outer.loop_layers=4"])))
+    with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0 and below 4, got 4"):
+        _ = graph.learned

@@ -45,6 +45,9 @@ class PsiStage(Stage[LearnedPsi]):
 
     ``parts`` are those of a method that follows the hypergradient, None for others. ``on_record`` is called with every
     iteration's record as it ends.
+
+    Raises:
+        ValueError: ``outer.loop_layers`` of a backbone that has no such stages; here, before fields are trained.
     """
 
     name: ClassVar[str] = "psi"
@@ -60,6 +63,10 @@ class PsiStage(Stage[LearnedPsi]):
     seed: int
     progress: bool = field(default=False, metadata=UNKEYED)
     on_record: Callable[[IterationRecord], object] | None = field(default=None, metadata=UNKEYED)
+
+    def __post_init__(self) -> None:
+        if self.outer.loop_layers:
+            self.warm_start.build().in_loop(self.outer.loop_layers)
 
     @property
     def title(self) -> str:
