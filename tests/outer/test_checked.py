@@ -130,6 +130,20 @@ def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
 
 
+@pytest.mark.parametrize(("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5), (0.9, 0.5), (1.1, 0.65)])
+def test_a_radius_shrinks_after_a_fall_beyond_the_error_alone(change, radius):
+    """What is neither better nor worse beyond the error is tried again: a shorter step would show even less."""
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50
+    noise = noise - noise.mean(1, keepdim=True)
+    error = 50**0.5 * noise.std(1, keepdim=True)
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    verdicts = steps.judge(torch.zeros(2, 50), noise + change * error / 50)
+    assert [verdict.accepted for verdict in verdicts.values()] == 2 * [change > 1.0]
+    assert steps.radius["pose"].tolist() == pytest.approx(2 * [radius])
+
+
 def test_a_rise_within_the_error_of_its_images_is_not_believed():
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50
@@ -150,6 +164,7 @@ def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.52, 0.51, 0.3))
     assert not any(verdict.accepted for verdict in verdicts.values())
     assert float(steps.reported.abs().max()) == 0.0
+    assert steps.radius["pose"].tolist() == pytest.approx([0.2, 0.2])
 
 
 def test_what_others_lose_counts_beyond_the_error_of_the_sum():

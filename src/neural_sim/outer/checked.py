@@ -2,8 +2,10 @@
 
 It has the random numbers of the training at the old psi, whose derivative was taken (the same initial parameters,
 batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the step with
-little noise. A step that does not raise its object's score is rejected and its radius shrinks; an accepted one enlarges
-it (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by object).
+little noise. A step that does not raise its object's score beyond the error is rejected. The radius grows after an
+accepted step and shrinks after one that lowered the score beyond the error (Conn, Gould and Toint 2000, Chapter 6, with
+the reduction measured object by object). Between the two it stays: the noise of a training does not shrink with the
+step, so that a shorter one would be judged by chance even more.
 """
 
 from __future__ import annotations
@@ -83,20 +85,23 @@ class CheckedSteps:
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
         """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
-        paired differences. Where all these scores rose and yet the mean over all classes fell by more than its own
-        standard errors, the steps harm other objects more than they help their own, and all are rejected."""
+        paired differences; shrink its radius where the score fell by more than these. Where all these scores rose and
+        yet the mean over all classes fell by more than its own standard errors, the steps harm other objects more than
+        they help their own: all are rejected, and their radii shrink."""
         change = after.double() - before.double()
         gains = change.sum(1)
         gain = gains[self.labels]
         error = _of_sums(change)[self.labels]
         rose, pending = gain > self.settings.errors * error, self._pending
+        fell = gain < -self.settings.errors * error
         total, of_total = gains.nansum(), _of_sums(change.nansum(0))
         if bool(pending.any()) and bool(rose[pending].all()) and total < -self.settings.errors * of_total:
-            rose = torch.zeros_like(rose)
+            rose, fell = torch.zeros_like(rose), torch.ones_like(fell)
         accepted = pending & rose
         self.accepted = self.trial = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
-            scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink)
+            scaled = torch.where(accepted, radius * self.settings.grow, radius)
+            scaled = torch.where(fell, radius * self.settings.shrink, scaled)
             self.radius[name] = torch.where(
                 self._moved[name], scaled.clamp_max(self.settings.largest), radius
             )

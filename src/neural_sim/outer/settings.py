@@ -74,11 +74,12 @@ class Checks:
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
-        errors: standard errors by which an object's score must rise for its step to be accepted.
+        errors: standard errors by which an object's score must rise for its step to be accepted, and fall for its
+            radius to shrink.
         waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
             largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
             present mistakes in it, and another once they have moved.
-        grow, shrink: factors of the radius after an accepted and a rejected step.
+        grow, shrink: factors of the radius after an accepted step and after one that lowered the score.
         momentum: factor of a derivative's weight in the average for every later move of its object.
         max_step: largest change of a logit (or a weight) in one step.
 
