@@ -48,8 +48,8 @@ DEFAULT = (
     "forward differences, a probe of each bin in every early step and one of 2 or 3 later ones (default)"
 )
 OTHERS = {
-    "tiny, 24 epochs": ("outer.epochs=24",),
-    "resnet18, 12 epochs": ("detector=resnet18", "training.warm_epochs=1"),
+    "tiny, 12 epochs": ("outer.epochs=12",),
+    "resnet18, 6 epochs": ("detector=resnet18", "training.warm_epochs=1"),
 }
 """Other trainings whose cost is measured; a warm start of one epoch, since costs do not depend on it."""
 PARTS = (0.75, 0.5, 0.25)
@@ -253,7 +253,7 @@ def main() -> None:
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     world = World.of(arguments.overrides)
-    spent = {"tiny, 12 epochs": costs(world, arguments.repeats)}
+    spent = {"tiny, 6 epochs": costs(world, arguments.repeats)}
     wrong = errors(walked(world, world.context.graph.names.index(arguments.object), 0))
     print(json.dumps({"costs": spent, "errors": wrong}, indent=1), flush=True)
     for name, overrides in OTHERS.items():

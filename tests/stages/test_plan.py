@@ -17,14 +17,14 @@ def left_out(*overrides):
 def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     found = left_out("scale=quick")
     assert {"appearance codes", "view-dependent colour", "the renderer's derivative"} <= set(found)
-    # 192 renders an object in place of 7 iterations of 50 images and, but for the last, which takes no derivative, 24
+    # 384 renders an object in place of 7 iterations of 100 images and, but for the last, which takes no derivative, 48
     # probes in each of 8 bins, half of them anew
-    assert found["renders of the loop"].fraction == pytest.approx(1 - 192 / (7 * 50 + 192 + 5 * 96))
+    assert found["renders of the loop"].fraction == pytest.approx(1 - 384 / (7 * 100 + 384 + 5 * 192))
     assert "images in Hessian products" not in found
     implicit = left_out("scale=quick", "outer.adjoint=implicit")
-    assert implicit["images in Hessian products"].fraction == pytest.approx(1 - 64 / 300)
+    assert implicit["images in Hessian products"].fraction == pytest.approx(1 - 64 / 600)
     assert found["passes of the backbone's frozen stages in the loop's training"].fraction == pytest.approx(
-        1 - 1 / 12
+        1 - 1 / 6
     )
 
 

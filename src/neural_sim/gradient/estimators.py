@@ -65,7 +65,7 @@ class StratifiedEstimator:
     """
 
     wanted: ClassVar[Wanted] = "probes"
-    probes_per_bin: int = 24
+    probes_per_bin: int = 48
     chunk_size: int = 64
     theta_mode: ThetaMode = "central_difference"
 

@@ -4,8 +4,8 @@ It has the random numbers of the training at the old psi, whose derivative was t
 batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the step with
 little noise. A step that does not raise its object's score beyond the error is rejected. The radius grows after an
 accepted step and shrinks after one that lowered the score beyond the error (Conn, Gould and Toint 2000, Chapter 6, with
-the reduction measured object by object). Between the two it stays: the noise of a training does not shrink with the
-step, so that a shorter one would be judged by chance even more.
+the reduction measured object by object). Between the two it shrinks less: the noise of a training does not shrink with
+the step, so that a much shorter one would be judged by chance even more.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class CheckedSteps:
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
         """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
-        paired differences; shrink its radius where the score fell by more than these. Where all these scores rose and
+        paired differences; shrink its radius, most where the score fell by more than these. Where all these scores rose and
         yet the mean over all classes fell by more than its own standard errors, the steps harm other objects more than
         they help their own: all are rejected, and their radii shrink."""
         change = after.double() - before.double()
@@ -100,7 +100,7 @@ class CheckedSteps:
         accepted = pending & rose
         self.accepted = self.trial = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
-            scaled = torch.where(accepted, radius * self.settings.grow, radius)
+            scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink**0.5)
             scaled = torch.where(fell, radius * self.settings.shrink, scaled)
             self.radius[name] = torch.where(
                 self._moved[name], scaled.clamp_max(self.settings.largest), radius

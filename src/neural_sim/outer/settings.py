@@ -75,11 +75,12 @@ class Checks:
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
         errors: standard errors by which an object's score must rise for its step to be accepted, and fall for its
-            radius to shrink.
+            radius to shrink by the whole factor.
         waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
             largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
             present mistakes in it, and another once they have moved.
-        grow, shrink: factors of the radius after an accepted step and after one that lowered the score.
+        grow, shrink: factors of the radius after an accepted step and after one that lowered the score; its square
+            root after one that did neither beyond the error.
         momentum: factor of a derivative's weight in the average for every later move of its object.
         max_step: largest change of a logit (or a weight) in one step.
 
@@ -168,8 +169,8 @@ class Outer:
 
     update: Update
     iterations: int = 10
-    images_per_object: int = 50
-    epochs: int = 12
+    images_per_object: int = 100
+    epochs: int = 6
     least_steps: int = 0
     learning_rate: float = 3e-3
     loop_layers: int | None = None
@@ -184,7 +185,7 @@ class Outer:
     checks: Checks = field(default_factory=Checks)
     final_step: float = 0.1
     curvature_images: int = 64
-    pool_per_bin: int = 24
+    pool_per_bin: int = 48
     refresh: float = 0.5
     quality: Quality | None = None
     trust: Trust = field(default_factory=Trust)
