@@ -130,7 +130,9 @@ def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
 
 
-@pytest.mark.parametrize(("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5 * 0.4**0.5), (0.9, 0.5 * 0.4**0.5), (1.1, 0.65)])
+@pytest.mark.parametrize(
+    ("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5 * 0.4**0.5), (0.9, 0.5 * 0.4**0.5), (1.1, 0.65)]
+)
 def test_a_radius_shrinks_most_after_a_fall_beyond_the_error(change, radius):
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50

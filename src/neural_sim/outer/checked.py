@@ -85,9 +85,9 @@ class CheckedSteps:
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
         """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
-        paired differences; shrink its radius, most where the score fell by more than these. Where all these scores rose and
-        yet the mean over all classes fell by more than its own standard errors, the steps harm other objects more than
-        they help their own: all are rejected, and their radii shrink."""
+        paired differences; shrink its radius, most where the score fell by more than these. Where all these scores
+        rose and yet the mean over all classes fell by more than its own standard errors, the steps harm other objects
+        more than they help their own: all are rejected, and their radii shrink most."""
         change = after.double() - before.double()
         gains = change.sum(1)
         gain = gains[self.labels]
