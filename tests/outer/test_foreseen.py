@@ -39,7 +39,7 @@ def derivative(psi):
 
 def gains(distribution, psi, error, trials=1, moved=0.2, radius=0.3):
     results = [Result(derivative(psi), error) for _ in range(trials)]
-    return expected(results, distribution, psi, NAMES, moved, radius, 50.0)
+    return expected(results, distribution, psi, NAMES, moved, radius)
 
 
 def test_the_gain_of_a_bin_is_the_fall_of_a_linear_loss(distribution, psi):

@@ -36,6 +36,21 @@ def test_bounded_logits_keep_p_near_the_floor():
     assert torch.equal(binned.bounded(psi, 0.0), psi)
 
 
+def test_nearest_probabilities_are_the_point_itself_or_the_nearest_of_many(generator):
+    p = torch.tensor([0.6, 0.2, 0.15, 0.05], dtype=torch.float64)
+    torch.testing.assert_close(binned.nearest(p, 0.005), p)
+    far = torch.tensor([1.4, 0.3, -0.2, -0.5], dtype=torch.float64)
+    near, least = binned.nearest(far, 0.005), 0.005 + 0.25 * 0.005 * 0.98
+    torch.testing.assert_close(near.sum(), torch.ones((), dtype=torch.float64))
+    assert float(near.min()) == pytest.approx(least)
+    others = torch.rand(10000, 4, generator=generator, dtype=torch.float64)
+    others = least + (1.0 - 4 * least) * others / others.sum(1, keepdim=True)
+    others = torch.cat([others, near + 0.01 * (others - near)])
+    assert bool(((others - far).norm(dim=1) >= (near - far).norm()).all())
+    at_bound = binned.bounded(torch.tensor([0.0, -50.0, -50.0, -50.0], dtype=torch.float64), 0.005)
+    assert float(binned.log_probabilities(at_bound, 0.005).exp().min()) == pytest.approx(least, rel=5e-3)
+
+
 def test_balanced_draws_have_the_bins_expected_numbers_and_each_follows_p(generator):
     p = torch.tensor([0.47, 0.3, 0.17, 0.05, 0.01], dtype=torch.float64)
     n, trials = 20, 4_000

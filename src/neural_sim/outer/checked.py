@@ -1,11 +1,15 @@
 """Trust-region steps of psi, accepted or rejected by a training at the new psi.
 
-It has the random numbers of the training at the old psi, whose derivative was taken (the same initial parameters,
-batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the step with
-little noise. A step that does not raise its object's score beyond the error is rejected. The radius grows after an
-accepted step and shrinks after one that lowered the score beyond the error (Conn, Gould and Toint 2000, Chapter 6, with
-the reduction measured object by object). Between the two it shrinks less: the noise of a training does not shrink with
-the step, so that a much shorter one would be judged by chance even more.
+A step goes to the p nearest to p + t direction, whose distance from p is the radius: bins that are as good as each
+other gain as much as each other. (Along logits, a bin gains in proportion to its p, and what is likely already takes
+nearly all.)
+
+The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
+parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
+step with little noise. A step that does not raise its object's score beyond the error is rejected. The radius grows
+after an accepted step and shrinks after one that lowered the score beyond the error (Conn, Gould and Toint 2000,
+Chapter 6, with the reduction measured object by object). Between the two it shrinks less: the noise of a training does
+not shrink with the step, so that a much shorter one would be judged by chance even more.
 """
 
 from __future__ import annotations
@@ -24,7 +28,10 @@ from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
 
-HALVINGS = 40
+HALVINGS = 50
+FARTHEST = (
+    1e3  # of p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart
+)
 
 
 class CheckedSteps:
@@ -145,7 +152,7 @@ class CheckedSteps:
             radius = self.radius[name] * taken
             radius = torch.where(self.radius[name] < self.settings.smallest, 0.0, radius)
             direction = self._averages[name].value
-            moved[name] = within(factor, psi[name], direction, radius, self.settings.max_step)
+            moved[name] = within(factor, psi[name], direction, radius)
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
             gains[name] = (direction * change).sum(1)
         due = self.settings.waits_below * torch.stack([*gains.values()]).max()
@@ -169,24 +176,23 @@ def within(
     psi: Float[Tensor, "objects k"],
     direction: Float[Tensor, "objects k"],
     radius: Float[Tensor, "objects"],
-    max_step: float,
 ) -> Float[Tensor, "objects k"]:
-    """psi moved along ``direction`` until half the absolute change of p (for bins, the total variation) reaches
-    ``radius`` or the largest change of a component of psi reaches ``max_step``; by bisection."""
+    """psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
+    reaches ``radius``, or as far as it goes within ``FARTHEST``; by bisection."""
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
-    longest = direction * (max_step / torch.where(size > 0.0, size, 1.0))
-    low, high = torch.zeros_like(radius), torch.ones_like(radius)
+    longest = direction * (FARTHEST / torch.where(size > 0.0, size, 1.0))
 
     def moved(part: Tensor) -> Tensor:
-        return factor.project(psi + part[:, None] * longest)
+        return factor.moved(psi, part[:, None] * longest)
 
+    def inside(part: Tensor) -> Tensor:
+        return 0.5 * (factor.p_of(moved(part)) - before).abs().sum(1) <= radius
+
+    low, high = torch.zeros_like(radius), torch.ones_like(radius)
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        inside = 0.5 * (factor.p_of(moved(middle)) - before).abs().sum(1) <= radius
-        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-    low = torch.where(
-        0.5 * (factor.p_of(moved(torch.ones_like(low))) - before).abs().sum(1) <= radius, 1.0, low
-    )
+        within_reach = inside(middle)
+        low, high = torch.where(within_reach, middle, low), torch.where(within_reach, high, middle)
     still = (radius <= 0.0) | (size[:, 0] == 0.0)
-    return torch.where(still[:, None], psi, moved(low))
+    return torch.where(still[:, None], psi, moved(torch.where(inside(high), high, low)))

@@ -54,7 +54,6 @@ def foresee(loop: GradientLoop, trials: int, moved: float, radius: float) -> lis
         loop.scene.names,
         moved,
         radius,
-        loop.settings.checks.max_step,
     )
 
 
@@ -65,7 +64,6 @@ def expected(
     names: tuple[str, ...],
     moved: float,
     radius: float,
-    max_step: float,
 ) -> list[Foreseen]:
     """The averages of derivatives at one psi; arguments as for :func:`foresee`."""
     parts, found = distribution.split(psi), []
@@ -82,7 +80,7 @@ def expected(
         variance = average.variance
         bins = torch.eye(p.shape[-1], dtype=p.dtype)
         toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]
-        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius), max_step)) - p
+        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius))) - p
         gains, spread = _along(toward, average.value[:, None], variance[:, None])
         step_gain, step_spread = _along(step, average.value, variance)
         for i, name in enumerate(names):

@@ -82,7 +82,6 @@ class Checks:
         grow, shrink: factors of the radius after an accepted step and after one that lowered the score; its square
             root after one that did neither beyond the error.
         momentum: factor of a derivative's weight in the average for every later move of its object.
-        max_step: largest change of a logit (or a weight) in one step.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -98,7 +97,6 @@ class Checks:
     grow: float = 1.3
     shrink: float = 0.4
     momentum: float = 0.5
-    max_step: float = 4.0
 
     def __post_init__(self) -> None:
         where = "outer.checks"
@@ -110,10 +108,9 @@ class Checks:
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
         if not 0.0 <= self.waits_below <= 1.0:
             raise ValueError(f"{where}: want waits_below in [0, 1], got {self.waits_below}")
-        if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0 or not self.max_step > 0.0:
+        if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0:
             raise ValueError(
-                f"{where}: want shrink in (0, 1), momentum in [0, 1] and max_step above 0, got {self.shrink}, "
-                f"{self.momentum} and {self.max_step}"
+                f"{where}: want shrink in (0, 1) and momentum in [0, 1], got {self.shrink} and {self.momentum}"
             )
 
 

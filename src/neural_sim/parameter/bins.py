@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.parameter.simplex import project_simplex
+
 
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
@@ -39,6 +41,14 @@ def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n
     if floor == 0.0:
         return psi
     return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(4.0 / floor))
+
+
+def nearest(values: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
+    """The nearest probabilities (Euclidean), none below floor (5 - k floor) / 4: that is where :func:`bounded` ends."""
+    bins = values.shape[-1]
+    least = floor + 0.25 * floor * (1.0 - bins * floor)
+    rest = 1.0 - bins * least
+    return least + rest * project_simplex((values - least) / rest)
 
 
 def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:

@@ -64,10 +64,10 @@ class Factor(Protocol):
 
     ``psi`` is the configured ``initial`` or ``target`` psi of an object, float64. ``psi_of`` maps probabilities of bins
     or weights of lights to psi; ``p_of`` is its inverse. A derivative by psi, divided by the exponential of
-    ``log_slopes``, is that by p but for a constant; they are 0 for lights, whose steps are Euclidean. ``project``
-    returns the nearest psi that meets the factor's constraint. ``stratum_of`` returns the stratum of each draw.
-    ``reach`` converts a score to the units of psi and gives the largest step, for a method whose steps are at most
-    ``step`` logits.
+    ``log_slopes``, is that by p but for a constant; they are 0 for lights. ``project`` returns the nearest psi that
+    meets the factor's constraint, ``moved`` that whose p is nearest to p + ``change``. ``stratum_of`` returns the
+    stratum of each draw. ``reach`` converts a score to the units of psi and gives the largest step, for a method whose
+    steps are at most ``step`` logits.
     """
 
     update: ClassVar[str]
@@ -87,6 +87,7 @@ class Factor(Protocol):
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
 
@@ -186,6 +187,10 @@ class BinnedFactor:
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """Logits within reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
         return binned.bounded(psi, self.floor)
+
+    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be."""
+        return binned.logits(binned.nearest(self.p_of(psi) + change, self.floor), self.floor)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The bin of each draw's coordinate, which a relaxed draw may not share with the bin that it was drawn for."""

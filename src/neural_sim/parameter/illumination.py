@@ -125,12 +125,16 @@ class Illumination:
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """0: psi are the weights, and steps are Euclidean."""
+        """0: psi are the weights."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
+
+    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """The nearest weights to psi + ``change`` that meet the constraint."""
+        return self.project(psi + change)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The anchor light of the largest weight. Raises ``ValueError`` for draws under the fixed light."""
