@@ -216,7 +216,7 @@ def main() -> None:
 TEXT = """
     python benchmarks/certificate.py
 
-An object whose derivative is zero should be called significant with probability `outer.trust.level`, 0.05, or less. The
+An object whose derivative is zero should be called significant with probability `outer.trust.level`, here 0.05, or less. The
 table has the rate of such false positives, by the distribution of the scores and by the ratio of the largest to the
 smallest standard deviation of bins (rare bins: largest): {objects} objects for each rate, of standard error
 {noise:.3f}, and {draws} permutations or sign changes for each p-value. In brackets: Welch's analysis of variance of the

@@ -88,7 +88,7 @@ def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
 @pytest.mark.parametrize(
     ("p_values", "on_untrusted", "expected"),
     [
-        ((0.05, 0.051), "shrink", ["kept", "shrunk"]),
+        ((0.1, 0.101), "shrink", ["kept", "shrunk"]),
         ((0.9, 0.001), "skip", ["skipped", "kept"]),
         ((0.9, 0.001), "stop", ["skipped", "kept"]),
         ((0.9, 0.2), "shrink", ["shrunk", "shrunk"]),

@@ -1,6 +1,7 @@
 """Checked steps: where they go, what evidence moves them, and what a training's outcome does to them."""
 
 import math
+from statistics import NormalDist
 
 import pytest
 import torch
@@ -29,6 +30,7 @@ def hypergradient(gradient, error, names=NAMES):
 
 
 def steps_at(psi, factors=(POSE,), labels=(0, 1), **checks):
+    checks = {"radius": 0.5, "largest": 0.7} | checks
     return CheckedSteps(Checks(**checks), 0.25, SceneDistribution(factors), NAMES, labels, psi)
 
 
@@ -157,32 +159,50 @@ def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
 
 
-@pytest.mark.parametrize(
-    ("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5 * 0.4**0.5), (0.9, 0.5 * 0.4**0.5), (1.1, 0.65)]
-)
-def test_a_radius_shrinks_most_after_a_fall_beyond_the_error(change, radius):
+def scattering(images=50):
+    """Scores of one class whose sum is 0 and has a standard error of 1."""
+    noise = torch.randn(images, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return (noise - noise.mean()) / noise.std() / images**0.5
+
+
+@pytest.mark.parametrize(("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5), (0.9, 0.5), (1.1, 0.65)])
+def test_a_radius_grows_after_a_rise_and_shrinks_after_a_fall_beyond_the_error(change, radius):
+    """Of steps that are accepted, because no measured gain says much beside so significant a derivative."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
-    noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50
-    noise = noise - noise.mean(1, keepdim=True)
-    error = 50**0.5 * noise.std(1, keepdim=True)
-    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), largest=0.7)
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(torch.zeros(2, 50), noise + change * error / 50)
-    assert [verdict.accepted for verdict in verdicts.values()] == 2 * [change > 1.0]
-    assert steps.radius["pose"].tolist() == pytest.approx(2 * [radius])
+    verdicts = steps.judge(torch.zeros(2, 50), scattering() + torch.tensor([[change], [3.0]]) / 50)
+    assert all(verdict.accepted for verdict in verdicts.values())
+    assert steps.radius["pose"].tolist() == pytest.approx([radius, 0.65])
 
 
-def test_a_rise_within_the_error_of_its_images_is_not_believed():
+@pytest.mark.parametrize("noise", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize(("beyond", "accepted"), [(-0.05, False), (0.05, True)])
+def test_the_derivative_and_the_measured_gain_are_significant_together(noise, beyond, accepted):
+    """Stouffer's sum of the two quantiles, from the standard library's normal distribution."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
-    noise = torch.randn(2, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / 50
-    noise = noise - noise.mean(1, keepdim=True)
-    error = float(50**0.5 * noise[0].std())
-    for rise, kept in ((0.9 * error, False), (1.1 * error, True)):
-        steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-        proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-        verdict = steps.judge(torch.zeros(2, 50), noise + rise / 50)["a"]
-        assert verdict.accepted == kept
-        assert verdict.error == pytest.approx(error) and verdict.measured_gain == pytest.approx(rise)
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), level=0.05)
+    _, p_values = proposed(steps, gradient, torch.full_like(gradient, noise), level=0.9)
+    normal = NormalDist()
+    least = -(2.0**0.5) * normal.inv_cdf(0.05) + normal.inv_cdf(p_values["a"]["pose"])
+    verdict = steps.judge(torch.zeros(2, 50), (scattering() + (least + beyond) / 50).expand(2, -1))["a"]
+    assert verdict.accepted == accepted
+    assert verdict.error == pytest.approx(1.0) and verdict.measured_gain == pytest.approx(least + beyond)
+    assert accepted or steps.radius["pose"].tolist() == pytest.approx(
+        [0.5 * (0.4**0.5 if least + beyond > -1.0 else 0.4)] * 2
+    )
+
+
+def test_what_objects_at_rest_gain_or_lose_is_the_error_of_trainings():
+    """The first object moves; the other, without a significant derivative, loses 0.3 where its images explain 0.05."""
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    error = torch.stack([torch.full((4,), 0.1), torch.full((4,), torch.inf)]).double()
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
+    proposed(steps, gradient, error, level=0.9)
+    after = torch.stack([0.1 * scattering() + 0.5 / 50, 0.05 * scattering() - 0.3 / 50])
+    assert steps.judge(torch.zeros(2, 50), after)["a"].error == pytest.approx(
+        math.hypot(0.1, math.sqrt(0.3**2 - 0.05**2))
+    )
 
 
 def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():

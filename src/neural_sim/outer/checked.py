@@ -6,10 +6,11 @@ nearly all.)
 
 The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
 parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
-step with little noise. A step that does not raise its object's score beyond the error is rejected. The radius grows
-after an accepted step and shrinks after one that lowered the score beyond the error (Conn, Gould and Toint 2000,
-Chapter 6, with the reduction measured object by object). Between the two it shrinks less: the noise of a training does
-not shrink with the step, so that a much shorter one would be judged by chance even more.
+step with little noise. A step is accepted if its derivative and this difference together are significant, because
+either alone often is not. The radius grows after a step that raised the object's score beyond the error and shrinks
+after one that lowered it beyond the error or was rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction
+measured object by object); in the last case less: the noise of a training does not shrink with the step, so that a much
+shorter one would be judged by chance even more.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
 
 HALVINGS = 50
+SMALLEST = 1e-15  # p-value, whose normal quantile is -8
 FARTHEST = (
     1e3  # of p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart
 )
@@ -63,6 +65,10 @@ class CheckedSteps:
         self._joined = dict(self._averages)  # with the derivatives since the last step
         self._expected = torch.zeros_like(psi[:, 0])
         self._moved = {name: torch.zeros(len(psi), dtype=torch.bool) for name in parts}
+        self._foretold = torch.zeros_like(
+            self._expected
+        )  # the derivatives' significance, in standard deviations
+        self._at_rest = torch.zeros(0, dtype=torch.float64)  # see _of_trainings
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
@@ -88,30 +94,38 @@ class CheckedSteps:
         """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
         return torch.stack([*self._moved.values()]).any(0)
 
+    @property
+    def _of_trainings(self) -> float:
+        """Variance of a gain between trainings: what objects at rest gained or lost beyond the errors of images."""
+        return float(self._at_rest.mean().clamp_min(0.0)) if len(self._at_rest) else 0.0
+
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
-        """Reject a step where the object's score did not rise by more than ``errors`` standard errors of the images'
-        paired differences; shrink its radius, most where the score fell by more than these. Where all these scores
-        rose and yet the mean over all classes fell by more than its own standard errors, the steps harm other objects
-        more than they help their own: all are rejected, and their radii shrink most."""
+        """Accept an object's step if its derivative and the measured gain together are significant at ``level``, by the
+        sum of their normal quantiles over the root of 2 (Stouffer et al. 1949). The gain's error is that of the images'
+        paired differences and of trainings, which the scores of objects that did not move show. Where the mean over all
+        classes fell by more than its own error, though all steps would be accepted, all are rejected."""
         change = after.double() - before.double()
-        gains = change.sum(1)
-        gain = gains[self.labels]
-        error = _of_sums(change)[self.labels]
-        rose, pending = gain > self.settings.errors * error, self._pending
-        fell = gain < -self.settings.errors * error
-        total, of_total = gains.nansum(), _of_sums(change.nansum(0))
-        if bool(pending.any()) and bool(rose[pending].all()) and total < -self.settings.errors * of_total:
-            rose, fell = torch.zeros_like(rose), torch.ones_like(fell)
-        accepted = pending & rose
+        gains, images = change.sum(1), _of_sums(change)
+        total, pending = gains.nansum(), self._pending
+        # Without at_rest below: what this step costs others is not scatter of trainings.
+        of_total = (_of_sums(change.nansum(0)).square() + len(gains) * self._of_trainings).sqrt()
+        at_rest = (gains.square() - images.square())[self.labels][~pending]
+        self._at_rest = torch.cat([self._at_rest, at_rest[at_rest.isfinite()]])
+        gain, error = gains[self.labels], (images.square() + self._of_trainings).sqrt()[self.labels]
+        rose, fell = gain > self.settings.errors * error, gain < -self.settings.errors * error
+        measured = torch.where(gain == 0.0, 0.0, gain / error)
+        accepted = pending & (self._foretold + measured > 2.0**0.5 * _beyond(self.settings.level))
+        if bool(accepted[pending].all()) and total < -self.settings.errors * of_total:
+            accepted, fell = torch.zeros_like(accepted), torch.ones_like(fell)
         self.accepted = self.trial = torch.where(accepted[:, None], self.trial, self.accepted)
         for name, radius in self.radius.items():
-            scaled = torch.where(accepted, radius * self.settings.grow, radius * self.settings.shrink**0.5)
-            scaled = torch.where(fell, radius * self.settings.shrink, scaled)
-            self.radius[name] = torch.where(
-                self._moved[name], scaled.clamp_max(self.settings.largest), radius
-            )
+            factor = torch.where(rose, self.settings.grow, 1.0)
+            factor = torch.where(accepted, factor, self.settings.shrink**0.5)
+            factor = torch.where(fell, self.settings.shrink, factor)
+            scaled = (radius * factor).clamp_max(self.settings.largest)
+            self.radius[name] = torch.where(self._moved[name], scaled, radius)
         verdicts = {
             name: Verdict(bool(accepted[i]), float(self._expected[i]), float(gain[i]), float(error[i]))
             for i, name in enumerate(self.names)
@@ -156,13 +170,23 @@ class CheckedSteps:
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
             gains[name] = (direction * change).sum(1)
         due = self.settings.waits_below * torch.stack([*gains.values()]).max()
+        smallest = torch.ones_like(self._expected)
         for name, gain in gains.items():
             moves = (gain >= due) & (moved[name] != psi[name]).any(1)
             moved[name] = torch.where(moves[:, None], moved[name], psi[name])
             self._moved[name] = moves
+            p_values = torch.where(moves, self._averages[name].p_values, 1.0)
+            smallest = torch.minimum(smallest, p_values)
             self._expected = self._expected + torch.where(moves, gain, 0.0)
+        factors = sum(moved.to(smallest) for moved in self._moved.values())
+        self._foretold = _beyond((smallest * factors).clamp(SMALLEST, 1.0 - SMALLEST))
         self.trial = self.distribution.join(moved)
         return self.trial
+
+
+def _beyond(p: Float[Tensor, "*n"] | float) -> Float[Tensor, "*n"]:
+    """What a standard normal variable exceeds with probability p."""
+    return -torch.special.ndtri(torch.as_tensor(p, dtype=torch.float64))
 
 
 def _of_sums(change: Float[Tensor, "*n images"]) -> Float[Tensor, "*n"]:

@@ -43,7 +43,7 @@ class Trust:
     max_stationarity: float | None = None
     max_sensitivity: float | None = None
     min_cosine: float | None = 0.0
-    level: float | None = 0.05
+    level: float | None = 0.1
     shrink: float = 0.25
 
     def __post_init__(self) -> None:
@@ -68,31 +68,33 @@ class Checks:
 
     Args:
         trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter. After
-            one, the test knows the scatter of images alone; the next training accepts or rejects all the same.
+            one, the test knows the scatter of images alone.
         folds: disjoint parts of the validation images; each derivative is that of L_val on one of them, so that the
             scatter between derivatives has that of the validation images in it.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
-        errors: standard errors by which an object's score must rise for its step to be accepted, and fall for its
-            radius to shrink by the whole factor.
+        level: significance level at which a step is accepted, by its derivative and its measured gain together.
+        errors: standard errors by which an object's score must rise for its radius to grow, and fall for it to shrink
+            by the whole factor.
         waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
             largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
             present mistakes in it, and another once they have moved.
-        grow, shrink: factors of the radius after an accepted step and after one that lowered the score; its square
-            root after one that did neither beyond the error.
+        grow, shrink: factors of the radius after an accepted step that raised the score and after one that lowered it;
+            the latter's square root after another rejected step.
         momentum: factor of a derivative's weight in the average for every later move of its object.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    trainings: int = 1
+    trainings: int = 2
     folds: int = 2
-    radius: float = 0.5
-    largest: float = 0.7
+    radius: float = 0.3
+    largest: float = 0.4
     smallest: float = 0.05
     errors: float = 1.0
+    level: float = 0.05
     waits_below: float = 0.2
     grow: float = 1.3
     shrink: float = 0.4

@@ -26,7 +26,7 @@ class Verdict:
     """Whether an object's step was accepted, by a training at the new psi; a rejected one is taken back.
 
     ``expected_gain`` is the fall of L_val that the hypergradient predicts to first order, ``measured_gain`` the rise of
-    the object's score, ``error`` the standard error of that rise over validation images.
+    the object's score, ``error`` the standard error of that rise, over validation images and trainings.
     """
 
     accepted: bool
