@@ -216,9 +216,9 @@ def main() -> None:
 TEXT = """
     python benchmarks/certificate.py
 
-An object whose derivative is zero should be called significant with probability `outer.trust.level`, here 0.05, or less. The
-table has the rate of such false positives, by the distribution of the scores and by the ratio of the largest to the
-smallest standard deviation of bins (rare bins: largest): {objects} objects for each rate, of standard error
+An object whose derivative is zero should be called significant with probability `outer.trust.level` (here 0.05) or
+less. The table has the rate of such false positives, by the distribution of the scores and by the ratio of the largest
+to the smallest standard deviation of bins (rare bins: largest): {objects} objects for each rate, of standard error
 {noise:.3f}, and {draws} permutations or sign changes for each p-value. In brackets: Welch's analysis of variance of the
 same scores. An earlier rule compared the best component's ratio to its standard error with 1, for the best of all
 objects; {old:.3f} of such objects pass it by themselves (normal, 16 images of each bin).
