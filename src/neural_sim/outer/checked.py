@@ -170,18 +170,23 @@ class CheckedSteps:
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
             gains[name] = (direction * change).sum(1)
         due = self.settings.waits_below * torch.stack([*gains.values()]).max()
-        smallest = torch.ones_like(self._expected)
         for name, gain in gains.items():
             moves = (gain >= due) & (moved[name] != psi[name]).any(1)
             moved[name] = torch.where(moves[:, None], moved[name], psi[name])
             self._moved[name] = moves
-            p_values = torch.where(moves, self._averages[name].p_values, 1.0)
-            smallest = torch.minimum(smallest, p_values)
             self._expected = self._expected + torch.where(moves, gain, 0.0)
-        factors = sum(moved.to(smallest) for moved in self._moved.values())
-        self._foretold = _beyond((smallest * factors).clamp(SMALLEST, 1.0 - SMALLEST))
+        self._foretold = self._significance
         self.trial = self.distribution.join(moved)
         return self.trial
+
+    @property
+    def _significance(self) -> Float[Tensor, "objects"]:
+        """That of the derivatives by the factors that move, in standard deviations; of several, the most significant
+        one counts, its p-value times their number (Bonferroni)."""
+        moves = torch.stack([*self._moved.values()])
+        p_values = torch.stack([self._averages[name].p_values for name in self._moved])
+        p_value = p_values.where(moves, 1.0).amin(0) * moves.sum(0)
+        return _beyond(p_value.clamp(SMALLEST, 1.0 - SMALLEST))
 
 
 def _beyond(p: Float[Tensor, "*n"] | float) -> Float[Tensor, "*n"]:
