@@ -169,7 +169,7 @@ def scattering(images=50):
 def test_a_radius_grows_after_a_rise_and_shrinks_after_a_fall_beyond_the_error(change, radius):
     """Of steps that are accepted, because no measured gain says much beside so significant a derivative."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
-    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), largest=0.7)
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     verdicts = steps.judge(torch.zeros(2, 50), scattering() + torch.tensor([[change], [3.0]]) / 50)
     assert all(verdict.accepted for verdict in verdicts.values())
@@ -289,6 +289,7 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
         {"shrink": 1.0},
         {"momentum": -0.1},
         {"waits_below": 1.1},
+        {"level": 0.0},
     ],
 )
 def test_settings_out_of_range_are_refused(bad):

@@ -108,6 +108,8 @@ class Checks:
             )
         at_least(where, 1, grow=self.grow, trainings=self.trainings, folds=self.folds)
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
+        if not 0.0 < self.level < 1.0:
+            raise ValueError(f"{where}.level must lie in (0, 1), got {self.level}")
         if not 0.0 <= self.waits_below <= 1.0:
             raise ValueError(f"{where}: want waits_below in [0, 1], got {self.waits_below}")
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0:
