@@ -87,6 +87,21 @@ def test_bins_that_are_as_good_as_each_other_gain_alike_whatever_their_p():
     )
 
 
+def test_a_step_leaves_each_bin_a_fraction_of_its_p():
+    """Against the projection without that bound where it does not bind, and in closed form where all bins do."""
+    p = torch.tensor([[0.4, 0.3, 0.2, 0.1]], dtype=torch.float64)
+    psi, radius = POSE.psi_of(p), torch.tensor([0.2, 1.0], dtype=torch.float64)
+    direction = torch.tensor([[0.5, -0.1, 0.0, -0.4]], dtype=torch.float64)
+    near, far = (POSE.p_of(within(POSE, psi, direction, part[None], keep=0.4)) for part in radius)
+    assert float(near[0, 3]) == pytest.approx(0.04)
+    assert 0.5 * float((near - p).abs().sum()) == pytest.approx(0.2, abs=1e-6)
+    unbounded = POSE.p_of(within(POSE, psi, direction, radius[:1]))
+    assert float(unbounded[0, 3]) < 0.01 and float(near[0, 1]) < float(unbounded[0, 1])
+    torch.testing.assert_close(
+        far[0], torch.tensor([0.76, 0.12, 0.08, 0.04], dtype=torch.float64), atol=1e-6, rtol=0
+    )
+
+
 def test_the_longest_step_ends_with_all_in_the_best_bin():
     psi = torch.zeros(1, 4, dtype=torch.float64)
     direction = torch.tensor([[-0.3, 0.3, 0.1, -0.1]], dtype=torch.float64)
@@ -165,14 +180,17 @@ def scattering(images=50):
     return (noise - noise.mean()) / noise.std() / images**0.5
 
 
-@pytest.mark.parametrize(("change", "radius"), [(-1.1, 0.2), (-0.9, 0.5), (0.9, 0.5), (1.1, 0.65)])
-def test_a_radius_grows_after_a_rise_and_shrinks_after_a_fall_beyond_the_error(change, radius):
-    """Of steps that are accepted, because no measured gain says much beside so significant a derivative."""
+@pytest.mark.parametrize(
+    ("change", "accepted", "radius"),
+    [(-1.1, False, 0.2), (-0.9, True, 0.5), (0.9, True, 0.5), (1.1, True, 0.65)],
+)
+def test_a_radius_grows_after_a_rise_and_shrinks_after_a_fall_beyond_the_error(change, accepted, radius):
+    """After so significant a derivative only a fall beyond the error rejects a step."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     proposed(steps, gradient, torch.full_like(gradient, 1e-4))
     verdicts = steps.judge(torch.zeros(2, 50), scattering() + torch.tensor([[change], [3.0]]) / 50)
-    assert all(verdict.accepted for verdict in verdicts.values())
+    assert [verdict.accepted for verdict in verdicts.values()] == [accepted, True]
     assert steps.radius["pose"].tolist() == pytest.approx([radius, 0.65])
 
 
@@ -203,6 +221,15 @@ def test_what_objects_at_rest_gain_or_lose_is_the_error_of_trainings():
     assert steps.judge(torch.zeros(2, 50), after)["a"].error == pytest.approx(
         math.hypot(0.1, math.sqrt(0.3**2 - 0.05**2))
     )
+
+
+def test_one_judgment_after_which_objects_at_rest_gain_much_does_not_count_as_scatter():
+    gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
+    error = torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)]).double()
+    steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), radius=0.1, grow=1.0)
+    for others, scatter in ((0.3, 0.3), (0.02, math.sqrt((0.3**2 + 0.02**2) / 2)), (0.04, 0.04)):
+        proposed(steps, gradient, error, level=0.9)
+        assert steps.judge(scored(0.0, 0.0), scored(0.5, others))["a"].error == pytest.approx(scatter)
 
 
 def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
@@ -283,6 +310,7 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     [
         {"radius": 0.8},
         {"smallest": 0.0},
+        {"keep": 1.0},
         {"grow": 0.9},
         {"trainings": 0},
         {"folds": 0},

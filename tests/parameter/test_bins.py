@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from neural_sim.parameter import bins as binned
 
@@ -49,6 +50,20 @@ def test_nearest_probabilities_are_the_point_itself_or_the_nearest_of_many(gener
     assert bool(((others - far).norm(dim=1) >= (near - far).norm()).all())
     at_bound = binned.bounded(torch.tensor([0.0, -50.0, -50.0, -50.0], dtype=torch.float64), 0.005)
     assert float(binned.log_probabilities(at_bound, 0.005).exp().min()) == pytest.approx(least, rel=5e-3)
+
+
+def test_nearest_probabilities_above_bounds_of_their_own_agree_with_a_solver(generator):
+    least = torch.tensor([0.3, 0.02, 0.1, 0.001, 0.05], dtype=torch.float64)
+    for _ in range(5):
+        far = torch.randn(5, generator=generator, dtype=torch.float64)
+        near = binned.nearest(far, 0.005, least)
+        lowest = least.clamp_min(0.005 + 0.25 * 0.005 * 0.975).numpy()
+        solved = minimize(
+            lambda p, to: ((p - to) ** 2).sum(), lowest + (1.0 - lowest.sum()) / 5, args=(far.numpy(),),
+            bounds=[(low, 1.0) for low in lowest], constraints={"type": "eq", "fun": lambda p: p.sum() - 1.0},
+            options={"ftol": 1e-14, "maxiter": 1000},
+        )  # fmt: skip
+        torch.testing.assert_close(near, torch.as_tensor(solved.x), atol=1e-5, rtol=0)
 
 
 def test_balanced_draws_have_the_bins_expected_numbers_and_each_follows_p(generator):

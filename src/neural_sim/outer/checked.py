@@ -2,20 +2,22 @@
 
 A step goes to the p nearest to p + t direction, whose distance from p is the radius: bins that are as good as each
 other gain as much as each other. (Along logits, a bin gains in proportion to its p, and what is likely already takes
-nearly all.)
+nearly all.) A bin keeps a fraction of its p: the score is concave in the number of a bin's images, so that the
+derivative, which is linear, says little about having none of them.
 
 The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
 parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
 step with little noise. A step is accepted if its derivative and this difference together are significant, because
-either alone often is not. The radius grows after a step that raised the object's score beyond the error and shrinks
-after one that lowered it beyond the error or was rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction
-measured object by object); in the last case less: the noise of a training does not shrink with the step, so that a much
-shorter one would be judged by chance even more.
+either alone often is not, and if the score did not fall beyond its error. The radius grows after a step that raised the
+object's score beyond the error and shrinks after one that lowered it beyond the error or was rejected (Conn, Gould and
+Toint 2000, Chapter 6, with the reduction measured object by object); in the last case less: the noise of a training
+does not shrink with the step, so that a much shorter one would be judged by chance even more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import median
 
 import torch
 from jaxtyping import Bool, Float
@@ -68,7 +70,7 @@ class CheckedSteps:
         self._foretold = torch.zeros_like(
             self._expected
         )  # the derivatives' significance, in standard deviations
-        self._at_rest = torch.zeros(0, dtype=torch.float64)  # see _of_trainings
+        self._at_rest: list[float] = []  # see _of_trainings
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
@@ -96,27 +98,31 @@ class CheckedSteps:
 
     @property
     def _of_trainings(self) -> float:
-        """Variance of a gain between trainings: what objects at rest gained or lost beyond the errors of images."""
-        return float(self._at_rest.mean().clamp_min(0.0)) if len(self._at_rest) else 0.0
+        """Variance of a gain between trainings: what objects at rest gained or lost beyond the errors of images, the
+        median judgment's, because after large steps they really gain by the better images of others."""
+        return max(median(self._at_rest), 0.0) if self._at_rest else 0.0
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
         """Accept an object's step if its derivative and the measured gain together are significant at ``level``, by the
-        sum of their normal quantiles over the root of 2 (Stouffer et al. 1949). The gain's error is that of the images'
-        paired differences and of trainings, which the scores of objects that did not move show. Where the mean over all
-        classes fell by more than its own error, though all steps would be accepted, all are rejected."""
+        sum of their normal quantiles over the root of 2 (Stouffer et al. 1949), and the score did not fall beyond
+        ``errors``: a derivative may differ from zero with certainty and yet promise next to nothing. The gain's error
+        is that of the images' paired differences and of trainings, which the scores of objects that did not move show.
+        Where the mean over all classes fell by more than its own error, though all steps would be accepted, all are
+        rejected."""
         change = after.double() - before.double()
         gains, images = change.sum(1), _of_sums(change)
         total, pending = gains.nansum(), self._pending
         # Without at_rest below: what this step costs others is not scatter of trainings.
         of_total = (_of_sums(change.nansum(0)).square() + len(gains) * self._of_trainings).sqrt()
         at_rest = (gains.square() - images.square())[self.labels][~pending]
-        self._at_rest = torch.cat([self._at_rest, at_rest[at_rest.isfinite()]])
+        at_rest = at_rest[at_rest.isfinite()]
+        self._at_rest += [float(at_rest.mean())] if len(at_rest) else []
         gain, error = gains[self.labels], (images.square() + self._of_trainings).sqrt()[self.labels]
         rose, fell = gain > self.settings.errors * error, gain < -self.settings.errors * error
         measured = torch.where(gain == 0.0, 0.0, gain / error)
-        accepted = pending & (self._foretold + measured > 2.0**0.5 * _beyond(self.settings.level))
+        accepted = pending & ~fell & (self._foretold + measured > 2.0**0.5 * _beyond(self.settings.level))
         if bool(accepted[pending].all()) and total < -self.settings.errors * of_total:
             accepted, fell = torch.zeros_like(accepted), torch.ones_like(fell)
         self.accepted = self.trial = torch.where(accepted[:, None], self.trial, self.accepted)
@@ -166,7 +172,7 @@ class CheckedSteps:
             radius = self.radius[name] * taken
             radius = torch.where(self.radius[name] < self.settings.smallest, 0.0, radius)
             direction = self._averages[name].value
-            moved[name] = within(factor, psi[name], direction, radius)
+            moved[name] = within(factor, psi[name], direction, radius, self.settings.keep)
             change = factor.p_of(moved[name]) - factor.p_of(psi[name])
             gains[name] = (direction * change).sum(1)
         due = self.settings.waits_below * torch.stack([*gains.values()]).max()
@@ -205,15 +211,17 @@ def within(
     psi: Float[Tensor, "objects k"],
     direction: Float[Tensor, "objects k"],
     radius: Float[Tensor, "objects"],
+    keep: float = 0.0,
 ) -> Float[Tensor, "objects k"]:
     """psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
-    reaches ``radius``, or as far as it goes within ``FARTHEST``; by bisection."""
+    reaches ``radius``, or as far as it goes within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p; by
+    bisection."""
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
     longest = direction * (FARTHEST / torch.where(size > 0.0, size, 1.0))
 
     def moved(part: Tensor) -> Tensor:
-        return factor.moved(psi, part[:, None] * longest)
+        return factor.moved(psi, part[:, None] * longest, keep)
 
     def inside(part: Tensor) -> Tensor:
         return 0.5 * (factor.p_of(moved(part)) - before).abs().sum(1) <= radius

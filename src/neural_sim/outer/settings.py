@@ -74,6 +74,7 @@ class Checks:
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest, smallest: bounds of the radius; an object below ``smallest`` does not move.
+        keep: fraction of its p that a step leaves each bin; 0: no bound. The score is concave in a bin's images.
         level: significance level at which a step is accepted, by its derivative and its measured gain together.
         errors: standard errors by which an object's score must rise for its radius to grow, and fall for it to shrink
             by the whole factor.
@@ -93,6 +94,7 @@ class Checks:
     radius: float = 0.3
     largest: float = 0.4
     smallest: float = 0.05
+    keep: float = 0.3
     errors: float = 1.0
     level: float = 0.05
     waits_below: float = 0.2
@@ -110,6 +112,8 @@ class Checks:
         at_least(where, 0, momentum=self.momentum, errors=self.errors)
         if not 0.0 < self.level < 1.0:
             raise ValueError(f"{where}.level must lie in (0, 1), got {self.level}")
+        if not 0.0 <= self.keep < 1.0:
+            raise ValueError(f"{where}.keep must lie in [0, 1), got {self.keep}")
         if not 0.0 <= self.waits_below <= 1.0:
             raise ValueError(f"{where}: want waits_below in [0, 1], got {self.waits_below}")
         if not 0.0 < self.shrink < 1.0 or not self.momentum <= 1.0:

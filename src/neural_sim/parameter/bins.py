@@ -43,12 +43,16 @@ def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n
     return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(4.0 / floor))
 
 
-def nearest(values: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """The nearest probabilities (Euclidean), none below floor (5 - k floor) / 4: that is where :func:`bounded` ends."""
+def nearest(
+    values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | None = None
+) -> Float[Tensor, "*n k"]:
+    """The nearest probabilities (Euclidean), none below floor (5 - k floor) / 4, where :func:`bounded` ends, nor below
+    its ``least``, which sum to less than 1."""
     bins = values.shape[-1]
-    least = floor + 0.25 * floor * (1.0 - bins * floor)
-    rest = 1.0 - bins * least
-    return least + rest * project_simplex((values - least) / rest)
+    lowest = torch.full_like(values, floor + 0.25 * floor * (1.0 - bins * floor))
+    lowest = lowest if least is None else torch.maximum(lowest, least)
+    rest = 1.0 - lowest.sum(-1, keepdim=True)
+    return lowest + rest * project_simplex((values - lowest) / rest)
 
 
 def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:

@@ -87,7 +87,9 @@ class Factor(Protocol):
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
-    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def moved(
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+    ) -> Float[Tensor, "*n k"]: ...
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
 
@@ -188,9 +190,13 @@ class BinnedFactor:
         """Logits within reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
         return binned.bounded(psi, self.floor)
 
-    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be."""
-        return binned.logits(binned.nearest(self.p_of(psi) + change, self.floor), self.floor)
+    def moved(
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+    ) -> Float[Tensor, "*n k"]:
+        """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be, nor than
+        the fraction ``keep`` of what it was."""
+        p = self.p_of(psi)
+        return binned.logits(binned.nearest(p + change, self.floor, keep * p), self.floor)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """The bin of each draw's coordinate, which a relaxed draw may not share with the bin that it was drawn for."""

@@ -132,8 +132,11 @@ class Illumination:
         """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
 
-    def moved(self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """The nearest weights to psi + ``change`` that meet the constraint."""
+    def moved(
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+    ) -> Float[Tensor, "*n k"]:
+        """The nearest weights to psi + ``change`` that meet the constraint. ``keep``, of bins, does not bound them: a
+        weight is no number of images."""
         return self.project(psi + change)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
