@@ -116,6 +116,19 @@ def test_val_and_test_share_no_image(folder, returned):
         assert not _pixels(coco.val) & _pixels(coco.test)
 
 
+def test_photographs_that_cannot_be_used_are_refused_before_fields_are_fitted(folder, returned, tmp_path):
+    path = write_coco(_targets(_context(folder)[0]).test, ["pitcher", "drill"], tmp_path / "photos")
+    images = json.loads(path.read_text())["images"]
+    (path.parent / images[-1]["file_name"]).write_text("no photograph")
+    small = [word for word in SMALL if not word.startswith("target.")]
+    target = ["target=coco", f"target.annotations={path}", f"paths.store={tmp_path / 'store'}"]
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        context, steps = context_of(compose("config", [*small, *target, "paths.mlflow=null"]), tmp_path)
+    with pytest.raises(ValueError, match="not a readable image"):
+        walk(context, steps)
+    assert context.account.seconds.keys() <= {"target_sets"}
+
+
 def test_the_report_leaves_the_detector_that_was_scored_as_learned(
     folder, returned, tmp_path, capsys, caplog
 ):

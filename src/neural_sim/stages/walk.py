@@ -60,7 +60,7 @@ STEPS: Mapping[str, Callable[[Context], None]] = {
     "evaluate": evaluate,
     "report": write_report,
 }
-"""The stages of a run from objects to a report, in their order."""
+"""The stages of a run from objects to a report, in their order; a target of photographs comes first."""
 
 
 def walk(context: Context, others: Mapping[str, Step]) -> float | None:
@@ -72,6 +72,8 @@ def walk(context: Context, others: Mapping[str, Step]) -> float | None:
     asked = [name for name in STEPS if name in context.stages]
     if asked:
         context.account.left_out += plan(context.graph)
+        if not context.graph.renders_target:  # photographs that cannot be used are refused before fields are fitted
+            asked.sort(key=lambda name: name != "target_sets")
     for omission in context.account.left_out:
         fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
         _log.info("left out: %s%s: %s", omission.what, fraction, omission.why)
