@@ -123,6 +123,12 @@ def test_weights_from_a_file_reach_the_features(tools, generator, tmp_path):
     torch.save({"conv1.weight": torch.zeros(1)}, tmp_path / "wrong.pth")
     with pytest.raises(ValueError, match="does not fit resnet18"):
         tools.detector({"architecture": "resnet18", "weights": str(tmp_path / "wrong.pth")})
+    torch.save([1, 2], tmp_path / "list.pth")
+    (tmp_path / "text.pth").write_text("no weights")
+    (tmp_path / "empty.pth").write_bytes(b"")
+    for name, wrong in (("list", "no state dictionary"), ("text", "no file of"), ("empty", "no file of")):
+        with pytest.raises(ValueError, match=wrong):
+            tools.detector({"architecture": "resnet18", "weights": str(tmp_path / f"{name}.pth")})
 
 
 def test_anchors_without_a_reference_are_pixels(tools):

@@ -129,6 +129,18 @@ def test_photographs_that_cannot_be_used_are_refused_before_fields_are_fitted(fo
     assert context.account.seconds.keys() <= {"target_sets"}
 
 
+def test_weights_that_do_not_exist_are_refused_before_anything_is_made(folder, returned):
+    named = [
+        "detector=tiny",
+        "detector.backbone.architecture=resnet18",
+        "detector.backbone.weights=nowhere.pth",
+    ]
+    context, steps = _context(folder, *named, "paths.mlflow=" + str(folder / "none.db"))
+    with pytest.raises(ValueError, match="want a file or one of"):
+        walk(context, steps)
+    assert not context.account.seconds
+
+
 def test_the_report_leaves_the_detector_that_was_scored_as_learned(
     folder, returned, tmp_path, capsys, caplog
 ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,10 +185,16 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     (``DEFAULT``, ``IMAGENET1K_V1``, ...), which torchvision downloads or takes from its cache.
 
     Raises:
-        ValueError: where neither a file nor a weight name is meant, or the file's tensors do not fit.
+        ValueError: where neither a file nor a weight name is meant, or the file holds no state dictionary or one that
+            does not fit.
     """
     if Path(weights).is_file():
-        state = torch.load(weights, map_location="cpu", weights_only=True)
+        try:
+            state = torch.load(weights, map_location="cpu", weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+            raise ValueError(f"detector.backbone.weights: {weights} is no file of torch.save") from error
+        if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+            raise ValueError(f"detector.backbone.weights: {weights} holds no state dictionary")
     else:
         names = list(get_model_weights(architecture).__members__)
         if weights not in (*names, "DEFAULT"):
