@@ -121,9 +121,10 @@ def test_photographs_that_cannot_be_used_are_refused_before_fields_are_fitted(fo
     images = json.loads(path.read_text())["images"]
     (path.parent / images[-1]["file_name"]).write_text("no photograph")
     small = [word for word in SMALL if not word.startswith("target.")]
-    target = ["target=coco", f"target.annotations={path}", f"paths.store={tmp_path / 'store'}"]
+    target = ["target=coco", f"target.annotations={path}"]
+    paths = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        context, steps = context_of(compose("config", [*small, *target, "paths.mlflow=null"]), tmp_path)
+        context, steps = context_of(compose("config", [*small, *target, *paths]), tmp_path)
     with pytest.raises(ValueError, match="not a readable image"):
         walk(context, steps)
     assert context.account.seconds.keys() <= {"target_sets"}
@@ -135,7 +136,7 @@ def test_weights_that_do_not_exist_are_refused_before_anything_is_made(folder, r
         "detector.backbone.architecture=resnet18",
         "detector.backbone.weights=nowhere.pth",
     ]
-    context, steps = _context(folder, *named, "paths.mlflow=" + str(folder / "none.db"))
+    context, steps = _context(folder, *named)
     with pytest.raises(ValueError, match="want a file or one of"):
         walk(context, steps)
     assert not context.account.seconds

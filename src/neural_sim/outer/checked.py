@@ -1,10 +1,5 @@
 """Trust-region steps of psi, accepted or rejected by a training at the new psi.
 
-A step goes to the p nearest to p + t direction, whose distance from p is the radius: bins that are as good as each
-other gain as much as each other. (Along logits, a bin gains in proportion to its p, and what is likely already takes
-nearly all.) A bin keeps a fraction of its p: the score is concave in the number of a bin's images, so that the
-derivative, which is linear, says little about having none of them.
-
 The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
 parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
 step with little noise. A step is accepted if its derivative and this difference together are significant, because
@@ -28,14 +23,10 @@ from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.evidence import Average
 from neural_sim.outer.settings import Checks
 from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
-from neural_sim.parameter.factor import Factor
+from neural_sim.outer.trust_region import within
 from neural_sim.parameter.product import SceneDistribution
 
-HALVINGS = 50
 SMALLEST = 1e-15  # p-value, whose normal quantile is -8
-FARTHEST = (
-    1e3  # of p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart
-)
 
 
 class CheckedSteps:
@@ -118,7 +109,8 @@ class CheckedSteps:
         of_total = (_of_sums(change.nansum(0)).square() + len(gains) * self._of_trainings).sqrt()
         at_rest = (gains.square() - images.square())[self.labels][~pending]
         at_rest = at_rest[at_rest.isfinite()]
-        self._at_rest += [float(at_rest.mean())] if len(at_rest) else []
+        if len(at_rest):
+            self._at_rest.append(float(at_rest.mean()))
         gain, error = gains[self.labels], (images.square() + self._of_trainings).sqrt()[self.labels]
         rose, fell = gain > self.settings.errors * error, gain < -self.settings.errors * error
         measured = torch.where(gain == 0.0, 0.0, gain / error)
@@ -204,32 +196,3 @@ def _of_sums(change: Float[Tensor, "*n images"]) -> Float[Tensor, "*n"]:
     """Standard errors of sums over images; 0 for one image, whose scatter is not known."""
     images = change.shape[-1]
     return images**0.5 * change.std(-1) if images > 1 else torch.zeros_like(change[..., 0])
-
-
-def within(
-    factor: Factor,
-    psi: Float[Tensor, "objects k"],
-    direction: Float[Tensor, "objects k"],
-    radius: Float[Tensor, "objects"],
-    keep: float = 0.0,
-) -> Float[Tensor, "objects k"]:
-    """psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
-    reaches ``radius``, or as far as it goes within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p; by
-    bisection."""
-    before = factor.p_of(psi)
-    size = direction.abs().amax(1, keepdim=True)
-    longest = direction * (FARTHEST / torch.where(size > 0.0, size, 1.0))
-
-    def moved(part: Tensor) -> Tensor:
-        return factor.moved(psi, part[:, None] * longest, keep)
-
-    def inside(part: Tensor) -> Tensor:
-        return 0.5 * (factor.p_of(moved(part)) - before).abs().sum(1) <= radius
-
-    low, high = torch.zeros_like(radius), torch.ones_like(radius)
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        within_reach = inside(middle)
-        low, high = torch.where(within_reach, middle, low), torch.where(within_reach, high, middle)
-    still = (radius <= 0.0) | (size[:, 0] == 0.0)
-    return torch.where(still[:, None], psi, moved(torch.where(inside(high), high, low)))

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.checked import within
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.evidence import Average
 from neural_sim.outer.steps import stacked
+from neural_sim.outer.trust_region import within
 from neural_sim.parameter.product import SceneDistribution
 
 

@@ -44,13 +44,12 @@ def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n
 
 
 def nearest(
-    values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | None = None
+    values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | float = 0.0
 ) -> Float[Tensor, "*n k"]:
     """The nearest probabilities (Euclidean), none below floor (5 - k floor) / 4, where :func:`bounded` ends, nor below
     its ``least``, which sum to less than 1."""
     bins = values.shape[-1]
-    lowest = torch.full_like(values, floor + 0.25 * floor * (1.0 - bins * floor))
-    lowest = lowest if least is None else torch.maximum(lowest, least)
+    lowest = (torch.zeros_like(values) + least).clamp_min(floor + 0.25 * floor * (1.0 - bins * floor))
     rest = 1.0 - lowest.sum(-1, keepdim=True)
     return lowest + rest * project_simplex((values - lowest) / rest)
 

@@ -88,7 +88,7 @@ class Factor(Protocol):
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
     def moved(
-        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]: ...
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
@@ -191,7 +191,7 @@ class BinnedFactor:
         return binned.bounded(psi, self.floor)
 
     def moved(
-        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
         """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be, nor than
         the fraction ``keep`` of what it was."""

@@ -133,7 +133,7 @@ class Illumination:
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
 
     def moved(
-        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float = 0.0
+        self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
         """The nearest weights to psi + ``change`` that meet the constraint. ``keep``, of bins, does not bound them: a
         weight is no number of images."""

@@ -74,9 +74,8 @@ def walk(context: Context, others: Mapping[str, Step]) -> float | None:
         context.account.left_out += plan(context.graph)
         if {"warm_start", "psi", "evaluate"} & {*asked}:
             context.graph.warm_start.build()  # so that weights which do not fit it are refused now
-        if (
-            not context.graph.renders_target
-        ):  # photographs that cannot be used are refused before fields are fitted
+        if not context.graph.renders_target:
+            # Photographs that cannot be used are refused before fields are fitted.
             asked.sort(key=lambda name: name != "target_sets")
     for omission in context.account.left_out:
         fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
