@@ -37,9 +37,9 @@ def derivative(psi):
     return p * (COST - (p * COST).sum(-1, keepdim=True))
 
 
-def gains(distribution, psi, error, trials=1, moved=0.2, radius=0.3):
+def gains(distribution, psi, error, trials=1, moved=0.2, radius=0.3, keep=0.0):
     results = [Result(derivative(psi), error) for _ in range(trials)]
-    return expected(results, distribution, psi, NAMES, moved, radius)
+    return expected(results, distribution, psi, NAMES, moved, radius, keep)
 
 
 def test_the_gain_of_a_bin_is_the_fall_of_a_linear_loss(distribution, psi):
@@ -62,6 +62,14 @@ def test_a_step_gains_what_the_loss_falls_by_within_its_radius(distribution, psi
         best, left = best + taken * float(COST[0][bin] - COST[0][1]), left - taken
     assert 0.0 < first.step <= best + 1e-9 and first.step > 0.5 * best
     assert second.step == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_step_gains_no_more_than_what_bins_may_lose(distribution, psi):
+    p = psi.softmax(-1)[0]
+    # All that may leave a bin goes to bin 1, the cheapest: the radius is as wide as p allows.
+    most = sum(0.6 * float(p[bin]) * float(COST[0][bin] - COST[0][1]) for bin in (0, 2, 3))
+    (first, _) = gains(distribution, psi, 1e-6, radius=1.0, keep=0.4)
+    assert first.step == pytest.approx(most, rel=1e-3)
 
 
 def test_errors_fall_with_the_root_of_the_trials(distribution, psi):

@@ -21,8 +21,8 @@ class Foreseen:
     """The expected fall of L_val by one object and factor, to first order, with standard errors.
 
     ``by_bin``: when the fraction ``moved`` of the object's images moves to each bin (or light), all others losing it
-    in proportion; ``step``: by the step of a trust region of this radius along the derivative. ``p_value`` is that of
-    the null that the derivative is zero.
+    in proportion; ``step``: by a step of the loop, along the derivative. ``p_value`` is that of the null that the
+    derivative is zero.
     """
 
     name: str
@@ -35,8 +35,9 @@ class Foreseen:
     step_error: float
 
 
-def foresee(loop: GradientLoop, trials: int, moved: float, radius: float) -> list[Foreseen]:
-    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move.
+def foresee(loop: GradientLoop, trials: int, moved: float, radius: float, keep: float) -> list[Foreseen]:
+    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move. ``radius``
+    and ``keep`` are those of steps (``outer.checks``).
 
     Raises:
         ValueError: no trial, or a fraction or radius outside (0, 1].
@@ -54,6 +55,7 @@ def foresee(loop: GradientLoop, trials: int, moved: float, radius: float) -> lis
         loop.scene.names,
         moved,
         radius,
+        keep,
     )
 
 
@@ -64,6 +66,7 @@ def expected(
     names: tuple[str, ...],
     moved: float,
     radius: float,
+    keep: float,
 ) -> list[Foreseen]:
     """The averages of derivatives at one psi; arguments as for :func:`foresee`."""
     parts, found = distribution.split(psi), []
@@ -80,7 +83,7 @@ def expected(
         variance = average.variance
         bins = torch.eye(p.shape[-1], dtype=p.dtype)
         toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]
-        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius))) - p
+        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius), keep)) - p
         gains, spread = _along(toward, average.value[:, None], variance[:, None])
         step_gain, step_spread = _along(step, average.value, variance)
         for i, name in enumerate(names):
