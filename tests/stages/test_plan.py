@@ -17,9 +17,9 @@ def left_out(*overrides):
 def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     found = left_out("scale=quick")
     assert {"appearance codes", "view-dependent colour", "the renderer's derivative"} <= set(found)
-    # 384 renders an object in place of 10 iterations of 100 images and, but for the last, which takes no derivative, 48
-    # probes in each of 8 bins, half of them anew
-    assert found["renders of the loop"].fraction == pytest.approx(1 - 384 / (10 * 100 + 384 + 8 * 192))
+    # 384 renders an object in place of 100 images for each of 11 trainings, two in the first of 10 iterations, and, but
+    # for the last, which takes no derivative, 48 probes in each of 8 bins, half of them anew.
+    assert found["renders of the loop"].fraction == pytest.approx(1 - 384 / (11 * 100 + 384 + 9 * 192))
     assert "images in Hessian products" not in found
     implicit = left_out("scale=quick", "outer.adjoint=implicit")
     assert implicit["images in Hessian products"].fraction == pytest.approx(1 - 64 / 600)

@@ -81,15 +81,19 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
 
 
 def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
-    """The fraction of the loop's renders that a pool of every bin saves."""
+    """The fraction of the loop's renders that a pool of every bin saves; trainings that judge a step are not counted,
+    since not every iteration has one."""
     factors, outer = x.imaging.distribution.binned, x.loop.outer
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
-    probes = 0.0
+    trainings, probes = rounds, 0.0
     if follows:
-        derived = rounds - 1 if outer.steps == "checked" else rounds
-        anew = 1.0 + (derived - 1) * outer.refresh
+        derivatives = rounds
+        if outer.steps == "checked":  # several derivatives in the first iteration, none in the last
+            trainings += outer.checks.trainings - 1
+            derivatives = trainings - 1
+        anew = 1.0 + (derivatives - 1) * outer.refresh
         probes = anew * x.loop.gradient.probes_per_bin * sum(factor.bins for factor in factors)
-    wanted = rounds * outer.images_per_object + probes
+    wanted = trainings * outer.images_per_object + probes
     fraction = max(0.0, 1.0 - rendered / wanted)
     return Omission(
         "psi", "renders of the loop", "fields do not change: every bin is rendered once", fraction
