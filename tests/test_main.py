@@ -219,17 +219,21 @@ def test_every_choice_of_every_group_builds(group, choice, tmp_path):
     build(config)
 
 
-def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path):
+@pytest.mark.parametrize("mode", ["run", "sweep"])
+def test_what_begins_in_the_same_second_has_a_folder_of_its_own(mode, tmp_path):
     def begun(*overrides):
         wanted = str(tmp_path / "runs" / "2026-01-01_00-00-00")
-        config = OmegaConf.create(
-            {"hydra": {"run": {"dir": wanted}, "overrides": {"hydra": list(overrides)}}}
-        )
+        config = OmegaConf.create({"hydra": {mode: {"dir": wanted}, "overrides": {"hydra": list(overrides)}}})
         OmegaConf.set_readonly(config, True)
-        OwnFolder().on_run_start(config)
-        return Path(config.hydra.run.dir).name
+        begin = OwnFolder().on_run_start if mode == "run" else OwnFolder().on_multirun_start
+        begin(config)
+        taken = config.hydra[mode].dir
+        # Jobs of a sweep compose their configuration anew, from overrides.
+        told = [f"hydra.sweep.dir='{taken}'"] if mode == "sweep" and not overrides else list(overrides)
+        assert config.hydra.overrides.hydra == told
+        return Path(taken).name
 
     assert [begun(), begun(), begun()] == [f"2026-01-01_00-00-00{end}" for end in ("", "_2", "_3")]
     assert len(list((tmp_path / "runs").iterdir())) == 3
-    for own in ("hydra.run.dir=runs", "++hydra.run.dir=runs"):  # may be taken again
+    for own in (f"hydra.{mode}.dir=runs", f"++hydra.{mode}.dir=runs"):  # may be taken again
         assert begun(own) == "2026-01-01_00-00-00"

@@ -255,15 +255,24 @@ class RefuseStudies(Callback):
 
 
 class OwnFolder(Callback):
-    """A folder of its own for each of the runs of an experiment that begin in the same second, by which folders are
-    named. A folder that the command line names is taken as it is."""
+    """A folder of its own for each of the runs, or sweeps, of an experiment that begin in the same second, by which
+    folders are named. A folder that the command line names is taken as it is."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        if not any(
-            override.lstrip("+").startswith("hydra.run.dir=") for override in config.hydra.overrides.hydra
-        ):
-            with read_write(config):
-                config.hydra.run.dir = str(own_folder(Path(config.hydra.run.dir)))
+        self._take(config, "run")
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        if self._take(config, "sweep"):
+            with read_write(config):  # each job composes its configuration anew
+                config.hydra.overrides.hydra.append(f"hydra.sweep.dir='{config.hydra.sweep.dir}'")
+
+    def _take(self, config: DictConfig, mode: str) -> bool:
+        key = f"hydra.{mode}.dir="
+        if any(override.lstrip("+").startswith(key) for override in config.hydra.overrides.hydra):
+            return False
+        with read_write(config):
+            config.hydra[mode].dir = str(own_folder(Path(config.hydra[mode].dir)))
+        return True
 
 
 def _refuse(error: Exception) -> NoReturn:
