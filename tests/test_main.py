@@ -16,9 +16,9 @@ ROOT = Path(__file__).parents[1]
 CONF = Path(conf_directory())
 
 
-def _config(*overrides):
+def _config(*overrides, hydra=False):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
+        return compose("config", list(overrides), return_hydra_config=hydra)
 
 
 def _run(folder, *arguments):
@@ -228,9 +228,11 @@ def test_what_begins_in_the_same_second_has_a_folder_of_its_own(mode, tmp_path):
         begin = OwnFolder().on_run_start if mode == "run" else OwnFolder().on_multirun_start
         begin(config)
         taken = config.hydra[mode].dir
-        # Jobs of a sweep compose their configuration anew, from overrides.
-        told = [f"hydra.sweep.dir='{taken}'"] if mode == "sweep" and not overrides else list(overrides)
-        assert config.hydra.overrides.hydra == told
+        if mode == "sweep" and not overrides:  # each job composes its configuration anew, from overrides
+            told = config.hydra.overrides.hydra
+            assert _config(*told, hydra=True).hydra.sweep.dir == taken
+        else:
+            assert config.hydra.overrides.hydra == list(overrides)
         return Path(taken).name
 
     assert [begun(), begun(), begun()] == [f"2026-01-01_00-00-00{end}" for end in ("", "_2", "_3")]

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neural_sim.outer.foreseen import expected
+from neural_sim.outer.settings import Checks
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 
@@ -39,7 +40,7 @@ def derivative(psi):
 
 def gains(distribution, psi, error, trials=1, moved=0.2, radius=0.3, keep=0.0):
     results = [Result(derivative(psi), error) for _ in range(trials)]
-    return expected(results, distribution, psi, NAMES, moved, radius, keep)
+    return expected(results, distribution, psi, NAMES, moved, Checks(radius=radius, largest=1.0, keep=keep))
 
 
 def test_the_gain_of_a_bin_is_the_fall_of_a_linear_loss(distribution, psi):

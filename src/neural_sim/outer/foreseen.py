@@ -11,6 +11,7 @@ from torch import Tensor
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.evidence import Average
+from neural_sim.outer.settings import Checks
 from neural_sim.outer.steps import stacked
 from neural_sim.outer.trust_region import within
 from neural_sim.parameter.product import SceneDistribution
@@ -35,15 +36,14 @@ class Foreseen:
     step_error: float
 
 
-def foresee(loop: GradientLoop, trials: int, moved: float, radius: float, keep: float) -> list[Foreseen]:
-    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move. ``radius``
-    and ``keep`` are those of steps (``outer.checks``).
+def foresee(loop: GradientLoop, trials: int, moved: float) -> list[Foreseen]:
+    """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move.
 
     Raises:
-        ValueError: no trial, or a fraction or radius outside (0, 1].
+        ValueError: no trial, or a fraction outside (0, 1].
     """
-    if trials < 1 or not 0.0 < moved <= 1.0 or not 0.0 < radius <= 1.0:
-        raise ValueError(f"want trials >= 1, moved and radius in (0, 1], got {trials}, {moved}, {radius}")
+    if trials < 1 or not 0.0 < moved <= 1.0:
+        raise ValueError(f"want trials >= 1 and moved in (0, 1], got {trials}, {moved}")
     results = []
     for _ in range(trials):
         results.append(loop.derivative())
@@ -54,8 +54,7 @@ def foresee(loop: GradientLoop, trials: int, moved: float, radius: float, keep: 
         loop.psi.detach(),
         loop.scene.names,
         moved,
-        radius,
-        keep,
+        loop.settings.checks,
     )
 
 
@@ -65,10 +64,9 @@ def expected(
     psi: Float[Tensor, "objects K"],
     names: tuple[str, ...],
     moved: float,
-    radius: float,
-    keep: float,
+    checks: Checks,
 ) -> list[Foreseen]:
-    """The averages of derivatives at one psi; arguments as for :func:`foresee`."""
+    """The averages of derivatives at one psi, and steps by ``checks``; other arguments as for :func:`foresee`."""
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
@@ -83,7 +81,8 @@ def expected(
         variance = average.variance
         bins = torch.eye(p.shape[-1], dtype=p.dtype)
         toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]
-        step = factor.p_of(within(factor, own, average.value, torch.full_like(p[:, 0], radius), keep)) - p
+        radius = torch.full_like(p[:, 0], checks.radius)
+        step = factor.p_of(within(factor, own, average.value, radius, checks.keep)) - p
         gains, spread = _along(toward, average.value[:, None], variance[:, None])
         step_gain, step_spread = _along(step, average.value, variance)
         for i, name in enumerate(names):

@@ -24,7 +24,7 @@ def within(
     psi: Float[Tensor, "objects k"],
     direction: Float[Tensor, "objects k"],
     radius: Float[Tensor, "objects"],
-    keep: float = 0.0,
+    keep: float,
 ) -> Float[Tensor, "objects k"]:
     """psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
     reaches ``radius``, or as far as it goes within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p; by

@@ -63,7 +63,7 @@ class PreflightStep:
                 f"preflight wants a method that follows the hypergradient, got baseline={x.loop.method.name}"
             )
         outer = x.loop.outer
-        foreseen = foresee(loop, self.trials, self.moved, outer.checks.radius, outer.checks.keep)
+        foreseen = foresee(loop, self.trials, self.moved)
         photographs, labelled = results(graph.targets).train, []
         if photographs is not None and self.labelled:
             labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
