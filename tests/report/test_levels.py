@@ -36,6 +36,12 @@ def test_targets_are_in_the_order_of_their_bins():
     ]
 
 
+@pytest.mark.parametrize("score", ["AP", "accuracy"])
+def test_the_axis_names_what_detectors_and_classifiers_are_scored_by(score):
+    axes = levels_figure([setting(gap="same", score=score)], "gap").axes
+    assert axes[0].get_ylabel() == f"{score} on the test set (%)"
+
+
 def test_table_and_summary_have_the_scores_of_every_object():
     made = [setting(gap="same"), setting(gap="disjoint", methods=METHODS)]
     table = levels_table(made, "gap")

@@ -1,4 +1,4 @@
-"""AP of each biased object over settings: over how far its start is from the target (the paper's Fig. 5), or over
+"""Each biased object's score over settings: over how far its start is from the target (the paper's Fig. 5), or over
 targets (Fig. 6)."""
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
         axes.set(ylim=(0, 100), xlim=(-0.3, len(panel) - 0.7))
         axes.set_xlabel(LABELS[axis], fontsize=8, color=figures.MUTED)
         if (number - 1) % columns == 0:
-            axes.set_ylabel("AP on the test set (%)", fontsize=8)
+            score = next(iter(panel.values())).runs[0].score
+            axes.set_ylabel(f"{score} on the test set (%)", fontsize=8)
         axes.yaxis.grid(color=figures.GRID)
         figures.style(axes)
     figure.legend(handles.values(), handles.keys(), loc="outside right upper", fontsize=8, frameon=False)
@@ -101,7 +102,7 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str) -> Any:
 
 
 def levels_table(settings: Sequence[Setting], axis: Axis) -> str:
-    """AP of every object at every setting, a column a method, in points with 95 % intervals."""
+    """The score of every object at every setting, a column a method, in points with 95 % intervals."""
     methods = list(dict.fromkeys(m for setting in settings for m in setting.scores.methods))
     head = ["experiment", "object", *(["start"] if axis == "target" else []), LABELS[axis], "seeds"]
     lines = [
@@ -119,7 +120,7 @@ def levels_table(settings: Sequence[Setting], axis: Axis) -> str:
 
 
 def levels_summary(settings: Sequence[Setting], axis: Axis) -> list[str]:
-    """NSO's AP on each object, and how far it is ahead, for each setting; over ``gap`` that of the disjoint start."""
+    """NSO's score on each object, and its lead, for each setting; over ``gap`` that of the disjoint start."""
     lines = []
     for (experiment, start, name), panel in _panels(settings, axis).items():
         for label, setting in panel.items():
