@@ -11,7 +11,7 @@ from torch import Tensor
 INTRODUCTION = """    python benchmarks/unrolled.py --object {object}{overrides}
 
 `outer.adjoint=unrolled`: one iteration of `+experiment=pose_gap gap=uniform` at 64 px (`detector=tiny`, six
-objects, 300 images, 12 epochs of AdamW), one thread, processor time of the process. A training takes
+objects, 600 images, 6 epochs of AdamW), one thread, processor time of the process. A training takes
 {training:.1f} s; in trainings, medians of {repeats}:
 
 | what | trainings |
