@@ -2,9 +2,10 @@
 independent training says.
 
 `python benchmarks/judged_steps.py FOLDER ...` reads every results.json below the folders and prints a table. The
-derivative of iteration k is taken in a training at the psi that the step before it led to, with random numbers that
-played no part in that step or its verdict. So the difference of an object's score to iteration k - 1 is unbiased by
-the choice of the step, where the judging training's own measure is of the training that the step was derived from.
+derivative of iteration k is taken in a training at the psi that the step before it led to, with other random numbers
+than the training that judged the step. The difference of an object's score to iteration k - 1 is the last column. A
+step is accepted more readily where the training of iteration k - 1 happened to score low, so that this difference is
+somewhat too high for accepted steps, and too low for rejected ones, after which the object is where it was.
 """
 
 from __future__ import annotations

@@ -47,10 +47,10 @@ CENTRAL = replace(ALL, product="central_difference")
 DEFAULT = (
     "forward differences, a probe of each bin in every early step and one of 2 or 3 later ones (default)"
 )
-OTHERS = {
-    "tiny, 12 epochs": ("outer.epochs=12",),
-    "resnet18, 6 epochs": ("detector=resnet18", "training.warm_epochs=1"),
-}
+OTHERS = (
+    ("tiny", ("outer.epochs=12",)),
+    ("resnet18", ("detector=resnet18", "training.warm_epochs=1")),
+)
 """Other trainings whose cost is measured; a warm start of one epoch, since costs do not depend on it."""
 PARTS = (0.75, 0.5, 0.25)
 FEW = ((2, 1), (1, 1), (1, 2), (1, 4))
@@ -253,11 +253,14 @@ def main() -> None:
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     world = World.of(arguments.overrides)
-    spent = {"tiny, 6 epochs": costs(world, arguments.repeats)}
+    outer = world.context.experiment.loop.outer
+    spent = {f"tiny, {outer.epochs} epochs": costs(world, arguments.repeats)}
     wrong = errors(walked(world, world.context.graph.names.index(arguments.object), 0))
     print(json.dumps({"costs": spent, "errors": wrong}, indent=1), flush=True)
-    for name, overrides in OTHERS.items():
-        spent[name] = costs(World.of([*arguments.overrides, *overrides]), arguments.repeats, brief=True)
+    for detector, overrides in OTHERS:
+        other = World.of([*arguments.overrides, *overrides])
+        name = f"{detector}, {other.context.experiment.loop.outer.epochs} epochs"
+        spent[name] = costs(other, arguments.repeats, brief=True)
         print(json.dumps(spent[name], indent=1), flush=True)
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps({"machine": machine(), "costs": spent, "errors": wrong}, indent=1))
@@ -266,6 +269,8 @@ def main() -> None:
         "repeats": arguments.repeats,
         "per_bin": PER_BIN,
         "default": DEFAULT,
+        "images": len(world.p) * outer.images_per_object,
+        "epochs": outer.epochs,
     }
     replace_section(arguments.docs, "Unrolled", report(spent, wrong, settings, arguments.overrides))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 INTRODUCTION = """    python benchmarks/unrolled.py --object {object}{overrides}
 
 `outer.adjoint=unrolled`: one iteration of `+experiment=pose_gap gap=uniform` at 64 px (`detector=tiny`, six
-objects, 600 images, 6 epochs of AdamW), one thread, processor time of the process. A training takes
+objects, {images} images, {epochs} epochs of AdamW), one thread, processor time of the process. A training takes
 {training:.1f} s; in trainings, medians of {repeats}:
 
 | what | trainings |
@@ -45,7 +45,7 @@ def report(
     settings: Mapping[str, Any],
     overrides: Sequence[str],
 ) -> str:
-    """All tables, with the command that makes them; ``settings`` are its arguments."""
+    """All tables, with the command that makes them; ``settings`` are its arguments and sizes."""
     first = next(iter(spent.values()))
     shown = [f" {key}" for key in overrides if not key.startswith("paths.")]
     others = [
@@ -57,5 +57,6 @@ def report(
         overrides="".join(shown), training=first["seconds"], object=settings["object"], repeats=settings["repeats"],
         costs="\n".join(f"| {key} | {value:.2f} |" for key, value in first.items() if key not in SIZES),
         others="\n".join(others), per_bin=settings["per_bin"],
+        images=settings["images"], epochs=settings["epochs"],
         errors="\n".join(f"| {key} | {value:.2g} |" for key, value in wrong.items()),
     )  # fmt: skip
