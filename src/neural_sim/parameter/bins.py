@@ -13,6 +13,9 @@ from torch import Tensor
 
 from neural_sim.parameter.simplex import project_simplex
 
+# The softmax of a logit at its lowest (:func:`bounded`), in floors: there p is within this fraction of the floor.
+LOWEST = 0.25
+
 
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
@@ -36,20 +39,20 @@ def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, 
 
 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """psi with no logit further below the largest than log(4 / ``floor``). There a bin's p is within a quarter of the
-    floor; further down p hardly changes, yet a step of some logits would not bring the bin back."""
+    """psi with no logit further below the largest than log(1 / (``LOWEST`` ``floor``)). There a bin's p is within a
+    quarter of the floor; further down p hardly changes, yet a step of some logits would not bring the bin back."""
     if floor == 0.0:
         return psi
-    return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(4.0 / floor))
+    return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(1.0 / (LOWEST * floor)))
 
 
 def nearest(
     values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | float = 0.0
 ) -> Float[Tensor, "*n k"]:
-    """The nearest probabilities (Euclidean), none below floor (5 - k floor) / 4, where :func:`bounded` ends, nor below
-    its ``least``, which sum to less than 1."""
+    """The nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1, nor below the p of a
+    logit that :func:`bounded` has raised, if the largest p is 1."""
     bins = values.shape[-1]
-    lowest = (torch.zeros_like(values) + least).clamp_min(floor + 0.25 * floor * (1.0 - bins * floor))
+    lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
     rest = 1.0 - lowest.sum(-1, keepdim=True)
     return lowest + rest * project_simplex((values - lowest) / rest)
 
