@@ -94,7 +94,8 @@ def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
 @pytest.mark.slow  # a new MLflow store takes ten seconds
 def test_a_run_is_logged(tmp_path, uri):
     config = {"name": "work_precision", "seed": 2, "work_precision": {"repeats": 3}}
-    run = track(SERIES, config, uri, tmp_path, begun=5.0)
+    (tmp_path / "run").mkdir()  # not the folder that holds the store
+    run = track(SERIES, config, uri, tmp_path / "run", begun=5.0)
     logged = MlflowClient(uri).get_run(run.run_id)
     assert logged.info.start_time == 5000 and logged.data.params["work_precision.repeats"] == "3"
     assert logged.data.metrics["renderer_opacity/default_error"] == 0.01
