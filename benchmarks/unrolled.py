@@ -41,7 +41,7 @@ from neural_sim.types import LabelledImages
 
 START = ("+experiment=pose_gap", "gap=uniform")
 PER_BIN = 24
-ALL = Unrolled(probes_per_step=0, score_every=1)
+ALL = Unrolled(probes_per_step=0, scored_steps=0)
 EXACT = replace(ALL, product="reverse_over_reverse")
 CENTRAL = replace(ALL, product="central_difference")
 DEFAULT = (

@@ -17,7 +17,7 @@ from neural_sim.types import LabelledImages
 
 DOUBLE = torch.float64
 ALL = Recording()
-EXACT = Unrolled("reverse_over_reverse", score_every=1, floor=0.0)
+EXACT = Unrolled("reverse_over_reverse", scored_steps=0, floor=0.0)
 RULES = [SGD(0.05), SGD(0.05, 0.8), AdamW(0.05)]
 NAMES = ["sgd", "momentum", "adamw"]
 # Warm-up, the peak, and decay to nearly zero; smaller steps where the gradient's size counts.

@@ -93,7 +93,7 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
     made = micro.trained(RULE, micro.examples)
     scores, how = (
         all_scores(micro, made),
-        Unrolled("reverse_over_reverse", probes_per_step=1, score_every=2, floor=0.0),
+        Unrolled("reverse_over_reverse", probes_per_step=1, scored_steps=3, floor=0.0),
     )
     groups = [GROUP[:2], GROUP[2:]]
     found = how.accumulate(
@@ -143,7 +143,7 @@ def test_the_standard_error_counts_the_probes_and_the_few_that_are_scored(genera
     made = train(
         SGD(), like["w"], rows, (0.02,) * steps, lambda theta, index: examples.gradient(theta, like, index)
     )
-    strata, how = torch.arange(bins).repeat_interleave(per_bin), Unrolled(score_every=every)
+    strata, how = torch.arange(bins).repeat_interleave(per_bin), Unrolled(scored_steps=12 // every)
     values, errors = [], []
     for _ in range(120):
         drawn = slopes[strata] + torch.randn(bins * per_bin, 3, generator=generator, dtype=DOUBLE)
@@ -286,7 +286,7 @@ def test_pathwise_wants_the_derivative_by_inputs(problem):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"product": "dense"}, {"part": 0.0}, {"max_memory_mb": -1.0}, {"probes_per_step": -1}, {"score_every": 0},
+    [{"product": "dense"}, {"part": 0.0}, {"max_memory_mb": -1.0}, {"probes_per_step": -1}, {"scored_steps": -1},
      {"chunk_size": 0}, {"floor": -0.1}, {"floor": float("nan")}],
 )  # fmt: skip
 def test_nonsense_is_refused(settings):

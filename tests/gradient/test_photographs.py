@@ -94,7 +94,7 @@ def test_forward_differences_stand_for_exact_products():
     """As without photographs, the order eps^(1/2) times second derivatives a step."""
     problem, rule = Mixed(0.5), RULES[2]
     probes = ProbeGroups(problem.cached.losses, [BINS.argsort(stable=True).view(3, 2)])
-    settings = {"probes_per_step": 0, "score_every": 1}
+    settings = {"probes_per_step": 0, "scored_steps": 0}
     exact, near = (
         problem.accumulated(
             rule, Unrolled(product=product, **settings), probes=probes, wanted="probes"

@@ -133,7 +133,7 @@ def test_forward_differences_stand_for_exact_products_of_probes_scores(pulled, r
     """Six steps, each within the order eps^(1/2) = 1.5e-8 times second derivatives, from gradients that were kept or
     computed again, the proximal term's taken out."""
     probes = ProbeGroups(pulled.cached.losses, [torch.arange(8).view(4, 2)])
-    settings = {"probes_per_step": 0, "score_every": 1}
+    settings = {"probes_per_step": 0, "scored_steps": 0}
     recording = Recording() if kept else Recording(max_memory_mb=least_memory(pulled, rule))
     exact, near = (
         pulled.accumulated(

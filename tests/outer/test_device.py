@@ -111,7 +111,7 @@ def test_steps_walked_back_through_wait_for_nothing(scene, pretend, scored):
         probes = ProbeGroups(cached.losses, [torch.arange(6).view(2, 3)]) if scored else None
         slope = torch.ones_like(inner.trajectory.end)
         with counted() as ledger:
-            Unrolled(score_every=1).accumulate(
+            Unrolled(scored_steps=0).accumulate(
                 inner.trajectory, examples, inner.trainable, slope, torch.Generator(), probes
             )
         trips[len(inner.trajectory)] = ledger.count()

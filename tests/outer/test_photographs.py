@@ -29,7 +29,7 @@ from neural_sim.types import LabelledImages
 
 DETECTOR = RetinaNet(2, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48))
 ESTIMATORS = [PathwiseEstimator(), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()]
-EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, score_every=1, floor=0.0)
+EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, scored_steps=0, floor=0.0)
 SOLVER = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
 
 

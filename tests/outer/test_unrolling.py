@@ -34,7 +34,7 @@ MICRO = {
 ESTIMATORS = [
     PathwiseEstimator(), PathwiseEstimator("reverse"), StratifiedEstimator(probes_per_bin=2), ReinforceEstimator()
 ]  # fmt: skip
-EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, score_every=1, floor=0.0)
+EXACT = Unrolled("reverse_over_reverse", probes_per_step=0, scored_steps=0, floor=0.0)
 
 
 def _module(scene, estimator, psi=None, **outer):

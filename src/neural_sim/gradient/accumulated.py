@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import get_args
@@ -99,8 +100,9 @@ class Unrolled:
         part: fraction of the steps, the last ones, that are reversed; 1 is exact.
         max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
         probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them.
-        score_every: mean length of a block of steps; one step of each block, drawn at random, scores probes with the
-            block's weight, see :func:`step_weights`.
+        scored_steps: about the number of steps that score probes; 0: all. A longer training is divided into blocks, of
+            which one step, drawn at random, scores probes with the block's weight, see :func:`step_weights`. More
+            objects have more probes and more steps: were all scored, the cost would grow with their square.
         chunk_size: probes whose losses are computed at a time.
         floor: least denominator of an entry of theta in AdamW's steps, as a fraction of what is usual for it and for
             its tensor, see :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
@@ -113,14 +115,14 @@ class Unrolled:
     part: float = 1.0
     max_memory_mb: float = 2048.0
     probes_per_step: int = 1
-    score_every: int = 2
+    scored_steps: int = 60
     chunk_size: int = 64
     floor: float = 0.3
 
     def __post_init__(self) -> None:
         if self.product not in get_args(Product):
             raise ValueError(f"unrolled.product must be one of {get_args(Product)}, got {self.product!r}")
-        for key, least in (("probes_per_step", 0), ("score_every", 1), ("chunk_size", 1)):
+        for key, least in (("probes_per_step", 0), ("scored_steps", 0), ("chunk_size", 1)):
             if getattr(self, key) < least:
                 raise ValueError(f"unrolled.{key} must be at least {least}, got {getattr(self, key)}")
         if not self.floor >= 0.0:
@@ -150,7 +152,9 @@ class Unrolled:
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
         columns = shuffled_passes(per_bin, self.probes_per_step or per_bin, generator)
-        weights = step_weights(len(trajectory) - trajectory.first, self.score_every, generator)
+        count = len(trajectory) - trajectory.first
+        every = max(1, math.ceil(count / self.scored_steps)) if self.scored_steps else 1
+        weights = step_weights(count, every, generator)
         images = slope.new_zeros(0 if wanted == "probes" else len(examples.inputs[0]))
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if wanted == "inputs" else ()
         for step in steps:

@@ -47,12 +47,12 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
         return Way(line, replace(outer, adjoint="unrolled", unrolled=how), solver)
 
     implicit = replace(outer, adjoint="implicit")
-    everything: dict[str, object] = {"probes_per_step": 0, "score_every": 1}
+    everything: dict[str, object] = {"probes_per_step": 0, "scored_steps": 0}
     return {
         DEFAULT: unrolled("unrolled"),
         "unrolled, central differences": unrolled("product", product="central_difference"),
         "unrolled, exact products": unrolled("product", product="reverse_over_reverse"),
-        "unrolled, 1 probe every step": unrolled("probes", probes_per_step=1, score_every=1),
+        "unrolled, 1 probe every step": unrolled("probes", probes_per_step=1, scored_steps=0),
         "unrolled, all probes every step": unrolled("probes", **everything),
         "unrolled, exact: no floor": unrolled("floor", floor=0.0),
         "unrolled, last half of the steps": unrolled("part", part=0.5),
