@@ -46,9 +46,10 @@ def _stored(folder, config):
 def _run(folder, config):
     """README.md, Use: the files of a run."""
     results = json.loads((folder / "results.json").read_text())
+    real = config["training"]["real"]
     beside = (
         {"synthetic_only", "real_only", "views_only"}
-        if config["training"]["real"]["mode"] != "none"
+        if real["mode"] != "none" and real["count"] != 0
         else set()
     )
     photographs = config["target"]["_target_"].rpartition(".")[2] != "RenderedTarget"
