@@ -35,7 +35,18 @@ SMALL_FIELDS = [
     "scale=quick", "progress=false", "views.count=40", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",
     "budget.grid.prune_steps=[60]",
 ]  # fmt: skip
-PHASES = ("render", "probes", "features", "train", "validation", "solve", "unrolled", "mixed", "rest")
+PHASES = (
+    "render",
+    "probes",
+    "features",
+    "train",
+    "judge",
+    "validation",
+    "solve",
+    "unrolled",
+    "mixed",
+    "rest",
+)
 
 
 def repeated(scene: Scene, count: int) -> Scene:
