@@ -53,7 +53,7 @@ OTHERS = (
 )
 """Other trainings whose cost is measured; a warm start of one epoch, since costs do not depend on it."""
 PARTS = (0.75, 0.5, 0.25)
-FEW = ((2, 1), (1, 1), (1, 2), (1, 4))
+FEW = ((2, 1), (1, 1), (1, 2), (1, 4), (1, 7))
 
 
 @dataclass(frozen=True)
