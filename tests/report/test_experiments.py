@@ -141,6 +141,14 @@ def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
     assert line == "gap, disjoint: an iteration takes 5.0 s, an object's field 3.0 s"
 
 
+def test_seconds_that_differ_are_a_median_and_a_range():
+    measured = setting(seeds=(0, 1))
+    for factor, run in enumerate(measured.of_reference, start=1):
+        run["seconds"]["field"] *= factor
+    (line,) = LAYOUTS["seconds"]([measured], None, 5, 0).lines
+    assert line.endswith("an object's field 3.2 (3.0 to 3.5) s")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

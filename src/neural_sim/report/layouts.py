@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -133,8 +134,9 @@ def _field(run: Mapping[str, Any]) -> float:
 
 
 def _range(values: Sequence[float]) -> str:
-    low, high = f"{min(values):.1f}", f"{max(values):.1f}"
-    return low if low == high else f"{low} to {high}"
+    """The median, and the range if there is one: first iterations take two trainings more than last ones."""
+    low, middle, high = (f"{value:.1f}" for value in (min(values), median(values), max(values)))
+    return low if low == high else f"{middle} ({low} to {high})"
 
 
 LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None, int, int], Shown]] = {
