@@ -36,17 +36,8 @@ SMALL_FIELDS = [
     "budget.grid.prune_steps=[60]",
 ]  # fmt: skip
 PHASES = (
-    "render",
-    "probes",
-    "features",
-    "train",
-    "judge",
-    "validation",
-    "solve",
-    "unrolled",
-    "mixed",
-    "rest",
-)
+    "render", "probes", "features", "train", "judge", "validation", "solve", "unrolled", "mixed", "rest"
+)  # fmt: skip
 
 
 def repeated(scene: Scene, count: int) -> Scene:

@@ -153,7 +153,7 @@ class Unrolled:
         per_bin = probes.per_bin if probes else 1
         columns = shuffled_passes(per_bin, self.probes_per_step or per_bin, generator)
         count = len(trajectory) - trajectory.first
-        every = max(1, math.ceil(count / self.scored_steps)) if self.scored_steps else 1
+        every = math.ceil(count / self.scored_steps) if self.scored_steps else 1
         weights = step_weights(count, every, generator)
         images = slope.new_zeros(0 if wanted == "probes" else len(examples.inputs[0]))
         inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if wanted == "inputs" else ()
