@@ -96,6 +96,12 @@ def test_the_page_has_what_was_measured_and_says_what_was_not(page, tmp_path):
     assert "it failed" in (tmp_path / "left_out.md").read_text()
 
 
+def test_a_row_without_runs_says_what_data_it_needs_and_one_with_runs_does_not(page):
+    rows = {name: {**ROWS[name], "needs": "photographs"} for name in ("gaps", "large")}
+    text = page(rows=rows)
+    assert "| not yet measured, needs photographs |" in text and text.count("photographs") == 1
+
+
 def test_some_rows_alone(page):
     text = page(only=["large"])
     assert "| Large |" in text and "| Gaps |" not in text and "Table 2" not in text

@@ -67,7 +67,7 @@ class Temperatures:
 
     values: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
     rounds: int = 8
-    truth_per_bin: int = 48
+    truth_per_bin: int = 240
     draws: int = 20_000
 
     def __post_init__(self) -> None:

@@ -37,6 +37,7 @@ class Row:
         claims: entries of the paper's ``claims``.
         table: the paper's table that stands beside ours.
         differs: what differs from the paper's setting.
+        needs: data that the project does not bring; the page says so of a row without runs.
 
     Raises:
         ValueError: an unknown layout, one without runs, or a document besides.
@@ -51,6 +52,7 @@ class Row:
     claims: Sequence[str] = ()
     table: str | None = None
     differs: str = ""
+    needs: str = ""
 
     def __post_init__(self) -> None:
         if self.layout is not None and (self.layout not in LAYOUTS or not self.runs or self.document):
@@ -62,6 +64,13 @@ class Row:
     @property
     def exists(self) -> bool:
         return (conf_directory() / "experiment" / f"{self.experiment}.yaml").is_file()
+
+    @property
+    def without_runs(self) -> str:
+        """What the page says in the place of our numbers."""
+        if not self.runs and not self.document:
+            return BY_FIGURES
+        return f"{NOT_YET}, needs {self.needs}" if self.needs else NOT_YET
 
     @property
     def run(self) -> str:
@@ -176,7 +185,7 @@ class Experiments:
             "|---|---|---|---|---|",
         ]
         for name, row in rows.items():
-            ours = made[name].cell if name in made else NOT_YET if row.runs or row.document else BY_FIGURES
+            ours = made[name].cell if name in made else row.without_runs
             lines.append(
                 f"| {row.title} | `{row.run}` | {ours} | {'<br>'.join(self._claims(row))} | {row.differs} |"
             )
