@@ -143,6 +143,17 @@ def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
         torch.testing.assert_close(area, seen[..., 3].mean((1, 2)), atol=0.01, rtol=0.0)
 
 
+@pytest.mark.parametrize("mode", ["combined", "pretrain"])
+def test_where_fewer_may_do_every_row_takes_all_that_there_are(folder, mode):
+    few = [f"training.real.mode={mode}", "training.real.count=50", "training.real.fewer=all"]
+    context = run(folder, *few, "stages=[views,field,target_sets,warm_start,psi,evaluate]")
+    rows = context.graph.compared(context.results(context.graph.learned))
+    assert set(rows) == ROWS
+    own = context.results(rows["real_only"].trained).params
+    of_all = context.results(graph_of(few[0])._on_photographs(None)).params
+    assert all(torch.equal(value, of_all[name]) for name, value in own.items())
+
+
 def test_fine_tuning_goes_on_from_the_detector_of_synthetic_images(folder):
     stages = "stages=[views,field,target_sets,warm_start,psi,evaluate]"
     context = run(folder, "training.real.mode=pretrain", "training.real.fraction=0.5", stages)

@@ -226,7 +226,8 @@ class Graph:
         steps = -(-training.images_per_object * len(self.names) // training.batch_size)
         epochs = training.cold_epochs
         if start is None:  # the same for all modes
-            training = replace(training, real=Real("combined", real.count, real.fraction))
+            own = Real("combined", real.count, real.fraction, fewer=real.fewer)
+            training = replace(training, real=own)
         else:
             epochs, steps = 1, max(1, round(real.finetune * steps * epochs))
         return PhotographsStage(
