@@ -9,6 +9,8 @@ from pathlib import Path
 
 import torch
 
+from neural_sim.devices import forget_gpu_peak
+
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """The option ``--device``: cpu, cuda or cuda:1."""
@@ -27,7 +29,7 @@ def memory_mb() -> tuple[float, float]:
 
 def forget_peak(device: torch.device | None = None) -> None:
     """Start the peaks of ``memory_mb`` and ``gpu`` anew, where the system can."""
-    if device is not None and device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
+    if device is not None:
+        forget_gpu_peak(device)
     if Path("/proc/self/clear_refs").is_file():
         Path("/proc/self/clear_refs").write_text("5")

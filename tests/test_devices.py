@@ -34,6 +34,17 @@ def test_many_small_tensors_move_in_one_copy(pretend):
     assert all(x is y for x, y in zip(devices.moved(parts, "cpu"), parts, strict=True))
 
 
+def test_a_gpu_is_started_before_its_peak_is_forgotten(monkeypatch):
+    """As CUDA does: it has no count to reset before torch has used it."""
+    calls = []
+    monkeypatch.setattr(torch.cuda, "init", lambda: calls.append("init"))
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: calls.append(device.type))
+    devices.forget_gpu_peak(torch.device("cpu"))
+    assert not calls
+    devices.forget_gpu_peak(torch.device("cuda", 0))
+    assert calls == ["init", "cuda"]
+
+
 def test_memory_of_a_gpu_is_reported_only_where_there_is_one():
     found = devices.peak_memory_mb(torch.device("cpu"))
     assert set(found) == {"peak_memory_mb"} and found["peak_memory_mb"] > 10.0

@@ -84,6 +84,13 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
     return peaks
 
 
+def forget_gpu_peak(device: torch.device) -> None:
+    """Start the count of ``peak_gpu_memory_mb`` anew; nothing on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.init()  # without which torch has no count to reset, and raises
+        torch.cuda.reset_peak_memory_stats(device)
+
+
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:
     """The same on ``device``; those that are there already are not copied."""
     return {name: tensor.to(device) for name, tensor in tensors.items()}

@@ -8,6 +8,8 @@ from collections.abc import Callable
 import torch
 from torch.profiler import ProfilerActivity, profile
 
+from neural_sim.devices import forget_gpu_peak
+
 # Read when the profiler first runs, which otherwise writes lines of its own to the screen.
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")
 
@@ -22,7 +24,7 @@ def peak_bytes(run: Callable[[], object], device: torch.device | None = None) ->
     """
     if device is not None and device.type == "cuda":
         before = torch.cuda.memory_allocated(device)
-        torch.cuda.reset_peak_memory_stats(device)
+        forget_gpu_peak(device)
         run()
         return torch.cuda.max_memory_allocated(device) - before
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
