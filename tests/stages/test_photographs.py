@@ -13,6 +13,7 @@ from neural_sim.detector.training import train_detector
 from neural_sim.main import build, conf_directory, context_of
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.walk import walk
+from neural_sim.target.sets import RenderedTarget
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",
@@ -69,6 +70,19 @@ def test_the_warm_start_s_images_decide_on_it_and_on_psi_alone():
 def test_which_photographs_train_and_how_tells_detectors_apart(other):
     combined = "training.real.mode=combined"
     assert keys(combined)["scored"] != keys(combined, other)["scored"]
+
+
+@pytest.mark.parametrize("mode", ["combined", "pretrain"])
+def test_as_many_photographs_are_the_same_training_however_they_were_asked_for(monkeypatch, mode):
+    """Where the target says how many it has without reading them."""
+    monkeypatch.setattr(RenderedTarget, "training_count", lambda target, seed: 12, raising=False)
+    of_all, fewer = keys(f"training.real.mode={mode}"), "training.real.fewer=all"
+    assert of_all == keys(f"training.real.mode={mode}", "training.real.count=50", fewer)
+    half = keys(f"training.real.mode={mode}", "training.real.fraction=0.5")
+    assert half == keys(f"training.real.mode={mode}", "training.real.count=6")
+    assert half["scored"] != of_all["scored"] and half["real"] != of_all["real"]
+    with pytest.raises(ValueError, match="want 50 photographs or more to train on, got 12"):
+        keys(f"training.real.mode={mode}", "training.real.count=50")
 
 
 @pytest.mark.parametrize(

@@ -213,3 +213,5 @@ def test_scenes_for_training_are_taken_from_those_that_are_not_scored(root):
     parts = of(root, val_fraction=0.6, train_fraction=0.5).parts(1)
     assert parts["test"] == without["test"] and sorted(parts["train"] + parts["val"]) == without["val"]
     assert not {name.scene for name in parts["train"]} & {name.scene for name in parts["val"]}
+    counts = [of(root, val_fraction=0.6, train_fraction=part).training_count(1) for part in (0.5, None)]
+    assert counts == [len(parts["train"]), 0] and counts[0] > 0

@@ -131,6 +131,7 @@ def test_scenes_for_training_are_none_of_the_others(shared_root):
         assert all(len(own) == 1 for own in scenes.values()) and len(set.union(*scenes.values())) == 3
     made = sets_of(of(shared_root, train_fraction=0.5, val_fraction=0.6))
     assert {name: len(part) for name, part in made.items()} == {"train": 3, "val": 3, "test": 3}
+    assert of(shared_root, train_fraction=0.5, val_fraction=0.6).training_count(0) == 3
 
 
 def lists(root, **named):

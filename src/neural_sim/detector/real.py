@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
@@ -81,13 +81,12 @@ class Real:
         """Whether photographs are mixed with synthetic images."""
         return self.used and self.mode == "combined"
 
-    def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
-        """Those that train: a random subset, the first of an order that depends on ``seed`` alone.
+    def number(self, available: int) -> int:
+        """How many of ``available`` photographs train.
 
         Raises:
             ValueError: fewer photographs than ``count`` where that is refused, or none at all.
         """
-        available = 0 if photographs is None else len(photographs)
         count = available if self.count is None else self.count
         if self.fraction is not None:
             count = max(1, round(self.fraction * available))
@@ -96,11 +95,25 @@ class Real:
                 "training.real: %d photographs in the place of %d, there are no more", available, count
             )
             count = available
-        if photographs is None or not 0 < count <= available:
+        if not 0 < count <= available:
             raise ValueError(
                 f"training.real: want {max(1, count)} photographs or more to train on, got {available}"
             )
+        return count
+
+    def of(self, available: int) -> Real:
+        """The same in terms of a ``count``, so that equal trainings have equal keys. Raises as ``number`` does."""
+        return (
+            replace(self, count=self.number(available), fraction=None, fewer="refuse") if self.used else self
+        )
+
+    def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
+        """Those that train: a random subset, the first of an order that depends on ``seed`` alone. Raises as ``number``
+        does."""
+        available = 0 if photographs is None else len(photographs)
+        count = self.number(available)
         generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 3)
+        assert photographs is not None  # of which ``number`` found one at least
         return photographs.select(torch.randperm(available, generator=generator)[:count])
 
     def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:

@@ -201,10 +201,14 @@ class Graph:
     def _uniform(self) -> Psi:
         return self.experiment.imaging.distribution.uniform.expand_as(self.psi("initial"))
 
-    @property
+    @cached_property
     def _training(self) -> Training:
-        """As in the keys of detectors, which say by psi what they are trained on, whatever the warm start is of."""
-        return replace(self.experiment.training, warm_start="initial")
+        """As in the keys of detectors, which say by psi what they are trained on, whatever the warm start is of, and
+        how many photographs train, whatever was asked for, where the target knows how many it has."""
+        x = self.experiment
+        count = getattr(x.imaging.target, "training_count", None)
+        real = x.training.real if count is None else x.training.real.of(count(x.run.seed))
+        return replace(x.training, warm_start="initial", real=real)
 
     def _detector(
         self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True

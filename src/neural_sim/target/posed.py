@@ -25,7 +25,7 @@ from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, boxes_by_bin, large_enough
 from neural_sim.target.frames import Frame, FrameName, Listed, opened
 from neural_sim.target.letterbox import letterbox
-from neural_sim.target.split import check_fraction, for_training, split
+from neural_sim.target.split import check_fraction, evenly, for_training, split
 from neural_sim.target.viewpoint import bins_of_poses
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -148,6 +148,10 @@ class PosedTarget(ABC):
         """Whether some of the photographs are for training."""
         return self.train_fraction is not None
 
+    def training_count(self, seed: int) -> int:
+        """How many photographs the part ``train`` has, none of which is read for that."""
+        return len(self.parts(seed).get("train", []))
+
     def parts(self, seed: int) -> dict[str, list[FrameName]]:
         """The photographs of ``val``, which steers psi, ``test`` and any ``train``; they share no scene."""
         listed, generator = self._chosen, torch.Generator().manual_seed(seed)
@@ -158,12 +162,7 @@ class PosedTarget(ABC):
             rows, test = val, [listed.val[row] for row in scored]
         unscored = for_training(rows, scenes, self.train_fraction, generator)
         parts = {part: [listed.val[row] for row in own] for part, own in unscored.items()}
-        return {part: self._limited(sorted(names)) for part, names in {**parts, "test": test}.items()}
-
-    def _limited(self, names: list[FrameName]) -> list[FrameName]:
-        if self.limit is None or self.limit >= len(names):
-            return names
-        return [names[i * len(names) // self.limit] for i in range(self.limit)]
+        return {part: evenly(sorted(names), self.limit) for part, names in {**parts, "test": test}.items()}
 
     def camera(self) -> PinholeCamera:
         """The one that took most of the photographs; others are logged.

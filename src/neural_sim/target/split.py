@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import TypeVar
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
+
+T = TypeVar("T")
 
 
 def split(
@@ -76,6 +79,13 @@ def check_fraction(fraction: float | None) -> None:
     """Raises ``ValueError`` for a ``target.train_fraction`` that is none."""
     if fraction is not None and not 0.0 < fraction < 1.0:
         raise ValueError(f"target.train_fraction must lie in (0, 1) or be null, got {fraction}")
+
+
+def evenly(items: list[T], limit: int | None) -> list[T]:
+    """At most ``limit`` of the items, evenly spaced; None: all."""
+    if limit is None or limit >= len(items):
+        return items
+    return [items[i * len(items) // limit] for i in range(limit)]
 
 
 def nearest(sizes: Sequence[int], wanted: int) -> set[int]:
