@@ -5,6 +5,8 @@ import torch
 from small_loop import small_loop
 
 from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.outer.binding import object_images
 
 
 @pytest.mark.parametrize(
@@ -23,3 +25,16 @@ def test_few_images_are_trained_on_for_more_epochs(scene, least, start, steps):
     ).inner
     inner.train(inner.training_set(inner.draw(torch.zeros(2, 4)).images))
     assert inner.steps == steps
+
+
+@pytest.mark.parametrize(
+    "estimator", [StratifiedEstimator(probes_per_bin=2), PathwiseEstimator(mode="forward")]
+)
+def test_maps_of_objects_are_kept_only_where_a_derivative_goes_through_them(scene, estimator):
+    rendered = small_loop(scene, estimator).inner.draw(torch.zeros(2, 4))
+    relaxed = isinstance(estimator, PathwiseEstimator)
+    assert len(rendered) == 12 and [len(part.draw) for part in rendered.objects] == [6, 6]
+    assert [len(part.rgb) for part in rendered.objects] == [6 * relaxed] * 2
+    assert len(rendered.compose) == 2 * relaxed
+    by_object = object_images(scene, rendered, torch.zeros(2, 4), torch.ones(12))
+    assert all((images.images is not None) == relaxed for images in by_object.values())

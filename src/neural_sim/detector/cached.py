@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,13 +45,43 @@ class CachedSet:
         return len(self.targets)
 
     @staticmethod
-    def of(detector: Detector, backbone: Parameters, images: LabelledImages) -> CachedSet:
+    def of(
+        detector: Detector, backbone: Parameters, images: LabelledImages, batch_size: int = 64
+    ) -> CachedSet:
         """The features and targets of ``images``, on the backbone's device; the images may be on another."""
-        features = cached_features(detector, backbone, images.images)
+        features = cached_features(detector, backbone, images.images, batch_size)
         device = features[0].device
         return CachedSet(
             detector, features, detector.assign(images.boxes.to(device), images.labels.to(device))
         )
+
+    @staticmethod
+    def streamed(
+        detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
+    ) -> CachedSet:
+        """As of one set of all images, in the same batches, with no more images in memory than one of ``sets`` and a
+        batch. Raises ``ValueError`` for no set."""
+        parts: list[CachedSet] = []
+        waiting: list[LabelledImages] = []
+        for images in sets:
+            together = LabelledImages.concatenate([*waiting, images])
+            whole = len(together) // batch_size * batch_size
+            if whole:
+                parts.append(CachedSet.of(detector, backbone, together.select(slice(0, whole)), batch_size))
+            waiting = [together.select(slice(whole, None))] if whole < len(together) else []
+        if waiting or not parts:
+            parts.append(CachedSet.of(detector, backbone, LabelledImages.concatenate(waiting)))
+        return CachedSet.concatenate(parts)
+
+    @staticmethod
+    def concatenate(parts: Sequence[CachedSet]) -> CachedSet:
+        """The images of all ``parts``, of one detector and size, one after the other."""
+        targets = Targets(
+            torch.cat([part.targets.labels for part in parts]),
+            torch.cat([part.targets.deltas for part in parts]),
+        )
+        levels = zip(*(part.features for part in parts), strict=True)
+        return CachedSet(parts[0].detector, tuple(torch.cat(level) for level in levels), targets)
 
     @property
     def device(self) -> torch.device:
@@ -86,12 +116,7 @@ class CachedSet:
 
     def joined(self, others: CachedSet) -> CachedSet:
         """The set of these images and then ``others``, of the same detector and size."""
-        pairs = zip(self.features, others.features, strict=True)
-        targets = Targets(
-            torch.cat([self.targets.labels, others.targets.labels]),
-            torch.cat([self.targets.deltas, others.targets.deltas]),
-        )
-        return CachedSet(self.detector, tuple(torch.cat(pair) for pair in pairs), targets)
+        return CachedSet.concatenate([self, others])
 
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
         """The set with the images ``index`` replaced by ``others``."""

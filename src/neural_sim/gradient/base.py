@@ -85,13 +85,13 @@ class ObjectImages:
 
     ``psi`` is the object's part of all factors of ``distribution``, p_psi. ``index`` are the images' rows in
     the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
-    ``draw`` is where they were rendered. ``path`` is needed by the pathwise estimator only. Each ``group`` of
-    consecutive images shares randomness (1: all are independent).
+    ``draw`` is where they were rendered. ``images`` and ``path`` are needed by the pathwise estimator only. Each
+    ``group`` of consecutive images shares randomness (1: all are independent).
     """
 
     psi: Float[Tensor, "K"]
     distribution: SceneDistribution
-    images: Float[Tensor, "n 3 h w"]
+    images: Float[Tensor, "n 3 h w"] | None
     index: Int[Tensor, "n"]
     weights: Float[Tensor, "n"]
     draw: SceneDraw

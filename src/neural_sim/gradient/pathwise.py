@@ -152,6 +152,7 @@ def _path(images: ObjectImages) -> RenderedPath:
 
 def _inputs(images: ObjectImages, path: RenderedPath) -> tuple[Tensor, ...]:
     """The images, and their boxes where these depend on psi."""
+    assert images.images is not None  # as images with a path always have
     return (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
 
 

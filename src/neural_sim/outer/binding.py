@@ -73,12 +73,13 @@ def object_images(
 ) -> dict[str, ObjectImages]:
     """The images in which each object shows, by its name, with their rows in the training set; a path where draws are
     relaxed. ``weights`` are those of all images in the training loss."""
+    pixels = rendered.images.images
     bound = {}
     for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
         bound[scene.names[label]] = ObjectImages(
             psi=psi[label].detach().to(part.rgb.dtype),
             distribution=scene.distribution,
-            images=rendered.images.images[rows.to(part.rgb.device)],
+            images=pixels[rows.to(pixels.device)] if part.relaxed else None,
             index=rows,
             weights=weights[rows],
             draw=part.draw,

@@ -110,12 +110,12 @@ class InnerLoop:
         return self.detector.split(self.theta)[1]
 
     def draw(self, psi: Float[Tensor, "objects K"]) -> RenderedImages:
-        """An iteration's training images."""
+        """An iteration's training images, without maps where no derivative goes through them."""
         rendered = self.scene.training_set(
             psi, self.settings.images_per_object, self._common(0), self.draws, self.pool
         )
         self.images += len(rendered)
-        return rendered
+        return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
 
     def training_set(self, images: LabelledImages) -> CachedSet:
         """The drawn images, and after them the photographs that train with them, under the backbone."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,18 +41,19 @@ class ProbeSet:
     ) -> ProbeSet:
         """Probes of some ``objects``, rendered by ``source`` (None: the scene); all factors but the stratified one are
         drawn from p_psi."""
-        drawn: list[LabelledImages] = []
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
-        first = 0
-        for label in objects:
-            for factor in scene.distribution.factors:
-                images, draw = scene.probes(label, factor.name, per_bin, psi, generator, source)
-                index = torch.arange(first, first + len(images))
-                probes[label][factor.name] = Probes(index, factor.stratum_of(draw))
-                first += len(index)
-                drawn.append(images)
-        cached = CachedSet.of(detector, backbone, LabelledImages.concatenate(drawn))
-        return ProbeSet(probes, cached, per_bin)
+
+        def drawn() -> Iterator[LabelledImages]:
+            first = 0
+            for label in objects:
+                for factor in scene.distribution.factors:
+                    images, draw = scene.probes(label, factor.name, per_bin, psi, generator, source)
+                    index = torch.arange(first, first + len(images))
+                    probes[label][factor.name] = Probes(index, factor.stratum_of(draw))
+                    first += len(index)
+                    yield images
+
+        return ProbeSet(probes, CachedSet.streamed(detector, backbone, drawn()), per_bin)
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
         """These probes with the next ``fresh.per_bin`` of every bin, cyclically by the iteration ``turn``, replaced by

@@ -61,6 +61,16 @@ class RenderedImages:
     def __len__(self) -> int:
         return len(self.images)
 
+    def without_maps(self) -> RenderedImages:
+        """The same without what composes the images again, which takes more memory than they do."""
+        objects = [
+            replace(
+                part, rgb=part.rgb.new_empty(0, *part.rgb.shape[1:]), opacity=part.opacity.new_empty(0, 0, 0)
+            )
+            for part in self.objects
+        ]
+        return replace(self, objects=tuple(objects), compose=())
+
 
 def one_each(
     objects: Sequence[RenderedObject],
