@@ -114,10 +114,6 @@ class CachedSet:
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
-    def joined(self, others: CachedSet) -> CachedSet:
-        """The set of these images and then ``others``, of the same detector and size."""
-        return CachedSet.concatenate([self, others])
-
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
         """The set with the images ``index`` replaced by ``others``."""
         place = index.to(self.device)

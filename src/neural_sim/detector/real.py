@@ -103,9 +103,7 @@ class Real:
 
     def of(self, available: int) -> Real:
         """The same in terms of a ``count``, so that equal trainings have equal keys. Raises as ``number`` does."""
-        return (
-            replace(self, count=self.number(available), fraction=None, fewer="refuse") if self.used else self
-        )
+        return replace(self, count=self.number(available), fraction=None, fewer="refuse")
 
     def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
         """Those that train: a random subset, the first of an order that depends on ``seed`` alone. Raises as ``number``

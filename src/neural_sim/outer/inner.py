@@ -120,7 +120,7 @@ class InnerLoop:
     def training_set(self, images: LabelledImages) -> CachedSet:
         """The drawn images, and after them the photographs that train with them, under the backbone."""
         drawn = CachedSet.of(self.detector, self.backbone, images)
-        return drawn if self.photographs is None else drawn.joined(self.photographs)
+        return drawn if self.photographs is None else CachedSet.concatenate([drawn, self.photographs])
 
     def drawn(self, images: CachedSet) -> int:
         """How many of a training set's images were drawn from p_psi."""

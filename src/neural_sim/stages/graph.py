@@ -205,9 +205,10 @@ class Graph:
     def _training(self) -> Training:
         """As in the keys of detectors, which say by psi what they are trained on, whatever the warm start is of, and
         how many photographs train, whatever was asked for, where the target knows how many it has."""
-        x = self.experiment
+        x, real = self.experiment, self.experiment.training.real
         count = getattr(x.imaging.target, "training_count", None)
-        real = x.training.real if count is None else x.training.real.of(count(x.run.seed))
+        if real.used and count is not None:
+            real = real.of(count(x.run.seed))
         return replace(x.training, warm_start="initial", real=real)
 
     def _detector(

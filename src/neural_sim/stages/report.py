@@ -139,8 +139,8 @@ def _real(context: Context) -> dict[str, Any]:
     if not real.used:
         return {}
     train = context.results(context.graph.targets).train
-    chosen = real.chosen(train, context.experiment.run.seed)
-    return {"mode": real.mode, "photographs": len(chosen), "available": 0 if train is None else len(train)}
+    available = 0 if train is None else len(train)
+    return {"mode": real.mode, "photographs": real.number(available), "available": available}
 
 
 def _curve(context: Context) -> list[dict[str, Any]]:
