@@ -103,7 +103,7 @@ def test_groups_stay_together_and_a_limit_spreads(tmp_path):
         assert bool((inside < 0.5).all()) or bool((inside > 0.5).all())
     assert sorted(len(images) for images in parts.values()) == [5, 5]
     few = FolderTarget(tmp_path, limit=2)
-    assert [path.name for _, path in few._taken(["can"])] == ["2.png", "3.png"]  # of a/0 a/2 a/4 b/1 b/3 b/5
+    assert [path.name for _, path in few._taken(["can"])] == ["0.png", "1.png"]  # of a/0 a/2 a/4 b/1 b/3 b/5
     with pytest.raises(ValueError, match="want a regular expression or null, got 'attribute:scene'"):
         FolderTarget(tmp_path, split_by="attribute:scene")
     with pytest.raises(ValueError, match="want at least two groups"):

@@ -25,7 +25,7 @@ from neural_sim.target.letterbox import letterbox
 from neural_sim.target.near_duplicates import thumbnail
 from neural_sim.target.parting import Looks, Parting
 from neural_sim.target.photo_files import PhotoFiles
-from neural_sim.target.split import check_fraction
+from neural_sim.target.split import check_fraction, evenly
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
@@ -113,8 +113,7 @@ class FolderTarget:
         taken = []
         for folder in folders:
             paths = PhotoFiles(str(self._folders[folder]), "target.root").paths
-            count = len(paths) if self.limit is None else min(self.limit, len(paths))
-            taken += [(folder, paths[int((i + 0.5) * len(paths) / count)]) for i in range(count)]
+            taken += [(folder, path) for path in evenly(paths, self.limit)]
         return taken
 
     @cached_property

@@ -81,10 +81,10 @@ def check_fraction(fraction: float | None) -> None:
         raise ValueError(f"target.train_fraction must lie in (0, 1) or be null, got {fraction}")
 
 
-def evenly(items: list[T], limit: int | None) -> list[T]:
+def evenly(items: Sequence[T], limit: int | None) -> list[T]:
     """At most ``limit`` of the items, evenly spaced; None: all."""
     if limit is None or limit >= len(items):
-        return items
+        return list(items)
     return [items[i * len(items) // limit] for i in range(limit)]
 
 
