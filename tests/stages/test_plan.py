@@ -28,6 +28,15 @@ def test_the_default_differentiates_no_render_and_renders_every_bin_once():
     )
 
 
+def test_a_pool_saves_renders_of_every_object_of_an_image_or_is_not_mentioned():
+    found = left_out("scale=quick", "baseline=lts", "synthesis.objects_per_image=[3,6]")
+    renders = 4.5 * 2 * 10 * 100  # 4.5 objects in each of 100 images, twice in each of 10 iterations
+    assert found["renders of the loop"].fraction == pytest.approx(1 - 384 / renders)
+    # 250 images need fewer renders than a pool's 384
+    few = left_out("scale=quick", "baseline=auto_sim", "outer.images_per_object=25")
+    assert "renders of the loop" not in few
+
+
 def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
     found = left_out("gradient=pathwise")
     assert "the renderer's derivative" not in found and "renders of the loop" not in found

@@ -49,7 +49,7 @@ def _loop(graph: Graph) -> Iterator[Omission]:
     else:
         yield Omission("psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0)
     if pooled(outer, graph.learned.draws, x.imaging.distribution):
-        yield _pooled(x, getattr(method, "rounds", 1) * outer.iterations, follows)
+        yield from _pooled(x, getattr(method, "rounds", 1) * outer.iterations, follows)
     if outer.quality not in (None, x.imaging.renderer.quality):
         yield Omission(
             "psi", "fine renders in the loop", f"outer.quality={outer.quality}; the scored images are fine"
@@ -80,9 +80,9 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
         yield Omission("psi", "images in Hessian products", "outer.curvature_images stand for all", fraction)
 
 
-def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
-    """The fraction of the loop's renders that a pool of every bin saves; trainings that judge a step are not counted,
-    since not every iteration has one."""
+def _pooled(x: Experiment, rounds: int, follows: bool) -> Iterator[Omission]:
+    """The fraction of the loop's renders that a pool of every bin saves, if any. An image of several objects needs a
+    render of each. Trainings that judge a step are not counted, since not every iteration has one."""
     factors, outer = x.imaging.distribution.binned, x.loop.outer
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
     trainings, probes = rounds, 0.0
@@ -93,8 +93,8 @@ def _pooled(x: Experiment, rounds: int, follows: bool) -> Omission:
             derivatives = trainings - 1
         anew = 1.0 + (derivatives - 1) * outer.refresh
         probes = anew * x.loop.gradient.probes_per_bin * sum(factor.bins for factor in factors)
-    wanted = trainings * outer.images_per_object + probes
-    fraction = max(0.0, 1.0 - rendered / wanted)
-    return Omission(
-        "psi", "renders of the loop", "fields do not change: every bin is rendered once", fraction
-    )
+    shown = sum(x.imaging.synthesis.objects_per_image) / 2.0
+    wanted = shown * (trainings * outer.images_per_object + probes)
+    if rendered < wanted:
+        why = "fields do not change: every bin is rendered once"
+        yield Omission("psi", "renders of the loop", why, 1.0 - rendered / wanted)
