@@ -30,11 +30,21 @@ FREE = {
 """The paper's: steps as they come, of the loss, by the implicit derivative."""
 
 
-def small_loop(scene, estimator, iterations=2, solver=SOLVER, detector=None, psi=None, update=None, **outer):
+def small_loop(
+    scene,
+    estimator,
+    iterations=2,
+    solver=SOLVER,
+    detector=None,
+    psi=None,
+    update=None,
+    shown=slice(None),
+    **outer,
+):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
-    validation = scene.training_set(psi, 3, generator).images
+    validation = scene.training_set(psi, 3, generator).images.select(shown)  # three of each object
     settings = Outer(
         update or Mirror(),
         iterations=iterations,

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from small_loop import small_loop
+from small_loop import SOLVER, small_loop
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Checks, Outer, Trust
 from neural_sim.parameter.update import Mirror
 
@@ -142,3 +143,20 @@ def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
 def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
     with pytest.raises(ValueError, match="outer"):
         Outer(Mirror(), **bad)
+
+
+def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
+    module = checked_loop(scene, shown=slice(3, 6), trust=Trust(level=None))
+    assert "no validation image shows: a" in caplog.text
+    learned = learn_psi(module, progress=False)
+    assert not learned.last[0].any() and set(learned.records[1].verdicts) == {"b"}
+    assert all(set(record.certificate.actions) == {"b"} for record in learned.records[:2])
+    both = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"), trust=Trust(level=None))
+    assert set(learn_psi(both, progress=False).records[1].verdicts) == {"a", "b"}
+
+
+def test_validation_without_an_object_is_refused(scene):
+    inner = checked_loop(scene).inner
+    inner.shown = set()
+    with pytest.raises(ValueError, match="show none of the objects"):
+        SimulatorModule(inner, torch.zeros(2, 4), StratifiedEstimator(probes_per_bin=2), SOLVER)

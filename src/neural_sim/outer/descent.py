@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from abc import ABC, abstractmethod
 
@@ -19,6 +20,8 @@ from neural_sim.outer.objective import Objective
 from neural_sim.outer.steps import FreeSteps, Steps, Verdict
 from neural_sim.synthesis.assembly import RenderedImages
 
+_log = logging.getLogger(__name__)
+
 
 class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
@@ -29,9 +32,8 @@ class GradientLoop(OuterLoop, ABC):
 
     def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> None:
         super().__init__(inner, psi, inner.settings.iterations)
-        wanted, names = inner.settings.learned, self.scene.names
-        self._learned = [i for i, name in enumerate(names) if wanted is None or name in wanted]
-        self._names = [names[label] for label in self._learned]
+        self._learned = _learned(inner)
+        self._names = [self.scene.names[label] for label in self._learned]
         self.steps = self._begin()
         self._recording: Recording | None = None
         self._before = psi.new_zeros(0, 0)
@@ -156,3 +158,24 @@ def _products(result: Hypergradient) -> int:
     """Hessian products of the solve and of the damping before it."""
     spectrum = result.damping.spectrum
     return result.solution.products + (spectrum.products if spectrum else 0)
+
+
+def _learned(inner: InnerLoop) -> list[int]:
+    """Classes of the objects whose psi moves: those that were asked for, else all that validation images show.
+
+    Of an object that they do not show they measure only where it is taken for another, whatever its own best psi is.
+
+    Raises:
+        ValueError: validation images without any object.
+    """
+    names, wanted = inner.scene.names, inner.settings.learned
+    if wanted is not None:
+        return [label for label, name in enumerate(names) if name in wanted]
+    if not inner.shown:
+        raise ValueError(
+            "the target's validation images show none of the objects, so that psi cannot be learned"
+        )
+    unseen = [name for label, name in enumerate(names) if label not in inner.shown]
+    if unseen:
+        _log.warning("psi stays as it is of objects that no validation image shows: %s", ", ".join(unseen))
+    return sorted(inner.shown)

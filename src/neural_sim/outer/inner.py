@@ -62,8 +62,8 @@ class InnerLoop:
 
     With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
     ``objective`` is L_val, ``differentiated`` the part of it whose derivative is taken: all, unless it was replaced.
-    ``images`` and ``steps`` count labelled images and optimiser steps; ``cpu_begun`` is the processor time before the
-    pool was rendered.
+    ``shown`` are the classes of which a validation image shows an object. ``images`` and ``steps`` count labelled
+    images and optimiser steps; ``cpu_begun`` is the processor time before the pool was rendered.
     """
 
     def __init__(
@@ -83,6 +83,7 @@ class InnerLoop:
         self.training, self.generator = training, generator
         self.backbone, self.warm_start = detector.split(params)
         self.validation = CachedSet.of(detector, self.backbone, validation)
+        self.shown = set(validation.labels[validation.labels >= 0].tolist())
         self.draws, self.device = draws, self.validation.device
         self.photographs = None
         if photographs is not None:
