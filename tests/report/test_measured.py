@@ -19,6 +19,8 @@ def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
     write_measured(file, BUDGET, ROWS)
     assert read_measured(file, BUDGET) == ROWS
     assert read_measured(file, {**BUDGET, "views": {"count": 12}}) == {}
+    assert read_measured(file, {**BUDGET, "later": {"count": 12}}) == ROWS  # a key that the runs did not know
+    assert read_measured(file, {"views": BUDGET["views"]}) == {}  # one that is gone
 
 
 def test_the_cell_names_the_commits():
@@ -54,6 +56,7 @@ def test_the_newest_finished_run_of_the_scale_is_shown(uri, tmp_path):
         ["below"], "second", [commit() or "unknown"]
     )
     assert newest_document(uri, "study", "study.md", smaller).text == "smaller"
+    assert newest_document(uri, "study", "study.md", {**BUDGET, "later": 1}).text == "second"
 
 
 def test_without_runs_there_is_no_document(uri, tmp_path):

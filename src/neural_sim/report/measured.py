@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.report import logged
-from neural_sim.report.tracking import flatten
+from neural_sim.report.identity import at_scale
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
     if not file.is_file():
         return {}
     document = json.loads(file.read_text())
-    rows = document["rows"] if document["budget"] == budget else {}
+    rows = document["rows"] if at_scale(document["budget"], budget) else {}
     return {name: Measured(**row) for name, row in rows.items()}
 
 
@@ -51,8 +51,12 @@ def newest_document(uri: str, experiment: str, name: str, budget: Mapping[str, A
     """The Markdown file ``name`` of the newest finished run of an experiment at the scale ``budget``; None without."""
     if experiment not in logged.experiments(uri):
         return None
-    scale = {key: str(value) for key, value in flatten({"budget": budget}).items()}
     for run in logged.runs(uri, experiment):
-        if run.status == "FINISHED" and name in run.files and scale.items() <= run.parameters.items():
+        own = {
+            key.removeprefix("budget."): value
+            for key, value in run.parameters.items()
+            if key.startswith("budget.")
+        }
+        if run.status == "FINISHED" and name in run.files and at_scale(own, budget):
             return Measured(["below"], run.fetch(name).read_text().strip(), [run.commit])
     return None

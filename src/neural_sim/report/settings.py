@@ -10,7 +10,7 @@ from typing import Any
 from neural_sim.digests import digest
 from neural_sim.report import logged
 from neural_sim.report.finished import Candidate, FinishedRun, candidates, read_run
-from neural_sim.report.identity import scored_values
+from neural_sim.report.identity import at_scale, scored_values
 from neural_sim.report.object_scores import ObjectScores, object_scores
 from neural_sim.report.selection import Group, LeftOut, Selection
 
@@ -96,7 +96,7 @@ class Settings:
         return groups, [*others, *selection.left_out, *(_left(run, reason) for run in older)]
 
     def _at_scale(self, run: Candidate) -> bool:
-        return run.results.get("config", {}).get("budget") == self.budget
+        return at_scale(run.results.get("config", {}).get("budget") or {}, self.budget)
 
 
 def _way(run: Candidate) -> str:
