@@ -101,8 +101,9 @@ def test_the_loop_draws_a_part_of_its_probes_anew(scene):
     detector = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = scene.training_set(torch.zeros(1, 4), 2, generator).images
     settings = Outer(
-        Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2, **FREE
-    )
+        Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2,
+        learned=scene.names, **FREE,
+    )  # fmt: skip
     inner = InnerLoop(
         scene,
         detector,

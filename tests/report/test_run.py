@@ -8,7 +8,7 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.report import logged
-from neural_sim.report.figures import psi_figure
+from neural_sim.report.figures import image_grid, psi_figure
 from neural_sim.report.run import RunResults, write_figures, write_results
 from neural_sim.report.run_tracking import live_run
 from neural_sim.types import LabelledImages
@@ -126,6 +126,19 @@ def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tm
     assert steps(uri, tracked.run_id, "curve/biased_accuracy_by_images") == {9: 0.6}
     assert metrics["validation_accuracy"] == 0.25
     assert not any("ap" in key.replace("/", "_").split("_") for key in metrics)
+
+
+def test_captions_fit_above_wide_images_of_several_objects():
+    labels = torch.tensor([[0, 1, 2], [1, -1, -1], [-1, -1, -1]])
+    images = LabelledImages(
+        torch.rand(3, 3, 60, 80), torch.tensor([1.0, 2.0, 20.0, 30.0]).expand(3, 3, 4), labels, labels[:, 0]
+    )
+    figure = image_grid(images, ("a", "b", "c"))
+    (axes,) = figure.axes
+    assert [text.get_text() for text in axes.texts] == ["a +2", "b", "no box"]
+    assert axes.images[0].get_array().shape[:2] == (60 + 11, 3 * (80 + 11))  # no columns without an image
+    width, height = figure.get_size_inches()
+    assert width == 5.0 and height == pytest.approx(0.4 + 1.35 * 71 / 91)
 
 
 def test_figures_are_written(results, tmp_path):

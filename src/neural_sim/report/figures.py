@@ -156,13 +156,16 @@ def image_grid(
 ) -> Figure:
     """Images with their boxes (solid), or with the best prediction solid over dashed true boxes.
 
-    All images go on one canvas: an axes each would take a hundred times as long to lay out.
+    A caption names one object, and how many more there are. All images go on one canvas: an axes each would take a
+    hundred times as long to lay out.
     """
     count, height, width = len(images), *images.images.shape[-2:]
+    columns = max(1, min(columns, count))
     rows, gap = max(1, -(-count // columns)), round(0.18 * height)
     canvas = np.ones((rows * (height + gap), columns * (width + gap), 3), dtype=np.float32)
-    figure = Figure(figsize=(1.35 * columns, 1.35 * rows + 0.4))
-    axes = figure.add_axes((0.01, 0.0, 0.98, 1.0 - 0.4 / (1.35 * rows + 0.4)))
+    side = 1.35 * (height + gap) / (width + gap)  # inches of a row; a column has 1.35
+    figure = Figure(figsize=(max(1.35 * columns, 5.0), side * rows + 0.4))
+    axes = figure.add_axes((0.01, 0.0, 0.98, 1.0 - 0.4 / (side * rows + 0.4)))
     for i in range(count):
         top, left = i // columns * (height + gap) + gap, i % columns * (width + gap)
         canvas[top : top + height, left : left + width] = (
@@ -173,10 +176,17 @@ def image_grid(
             if label >= 0:
                 _box(axes, box, (left, top), label, dashed=predictions is not None)
                 caption.append(class_names[label])
+        if len(caption) > 1:
+            caption = [f"{caption[0]} +{len(caption) - 1}"]
         if predictions is not None:
             caption = [_best_prediction(axes, predictions[i], (left, top), class_names)]
         axes.text(
-            left + width / 2, top - 2, ", ".join(caption) or "no box", fontsize=6.5, color=MUTED, ha="center"
+            left + width / 2,
+            top - 2,
+            "".join(caption) or "no box",
+            fontsize=6.5,
+            color=MUTED,
+            ha="center",
         )
     axes.imshow(canvas)
     axes.set_axis_off()
