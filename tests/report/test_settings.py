@@ -46,6 +46,13 @@ def test_runs_of_another_scale_and_of_an_older_way_of_scoring_are_left_out(read)
     }
 
 
+def test_a_run_from_before_a_key_of_budget_is_of_this_scale(read):
+    before = dict(list(BUDGET.items())[1:])
+    groups, left_out = read(run(3, budget=before))
+    assert [group.runs[0].run_id for group in groups] == ["00000003x"] and not left_out
+    assert not read(run(3, budget={**BUDGET, "gone": 1}))[0] and not read(run(3, budget={}))[0]
+
+
 def test_distributions_in_short():
     assert modes([0.125] * 8) == "uniform"
     assert modes([0.86, *[0.02] * 7]) == "1"

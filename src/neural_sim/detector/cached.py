@@ -70,7 +70,7 @@ class CachedSet:
                 parts.append(CachedSet.of(detector, backbone, together.select(slice(0, whole)), batch_size))
             waiting = [together.select(slice(whole, None))] if whole < len(together) else []
         if waiting or not parts:
-            parts.append(CachedSet.of(detector, backbone, LabelledImages.concatenate(waiting)))
+            parts.append(CachedSet.of(detector, backbone, LabelledImages.concatenate(waiting), batch_size))
         return CachedSet.concatenate(parts)
 
     @staticmethod

@@ -160,8 +160,8 @@ class Outer:
         on_untrusted: what happens to steps that fail ``trust``: those of one factor of one object where its derivative
             is not significant, all of them where the whole hypergradient fails. ``keep`` takes them whole, as the paper
             does; ``stop`` skips the former, and ends the loop at the latter or where no step is left.
-        learned: names of the objects whose psi moves; None: all that validation images show. The others get no probes
-            and no second derivatives.
+        learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
+            get no probes and no second derivatives.
         light_update: the optimiser of free steps, for weights of lights.
         certify: reference of the hypergradient: the ``response`` of training at this psi, one training for each bin
             (:mod:`outer.response`), or finite differences of a problem ``retrained`` to stationarity, for one object

@@ -171,23 +171,17 @@ def image_grid(
         canvas[top : top + height, left : left + width] = (
             images.images[i].permute(1, 2, 0).clamp(0, 1).cpu().numpy()
         )
-        caption = []
+        shown = []
         for box, label in zip(images.boxes[i].tolist(), images.labels[i].tolist(), strict=True):
             if label >= 0:
                 _box(axes, box, (left, top), label, dashed=predictions is not None)
-                caption.append(class_names[label])
-        if len(caption) > 1:
-            caption = [f"{caption[0]} +{len(caption) - 1}"]
+                shown.append(class_names[label])
+        caption = shown[0] if shown else "no box"
+        if len(shown) > 1:
+            caption += f" +{len(shown) - 1}"
         if predictions is not None:
-            caption = [_best_prediction(axes, predictions[i], (left, top), class_names)]
-        axes.text(
-            left + width / 2,
-            top - 2,
-            "".join(caption) or "no box",
-            fontsize=6.5,
-            color=MUTED,
-            ha="center",
-        )
+            caption = _best_prediction(axes, predictions[i], (left, top), class_names)
+        axes.text(left + width / 2, top - 2, caption, fontsize=6.5, color=MUTED, ha="center")
     axes.imshow(canvas)
     axes.set_axis_off()
     figure.suptitle(title, color=INK, fontsize=11)

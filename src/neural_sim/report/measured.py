@@ -52,11 +52,7 @@ def newest_document(uri: str, experiment: str, name: str, budget: Mapping[str, A
     if experiment not in logged.experiments(uri):
         return None
     for run in logged.runs(uri, experiment):
-        own = {
-            key.removeprefix("budget."): value
-            for key, value in run.parameters.items()
-            if key.startswith("budget.")
-        }
-        if run.status == "FINISHED" and name in run.files and at_scale(own, budget):
+        own = {key: value for key, value in run.parameters.items() if key.startswith("budget.")}
+        if run.status == "FINISHED" and name in run.files and at_scale(own, {"budget": budget}):
             return Measured(["below"], run.fetch(name).read_text().strip(), [run.commit])
     return None
