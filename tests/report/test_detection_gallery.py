@@ -7,7 +7,14 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import AveragePrecision
-from neural_sim.report.detection_gallery import Counts, count, judge, judged, report_detections
+from neural_sim.report.detection_gallery import (
+    Counts,
+    count,
+    detections_figure,
+    judge,
+    judged,
+    report_detections,
+)
 from neural_sim.types import LabelledImages
 
 TRUE = torch.tensor([[10.0, 10.0, 30.0, 30.0], [50.0, 10.0, 70.0, 30.0]])
@@ -67,6 +74,20 @@ def test_counts_are_over_all_images_and_padding_is_no_box():
     test, found = gallery()
     counts = {method: count(judged(every, test, 0.3, 0.5)) for method, every in found.items()}
     assert counts == {"ns": Counts(0, 3, 5), "neural_sim": Counts(2, 1, 3)}
+
+
+@pytest.mark.parametrize("box", [(0.0, 10.0, 9.0, 30.0), (71.0, 10.0, 80.0, 30.0), (60.0, 1.0, 80.0, 30.0)])
+def test_a_caption_stays_in_its_image(box):
+    test, _ = gallery()
+    found = {"ns": [detections((box, 0, 0.9))] * 3}
+    verdicts = {"ns": judged(found["ns"], test, 0.3, 0.5)}
+    figure = detections_figure(test, found, verdicts, ["006_mustard_bottle", "mug"], torch.tensor([0]))
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    (caption,) = (text for text in axes.texts if "0.90" in text.get_text())
+    image, words = axes.get_window_extent(), caption.get_window_extent()
+    assert image.x0 - 1 <= words.x0 and words.x1 <= image.x1 + 1
+    assert image.y0 - 1 <= words.y0 and words.y1 <= image.y1 + 1
 
 
 def test_the_files_and_the_run_have_every_method(tmp_path, uri):

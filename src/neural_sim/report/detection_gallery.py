@@ -133,9 +133,10 @@ def _draw(
         name = class_names[int(found["labels"][index])]
         text = f"{name} {float(found['scores'][index]):.2f}"
         inside = y0 < 0.06 * width  # no room above the box
+        left = x0 + x1 < width  # of two sides that with more room
         axes.text(
-            max(x0, 0.0), y0, text, fontsize=5.5, color="white", clip_on=True,
-            ha="left", va="top" if inside else "bottom",
+            max(x0, 0.0) if left else min(x1, width), y0, text, fontsize=5.5, color="white", clip_on=True,
+            ha="left" if left else "right", va="top" if inside else "bottom",
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.85},
         )  # fmt: skip
 
