@@ -23,6 +23,25 @@ def test_one_place_chooses_the_device(pretend, monkeypatch):
     assert device == torch.device("pretend", 0) and trainer.strategy.root_device == device
 
 
+@pytest.fixture
+def tf32():
+    """TF32 allowed for a test; torch's default for cuDNN."""
+    backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
+    before = [backend.allow_tf32 for backend in backends]
+    for backend in backends:
+        backend.allow_tf32 = True
+    yield backends
+    for backend, allowed in zip(backends, before, strict=True):
+        backend.allow_tf32 = allowed
+
+
+def test_a_gpu_convolves_and_multiplies_in_float32(monkeypatch, tf32):
+    """The loop's central differences of losses need digits that TF32 does not have."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert devices.device_of("gpu") == torch.device("cuda", 0)
+    assert not any(backend.allow_tf32 for backend in tf32)
+
+
 def test_many_small_tensors_move_in_one_copy(pretend):
     parts = [torch.arange(6.0).view(2, 3), torch.ones(()), torch.zeros(0, 4)]
     with counted() as ledger:
