@@ -40,7 +40,7 @@ def compute_in_float32() -> None:
     """Keep a GPU from rounding what it convolves or multiplies to TF32's 11 bits, as torch lets cuDNN do by default.
 
     Derivatives of the psi loop are central differences of losses, whose digits that rounding takes: on an H200 their
-    standard errors were two to three times the CPU's (docs/numerics.md).
+    standard errors were 1.4 to 2.6 times the CPU's (docs/numerics.md).
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
