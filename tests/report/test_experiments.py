@@ -132,6 +132,23 @@ def test_a_page_keeps_what_it_said_of_experiments_without_runs_here(page, tmp_pa
         )
 
 
+def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_path, monkeypatch):
+    at = str(tmp_path / "page.md")
+    first = page(page=at).splitlines()
+    better = setting(gap="same", methods=(("neural_sim", 1.0),), commit="7654321")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(module.Settings, "read", lambda self, runs: ([better], []))
+        second = page(page=at, only=["gaps"]).splitlines()
+    start = "| gap | can | disjoint | 0 |"
+    (kept,) = [row for row in second if row.startswith(start)]
+    assert kept in first, "no run of this start is here"
+    (newer,) = [row for row in second if row.startswith("| gap | can | the target's | 0 |")]
+    assert "| 100.0" in newer and newer not in first
+    assert newer.split(" | ")[5] == "", "LTS of an older commit does not stand beside it"
+    assert any("gap, can: NSO 75.2" in row and "(commit 1234567, 7654321) |" in row for row in second)
+    assert any(row.startswith("Of 1 run, commit 7654321.") for row in second)
+
+
 def test_our_scores_stand_beside_those_of_the_papers_table():
     shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE), 5, 0)
     assert shown.lines[0].startswith("gap, disjoint: mAP of NSO 75.2")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from finished_runs import dominant, setting
 
-from neural_sim.report.histograms import histogram_figure, histogram_summary, histogram_table, histograms
+from neural_sim.report.entries import table
+from neural_sim.report.histograms import histogram_entries, histogram_figure, histograms
 
 HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
 
@@ -24,10 +25,12 @@ def test_total_variation_has_an_interval_over_seeds():
     assert (spread.distance["learned"].value, spread.distance["learned"].high) == (0.0, 0.0)
     assert spread.distance["initial"].value == pytest.approx(0.84)  # 0.86 - 0.02, of two dominant bins
     assert single.distance["learned"].value == pytest.approx(0.84) and single.distance["learned"].low is None
-    table = histogram_table([spread, single]).splitlines()
-    assert table[2] == "| gap | can | pose | 1 | 4 | 0, 1, 2 | 0.84 (0.84 to 0.84) | 0.00 (0.00 to 0.00) |"
-    assert table[3].endswith("| 0 | 0.84 | 0.84 |")
-    assert histogram_summary([single]) == ["can, pose target 1 from 4: total variation 0.84 to 0.84"]
+    entries = histogram_entries([spread, single])
+    rows = table(entries).splitlines()
+    assert rows[2] == "| gap | can | pose | 1 | 4 | 0, 1, 2 | 0.84 (0.84 to 0.84) | 0.00 (0.00 to 0.00) |"
+    assert rows[3].endswith("| 0 | 0.84 | 0.84 |")
+    assert entries[1].line == "can, pose target 1 from 4: total variation 0.84 to 0.84"
+    assert entries[1].place == ("gap", "can", "pose", "1", "4") and entries[1].commits == ["unknown"]
 
 
 def test_bars_are_the_probabilities():

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from finished_runs import setting
 
-from neural_sim.report.levels import levels_figure, levels_summary, levels_table
+from neural_sim.report.entries import table
+from neural_sim.report.levels import levels_entries, levels_figure
 
 METHODS = (("neural_sim", 0.75), ("lts", 0.5))
 
@@ -30,10 +31,12 @@ def test_targets_are_in_the_order_of_their_bins():
     assert titles == [
         f"gap: {name}, from the {start} start" for start in ("uniform", "disjoint") for name in ("can", "mug")
     ]
-    table = levels_table(made, "target").splitlines()
-    assert [row.split(" | ")[1:4] for row in table[2:6]] == [
+    entries = levels_entries(made, "target")
+    assert [[e.cells[c] for c in ("object", "start", "bins of the target")] for e in entries[:4]] == [
         [name, "uniform", target] for name in ("can", "mug") for target in ("1", "3")
     ]
+    assert sorted(entries, key=lambda entry: entry.place) == entries
+    assert entries[0].line.startswith("gap, can, uniform start, target 1: NSO 75.")
 
 
 @pytest.mark.parametrize("score", ["AP", "accuracy"])
@@ -43,12 +46,13 @@ def test_the_axis_names_what_detectors_and_classifiers_are_scored_by(score):
 
 
 def test_table_and_summary_have_the_scores_of_every_object():
-    made = [setting(gap="same"), setting(gap="disjoint", methods=METHODS)]
-    table = levels_table(made, "gap")
-    head, _, *rows = table.splitlines()
-    assert head == "| experiment | object | initial distribution | seeds | NS | NSO | matched | LTS |"
+    made = [setting(gap="same"), setting(gap="disjoint", methods=METHODS, commit="1234567")]
+    entries = levels_entries(made, "gap")
+    head, _, *rows = table(entries).splitlines()
+    assert head == "| experiment | object | initial distribution | seeds | NS | LTS | NSO | matched |"
     assert len(rows) == 4 and rows[0].startswith("| gap | can | the target's | 0 | 25.")
-    assert rows[0].endswith("|  |"), "LTS was not run at this gap"
-    lines = levels_summary(made, "gap")
+    assert rows[0].split(" | ")[5] == "", "LTS was not run at this gap"
+    assert [entry.commits for entry in entries] == [["unknown"], ["1234567"]] * 2
+    lines = [entry.line for entry in entries if entry.line]
     assert [line.split(":")[0] for line in lines] == ["gap, can", "gap, mug"]
     assert all("NSO 75." in line and "LTS by 2" in line and "matched" not in line for line in lines)

@@ -1,15 +1,27 @@
 """Measured rows: what is written is read at the same scale alone; documents come from the newest finished run."""
 
+import json
+
 import pytest
 
 from neural_sim.report import tracking
 from neural_sim.report.commit import commit
+from neural_sim.report.entries import Entry
 from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
 
 BUDGET = {"views": {"count": 84}, "field": {"batches": [1024, 8192], "background": None}}
 ROWS = {
     "large": Measured(["mAP of NSO 80.0 (70.0 to 90.0)", "ψ"], "| a |\n|---|", ["abc1234"]),
     "small": Measured([], "", []),
+    "gaps": Measured(
+        [],
+        "Costs.",
+        [],
+        (
+            Entry(("pose", "can", 0), {"object": "can", "NS": "1"}, "pose, can: 1", ["abc1234"]),
+            Entry(("pose", "can", 1), {"object": "can", "NS": "2"}, "", ["7654321"]),
+        ),
+    ),
 }
 
 
@@ -25,6 +37,23 @@ def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
 
 def test_the_cell_names_the_commits():
     assert ROWS["large"].cell == "mAP of NSO 80.0 (70.0 to 90.0)<br>ψ<br>(commit abc1234)"
+    assert ROWS["gaps"].cell == "pose, can: 1<br>(commit 7654321, abc1234)"
+    assert ROWS["gaps"].below == "| object | NS |\n|---|---|\n| can | 1 |\n| can | 2 |\n\nCosts."
+    assert ROWS["large"].below == "| a |\n|---|"
+
+
+def test_entries_are_kept_unless_newer_ones_take_their_place():
+    newer = Measured([], "Newer costs.", [], [Entry(("pose", "can", 1), {"object": "can", "NS": "3"})])
+    found = newer.with_kept(ROWS["gaps"], ["pose"])
+    assert found.below.endswith("| can | 1 |\n| can | 3 |\n\nNewer costs.")
+    assert found.cell.endswith("(commit abc1234)"), "that of the entry that is gone is gone with it"
+    assert newer.with_kept(None, ["pose"]).entries == tuple(newer.entries)
+
+
+def test_rows_of_before_there_were_entries_are_read(tmp_path):
+    old = {"budget": BUDGET, "rows": {"large": {"lines": ["a"], "text": "b", "commits": ["c"]}}}
+    (tmp_path / "page.json").write_text(json.dumps(old))
+    assert read_measured(tmp_path / "page.json", BUDGET) == {"large": Measured(["a"], "b", ["c"])}
 
 
 @pytest.fixture

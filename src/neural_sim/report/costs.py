@@ -9,6 +9,7 @@ from statistics import fmean, median
 from typing import Any
 
 from neural_sim.report.finished import FinishedRun
+from neural_sim.report.tracking import UNKNOWN
 
 PHASES: Mapping[str, tuple[str, ...]] = {
     "images": ("pool", "probes", "render", "features"),
@@ -92,7 +93,9 @@ def costs_table(runs: Sequence[FinishedRun]) -> str:
     ]
     for method, cost in costs(runs).items():
         lines.append("| " + " | ".join([method, *cells(cost)]) + " |")
-    return "\n".join([*lines, "", NOTE])
+    commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
+    of = f"Of {len(runs)} run{'s' * (len(runs) > 1)}, commit {', '.join(commits)}."
+    return "\n".join([*lines, "", f"{of} {NOTE}"])
 
 
 def cells(cost: Costs) -> list[str]:

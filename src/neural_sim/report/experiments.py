@@ -16,7 +16,6 @@ from neural_sim.report.layouts import LAYOUTS, Paper
 from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
 from neural_sim.report.selection import LeftOut
 from neural_sim.report.settings import Settings
-from neural_sim.report.tracking import UNKNOWN
 
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
@@ -120,8 +119,8 @@ class Experiments:
 
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
         """experiments.md, experiments.json and figures in ``folder``, and the page where it is asked for; returns the
-        page's text. Only runs with the ``budget`` of ``config`` count. A page keeps what it said of experiments without
-        runs here, from the file beside it."""
+        page's text. Only runs with the ``budget`` of ``config`` count. A page keeps what it said of experiments, and of
+        settings in a table of settings, without runs here, from the file beside it."""
         budget = config["budget"]
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
         rows = {name: Row(**arguments) for name, arguments in self.rows.items()}
@@ -134,7 +133,7 @@ class Experiments:
         made = {name: measured for name, (measured, _, _) in found.items() if measured is not None}
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
         (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n")
-        data = {name: {"command": row.run, "ours": list(made[name].lines) if name in made else None}
+        data = {name: {"command": row.run, "ours": made[name].summary if name in made else None}
                 for name, row in asked.items()}  # fmt: skip
         (folder / "experiments.json").write_text(
             json.dumps({"rows": data, "left_out": [asdict(run) for run in lost]}, indent=1)
@@ -143,6 +142,7 @@ class Experiments:
             text = self._page(asked, made, budget)
         else:
             kept = read_measured(beside(self.page), budget)
+            made = {name: own.with_kept(kept.get(name), rows[name].runs) for name, own in made.items()}
             made = {name: own for name, own in {**kept, **made}.items() if name in rows}
             text = self._page(rows, made, budget)
             write_measured(beside(self.page), budget, made)
@@ -165,8 +165,10 @@ class Experiments:
         shown = LAYOUTS[row.layout](found, table, settings.draws, settings.seed)
         runs = [run for setting in found for run in setting.runs]
         text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
-        commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
-        return Measured(list(shown.lines), text, commits), shown.figures, left_out
+        commits = sorted({commit for setting in found for commit in setting.commits})
+        own = [] if shown.entries else commits
+        measured = Measured(list(shown.lines), text, own, shown.entries).with_kept(None, row.runs)
+        return measured, shown.figures, left_out
 
     def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
@@ -190,7 +192,7 @@ class Experiments:
                 f"| {row.title} | `{row.run}` | {ours} | {'<br>'.join(self._claims(row))} | {row.differs} |"
             )
         for name, row in rows.items():
-            parts = [made[name].text] if name in made and made[name].text else []
+            parts = [made[name].below] if name in made and made[name].below else []
             # A layout sets the paper's table beside ours.
             if row.table and not (parts and row.layout):
                 parts.append(self._tables[row.table].markdown())

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from neural_sim.parameter.distributions import merged
 from neural_sim.report import figures
+from neural_sim.report.entries import Entry
 from neural_sim.report.levels import short
 from neural_sim.report.settings import Setting, modes
 from neural_sim.report.statistics import Estimate, over_seeds
@@ -34,6 +35,7 @@ class Histogram:
     groups: Sequence[Sequence[int]]
     p: Mapping[str, Float[np.ndarray, "seeds groups"]]
     distance: Mapping[str, Estimate]
+    commits: Sequence[str]
 
 
 def histograms(settings: Sequence[Setting], draws: int, seed: int) -> Iterator[Histogram]:
@@ -60,7 +62,9 @@ def _histogram(setting: Setting, name: str, factor: str, draws: int, seed: int) 
     start, aim = (modes(setting.distribution(which, name, factor)) for which in ("initial", "target"))
     seeds = tuple(run["seed"] for run in runs)
     distance = over_seeds(away, draws, seed)
-    return Histogram(setting.experiment, name, factor, start, aim, seeds, groups, p, distance)
+    return Histogram(
+        setting.experiment, name, factor, start, aim, seeds, groups, p, distance, setting.commits
+    )
 
 
 def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
@@ -102,23 +106,15 @@ def distance(estimate: Estimate) -> str:
     return f"{estimate.value:.2f} ({estimate.low:.2f} to {estimate.high:.2f})"
 
 
-def histogram_table(all_of: Sequence[Histogram]) -> str:
+def histogram_entries(all_of: Sequence[Histogram]) -> list[Entry]:
     """Total variation to the target, with 95 % intervals over seeds."""
-    lines = [
-        "| experiment | object | factor | target | start | seeds | initial | learned |",
-        "|" + "---|" * 8,
-    ]
+    made = []
     for h in all_of:
-        cells = [h.experiment, short(h.name), h.factor, h.aim, h.start, ", ".join(map(str, h.seeds))]
-        cells += [distance(h.distance[which]) for which in ("initial", "learned")]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def histogram_summary(all_of: Sequence[Histogram]) -> list[str]:
-    """Total variation before and after, a line each."""
-    return [
-        f"{short(h.name)}, {h.factor} target {h.aim} from {h.start}: total variation "
-        f"{distance(h.distance['initial'])} to {distance(h.distance['learned'])}"
-        for h in all_of
-    ]
+        initial, learned = (distance(h.distance[which]) for which in ("initial", "learned"))
+        cells = {
+            "experiment": h.experiment, "object": short(h.name), "factor": h.factor, "target": h.aim, "start": h.start,
+            "seeds": ", ".join(map(str, h.seeds)), "initial": initial, "learned": learned,
+        }  # fmt: skip
+        line = f"{short(h.name)}, {h.factor} target {h.aim} from {h.start}: total variation {initial} to {learned}"
+        made.append(Entry((h.experiment, h.name, h.factor, h.aim, h.start), cells, line, h.commits))
+    return made

@@ -10,8 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from neural_sim.report.compare import points
-from neural_sim.report.histograms import histogram_figure, histogram_summary, histogram_table, histograms
-from neural_sim.report.levels import Axis, levels_figure, levels_summary, levels_table
+from neural_sim.report.entries import Entry
+from neural_sim.report.histograms import histogram_entries, histogram_figure, histograms
+from neural_sim.report.levels import Axis, levels_entries, levels_figure
 from neural_sim.report.object_scores import MEAN, ObjectScores, called
 from neural_sim.report.photographs import photographs_summary, photographs_table
 from neural_sim.report.settings import Setting
@@ -19,10 +20,12 @@ from neural_sim.report.settings import Setting
 
 @dataclass(frozen=True)
 class Shown:
-    """``lines`` are for the table of all experiments, ``text`` is Markdown below it, ``figures`` are by file name."""
+    """``lines`` are for the table of all experiments, ``text`` is Markdown below it, ``figures`` are by file name.
+    ``entries`` have lines and the rows of a table above the text."""
 
-    lines: Sequence[str]
+    lines: Sequence[str] = ()
     text: str = ""
+    entries: Sequence[Entry] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
@@ -58,14 +61,14 @@ class Paper:
 def _levels(axis: Axis) -> Callable[..., Shown]:
     def show(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
         figure = levels_figure(settings, axis)
-        return Shown(levels_summary(settings, axis), levels_table(settings, axis), {"levels": figure})
+        return Shown(entries=levels_entries(settings, axis), figures={"levels": figure})
 
     return show
 
 
 def _histograms(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
     found = list(histograms(settings, draws, seed))
-    return Shown(histogram_summary(found), histogram_table(found), {"histograms": histogram_figure(found)})
+    return Shown(entries=histogram_entries(found), figures={"histograms": histogram_figure(found)})
 
 
 def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:

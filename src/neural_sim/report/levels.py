@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from neural_sim.report import figures
 from neural_sim.report.compare import points
+from neural_sim.report.entries import Entry
 from neural_sim.report.object_scores import called
 from neural_sim.report.settings import Setting, modes
 
@@ -101,34 +102,31 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str) -> Any:
     )  # fmt: skip
 
 
-def levels_table(settings: Sequence[Setting], axis: Axis) -> str:
-    """The score of every object at every setting, a column a method, in points with 95 % intervals."""
-    methods = list(dict.fromkeys(m for setting in settings for m in setting.scores.methods))
-    head = ["experiment", "object", *(["start"] if axis == "target" else []), LABELS[axis], "seeds"]
-    lines = [
-        "| " + " | ".join([*head, *map(called, methods)]) + " |",
-        "|" + "---|" * (len(head) + len(methods)),
+def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
+    """The score of every object at every setting, a column a method, in points with 95 % intervals. Lines have NSO's
+    score and its lead; over ``gap`` those of the disjoint start alone."""
+    made = []
+    for (experiment, start, name), panel in _panels(settings, axis).items():
+        for label, setting in panel.items():
+            cells = {"experiment": experiment, "object": short(name)}
+            cells |= {"start": start} if axis == "target" else {}
+            cells |= {LABELS[axis]: label, "seeds": ", ".join(map(str, setting.scores.seeds))}
+            cells |= {called(method): points(own[name]) for method, own in setting.scores.ap.items()}
+            starts = ["", *STARTS.values()]
+            place = (experiment, starts.index(start), name, *_order(label, axis))
+            line = (
+                "" if axis == "gap" and setting.gap != "disjoint" else _line_of(setting, name, start, label)
+            )
+            made.append(Entry(place, cells, line, setting.commits))
+    return made
+
+
+def _line_of(setting: Setting, name: str, start: str, label: str) -> str:
+    where = f", {start} start, target {label}" if start else ""
+    ours = points(setting.scores.ap[setting.scores.reference][name])
+    ahead = [
+        f"{called(method)} by {points(own[name])}"
+        for method, own in setting.scores.ahead.items()
+        if method != "matched"
     ]
-    for (experiment, start, name), panel in _panels(settings, axis).items():
-        for label, setting in panel.items():
-            ap = setting.scores.ap
-            cells = [experiment, short(name), *([start] if start else []), label]
-            cells.append(", ".join(map(str, setting.scores.seeds)))
-            cells += [points(ap[method][name]) if method in ap else "" for method in methods]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def levels_summary(settings: Sequence[Setting], axis: Axis) -> list[str]:
-    """NSO's score on each object, and its lead, for each setting; over ``gap`` that of the disjoint start."""
-    lines = []
-    for (experiment, start, name), panel in _panels(settings, axis).items():
-        for label, setting in panel.items():
-            if axis == "gap" and setting.gap != "disjoint":
-                continue
-            where = f", {start} start, target {label}" if axis == "target" else ""
-            ours = points(setting.scores.ap[setting.scores.reference][name])
-            ahead = [f"{called(method)} by {points(own[name])}" for method, own in setting.scores.ahead.items()
-                     if method != "matched"]  # fmt: skip
-            lines.append(f"{experiment}, {short(name)}{where}: NSO {ours}; ahead of {', '.join(ahead)}")
-    return lines
+    return f"{setting.experiment}, {short(name)}{where}: NSO {ours}; ahead of {', '.join(ahead)}"

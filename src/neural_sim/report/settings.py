@@ -13,6 +13,7 @@ from neural_sim.report.finished import Candidate, FinishedRun, candidates, read_
 from neural_sim.report.identity import at_scale, scored_values
 from neural_sim.report.object_scores import ObjectScores, object_scores
 from neural_sim.report.selection import Group, LeftOut, Selection
+from neural_sim.report.tracking import UNKNOWN
 
 AXES = re.compile(r"parameter\.\w+\.(gap|biased)\b|training\.real\.(mode|count|fraction)$")
 """Keys of a configuration in which the settings of one experiment differ: starts and targets of biased objects, and how
@@ -34,6 +35,11 @@ class Setting:
     @property
     def gap(self) -> str:
         return self.runs[0].results["gap"]
+
+    @property
+    def commits(self) -> list[str]:
+        """Of the code of its runs."""
+        return sorted({run.results.get("commit") or UNKNOWN for run in self.runs})
 
     @property
     def of_reference(self) -> list[Mapping[str, Any]]:
