@@ -51,6 +51,36 @@ def test_prose_does_not_count(tmp_path):
     assert code_version(["pack.a"], package(tmp_path / "after", changed)) == before
 
 
+SYNTAX = '''
+async def f(a, /, b: int = 1, *c, d, e=None, **g):
+    """What."""
+    return lambda x: {**g, "y": f"{x!r:>{b}}"}
+
+
+class A(list):
+    @property
+    def h(self):
+        return [u"z", None, ..., 1j, *self]
+'''
+
+
+def test_the_version_is_equal_in_all_versions_of_python(tmp_path):
+    """So stores can be shared: the digest below was the same in 3.11 and 3.13, whose ``ast.dump`` differ."""
+    root = package(tmp_path, {"__init__.py": "", "a.py": SYNTAX})
+    assert code_version(["pack.a"], root) == "7f7f9734c005"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [("f()", "f([])"), ("x = None", "x = 0"), ("[x]", "x"), ("{**x}", "{1: x}")]
+)
+def test_what_a_file_means_counts(tmp_path, before, after):
+    versions = [
+        code_version(["pack.a"], package(tmp_path / name, {"__init__.py": "", "a.py": text}))
+        for name, text in (("before", before), ("after", after))
+    ]
+    assert versions[0] != versions[1]
+
+
 def test_a_plug_in_counts_by_its_own_source(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     versions = []

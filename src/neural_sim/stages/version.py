@@ -71,8 +71,19 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
         else:
             continue
         imports |= {name for name in names if name.split(".")[0] == root.name and _source(name, root)}
-    meaning = hashlib.sha256(ast.dump(_without_docstrings(tree)).encode()).digest()
+    meaning = hashlib.sha256(_text(_without_docstrings(tree)).encode()).digest()
     return _File(meaning, tuple(sorted(imports)))
+
+
+def _text(node: object) -> str:
+    """A syntax tree as text, equal in all versions of Python: newer ones add fields, which are empty unless a file uses
+    them (``ast.dump`` of 3.12 has ``type_params`` of every function)."""
+    if isinstance(node, ast.AST):
+        fields = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
+        return f"{type(node).__name__}({', '.join(f'{name}={_text(value)}' for name, value in fields)})"
+    if isinstance(node, list):
+        return f"[{', '.join(_text(each) for each in node)}]"
+    return repr(node)
 
 
 def _source(name: str, root: Path) -> Path | None:
