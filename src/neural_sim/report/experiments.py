@@ -130,7 +130,9 @@ class Experiments:
         for name, (_, shown, _) in found.items():
             for called, figure in shown.items():
                 figures.save(figure, folder / "figures" / f"{name}_{called}.png")
-        made = {name: measured for name, (measured, _, _) in found.items() if measured is not None}
+        kept = {} if self.page is None else read_measured(beside(self.page), budget)
+        made = {name: measured.with_kept(kept.get(name), rows[name].runs)
+                for name, (measured, _, _) in found.items() if measured is not None}  # fmt: skip
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
         (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n")
         data = {name: {"command": row.run, "ours": made[name].summary if name in made else None}
@@ -141,8 +143,6 @@ class Experiments:
         if self.page is None:
             text = self._page(asked, made, budget)
         else:
-            kept = read_measured(beside(self.page), budget)
-            made = {name: own.with_kept(kept.get(name), rows[name].runs) for name, own in made.items()}
             made = {name: own for name, own in {**kept, **made}.items() if name in rows}
             text = self._page(rows, made, budget)
             write_measured(beside(self.page), budget, made)
@@ -166,17 +166,15 @@ class Experiments:
         runs = [run for setting in found for run in setting.runs]
         text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
         commits = sorted({commit for setting in found for commit in setting.commits})
-        own = [] if shown.entries else commits
-        measured = Measured(list(shown.lines), text, own, shown.entries).with_kept(None, row.runs)
-        return measured, shown.figures, left_out
+        return Measured(list(shown.lines), text, commits, shown.entries), shown.figures, left_out
 
     def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
         lines = [
             "# Experiments",
             "",
-            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments without runs there it "
-            "keeps what it said before.",
+            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
+            "their tables, without runs there it keeps what it said before.",
             "",
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "

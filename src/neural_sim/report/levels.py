@@ -112,8 +112,7 @@ def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
             cells |= {"start": start} if axis == "target" else {}
             cells |= {LABELS[axis]: label, "seeds": ", ".join(map(str, setting.scores.seeds))}
             cells |= {called(method): points(own[name]) for method, own in setting.scores.ap.items()}
-            starts = ["", *STARTS.values()]
-            place = (experiment, starts.index(start), name, *_order(label, axis))
+            place = (experiment, *_rank((experiment, start, name), settings)[1:], *_order(label, axis))
             line = (
                 "" if axis == "gap" and setting.gap != "disjoint" else _line_of(setting, name, start, label)
             )
