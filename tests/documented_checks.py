@@ -13,9 +13,14 @@ from neural_sim.report.tracking import tracking_uri
 
 def check_of(config):
     """The check of a configuration, which takes the folder and the configuration."""
-    alone = {"predict": _predict, "export": _export, "preflight": _preflight, "viewer": _viewer}.get(
-        config["stages"][0]
-    )
+    stages = {
+        "predict": _predict,
+        "export": _export,
+        "preflight": _preflight,
+        "repeat": _repeat,
+        "viewer": _viewer,
+    }
+    alone = stages.get(config["stages"][0])
     whole = _run if "report" in config["stages"] else _stored
     return alone or KINDS.get(next((key for key in KINDS if key in config), ""), whole)
 
@@ -120,6 +125,22 @@ def _preflight(folder, config):
     assert report["verdict"] in page and report["worth"] in page
     counts = {gain["photographs"] for gain in report["labelled"]}
     assert bool(counts) == bool(config["target"].get("train_fraction"))
+
+
+def _repeat(folder, config):
+    """usage.md, the end of Methods and their comparison."""
+    written = json.loads((folder / "repeat.json").read_text())
+    biased, everything, *each = written["groups"]
+    assert set(biased["names"]) == set(config["parameter"]["pose"]["biased"]) < set(everything["names"])
+    assert [[name] for name in everything["names"]] == [group["names"] for group in each]
+    for group in written["groups"]:
+        assert set(group["scores"]) == {"ns", "learned", "matched"} and group["over_images"] >= 0.0
+        assert all(len(scores) == config["repeat"]["trainings"] for scores in group["scores"].values())
+    assert len({tuple(group["scores"]["ns"]) for group in each}) > 1 and everything["between"] > 0.0
+    text = (folder / "repeat.md").read_text()
+    assert "trainings of each distribution" in text and all(
+        f"| {name} |" in text for name in everything["names"]
+    )
 
 
 def _viewer(folder, config):

@@ -87,6 +87,7 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
         ("lts seed 5", "it was not evaluated: it left no detections.json"),
     }
     text = (tmp_path / "compare.md").read_text()
+    assert "Differences in bold exceed the spread" in text
     assert text.startswith("## gap\n") and "views.size is 0, not 1" in text.split("## Left out")[1]
     assert (
         "Seconds are not comparable" not in text and (tmp_path / "figures" / "gap.png").stat().st_size > 5000
@@ -118,6 +119,7 @@ def test_classifiers_are_compared_by_accuracy(uri, tmp_path):
     ahead = comparison.ahead["lts"]
     assert ahead.value == 0.25 and 0.0 <= ahead.low < 0.25 < ahead.high <= 0.75
     text, page = ((tmp_path / "compare" / name).read_text() for name in ("compare.md", "report.html"))
+    assert "**" not in text and "None is in bold: intervals of one seed" in text
     assert "Top-1 accuracy of mug in points" in text and "| method | accuracy |" in text
     assert "neural_sim reaches 75.0 points of accuracy" in page
     assert "AP" not in text and "<th>AP" not in page

@@ -1,6 +1,7 @@
 """AP of several sources: means, paired intervals, the table and what is written."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,9 @@ def test_the_table_and_the_files_have_every_source(tmp_path, uri):
     text = table(result, "A heading.")
     assert "| single | 48 | 100.0 (100.0 to 100.0) |" in text and "nerf ahead of other by" in text
     assert "| single, mug | 100.0 | 100.0 | 0.0 |" in text
+    assert "| **50.0** (" in text and "Differences in bold exceed the spread." in text
+    one = table(replace(result, seeds=(0,)), "A heading.")
+    assert "**" not in one and "bold" not in one and "intervals over test images; seed 0." in one
     run = report_side_by_side(
         result, shown, ["can", "mug"], "A heading.", "nerf_vs_mesh", {"seed": 0}, uri, tmp_path / "run", 0.0
     )

@@ -160,8 +160,8 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
     for bound in c.bounds:
         lines.append(f"| {bound} | {points(c.ap[bound])} | | | | | | | |")
     for method in c.methods:
-        ahead = points(c.ahead[method], sure=True) if method in c.ahead else ""
-        area = points(c.area[method], sure=True) if method in c.area else ""
+        ahead = points(c.ahead[method], sure=count > 1) if method in c.ahead else ""
+        area = points(c.area[method], sure=count > 1) if method in c.area else ""
         won = points(c.won_back[method], "%") if method in c.won_back else ""
         spent = c.spent[method]
         lines.append(
@@ -169,7 +169,10 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
             f"| {points(c.at_equal_cost[method])} "
             f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent[c.clock]:.0f} |"
         )
-    lines += ["", "Differences in bold exceed the spread: their interval leaves 0 out. Images, steps and seconds "
+    bold = "Differences in bold exceed the spread: their interval leaves 0 out. "
+    if count == 1:
+        bold = "None is in bold: intervals of one seed leave out how much trainings differ. "
+    lines += ["", f"{bold}Images, steps and seconds "
               "include the warm start, whose backbone every loop trains on; fields, which all methods share, and the "
               "labelled validation images are not counted. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
@@ -187,7 +190,7 @@ def _leads(c: Comparison, unit: str) -> list[str]:
         + " |"
     )
     rows = [
-        f"| {method} | " + " | ".join(points(lead, sure=True) for lead in leads) + " |"
+        f"| {method} | " + " | ".join(points(lead, sure=len(c.seeds) > 1) for lead in leads) + " |"
         for method, leads in c.ahead_at.items()
     ]
     note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."

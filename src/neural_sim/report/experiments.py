@@ -178,8 +178,10 @@ class Experiments:
             "",
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
-            "set, in points; brackets are 95 % bootstrap intervals over seeds and test images. NS is no optimisation, "
-            "NSO is `baseline=neural_sim`. Line numbers are those of the paper's LaTeX source.",
+            "set, in points; brackets are 95 % bootstrap intervals over seeds and test images. Where there is one "
+            "seed, they are over test images alone, and another training may differ by more (docs/results.md, The "
+            "same training again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
+            "paper's LaTeX source.",
             "",
             "| the paper's experiment | command | ours | the paper | what differs |",
             "|---|---|---|---|---|",

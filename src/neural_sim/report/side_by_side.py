@@ -71,7 +71,8 @@ def table(found: SideBySide, heading: str) -> str:
     over = "seeds and test images" if count > 1 else "test images"
     lines = [
         f"{heading} AP (0.50 to 0.95) in points, mean of all classes, with 95 % bootstrap intervals over {over}; "
-        f"seed{'s' if count > 1 else ''} {', '.join(map(str, found.seeds))}. Differences in bold exceed the spread.",
+        f"seed{'s' if count > 1 else ''} {', '.join(map(str, found.seeds))}."
+        + (" Differences in bold exceed the spread." if count > 1 else ""),
         "",
         "| test images | number | "
         + " | ".join(found.sources)
@@ -81,7 +82,7 @@ def table(found: SideBySide, heading: str) -> str:
     ]
     for kind, row in found.ap.items():
         cells = [points(row[source]) for source in found.sources]
-        cells += [points(found.ahead[kind][other], sure=True) for other in others]
+        cells += [points(found.ahead[kind][other], sure=count > 1) for other in others]
         lines.append(f"| {kind} | {found.images[kind]} | " + " | ".join(cells) + " |")
     lines += ["", "| test images, class | " + " | ".join(found.sources) + " |"]
     lines += ["|---|" + "---|" * len(found.sources)]

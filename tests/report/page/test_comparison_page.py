@@ -1,6 +1,7 @@
 """The page of a comparison, on estimates that are given."""
 
 import re
+from dataclasses import replace
 
 import pytest
 from matplotlib.figure import Figure
@@ -32,6 +33,8 @@ def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
         "ours reaches 50.0 AP (40.0 to 60.0), ahead of first by 20.0, behind second by 10.0, "
         "not told apart from third."
     )
+    one = verdict(replace(comparison, seeds=(3,)))
+    assert one.endswith("from third; one seed, so that how much trainings differ is not in this.")
 
 
 def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
@@ -51,3 +54,11 @@ def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
     row = page.split("<tr><th>ours ahead after so many s, of</th>")[1]
     assert re.match(r'<th class="n">5</th><th class="n">60</th></tr>\s*<tr><th>first</th>\s*<td>\s*5\.0', row)
     assert re.search(r'<td class="accepted">\s*15\.0 <span class="note">\(11\.0 to 20\.0\)', row)
+    assert "by resampling seeds and test images" in page
+
+
+def test_differences_of_one_seed_do_not_stand_out(comparison, tmp_path):
+    section = Section(replace(comparison, seeds=(0,)), Figure(figsize=(2, 2)), "", ["mug"], {})
+    page = write_comparison_page([section], {}, tmp_path).read_text()
+    assert 'class="accepted"' not in page and 'class="rejected"' not in page
+    assert "by resampling test images alone" in page and re.search(r"<td>\s*20\.0", page)

@@ -64,7 +64,7 @@ class Section:
 
 def verdict(comparison: Comparison) -> str:
     """Whom the reference method is ahead of by AP at the end, with intervals; methods whose interval includes 0 are
-    named as not told apart."""
+    named as not told apart. Of one seed it says that intervals leave out how much trainings differ."""
     c = comparison
     reached = c.ap[c.reference]
     head = f"{c.reference} reaches {100 * reached.value:.1f} {POINTS[c.score]} ({interval(reached)})"
@@ -79,7 +79,8 @@ def verdict(comparison: Comparison) -> str:
     untold = [m for m, e in c.ahead.items() if not e.certain]
     if untold:
         parts.append(f"not told apart from {listed(untold)}")
-    return head + "".join(f", {part}" for part in parts) + "."
+    one = "; one seed, so that how much trainings differ is not in this" if len(c.seeds) == 1 else ""
+    return head + "".join(f", {part}" for part in parts) + one + "."
 
 
 def write_comparison_page(sections: Sequence[Section], left_out: dict[str, list[str]], folder: Path) -> Path:

@@ -93,13 +93,13 @@ class Resampled:
     def gain(self, names: Sequence[str], labels: Sequence[int], same_target: bool) -> Gain:
         """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
         the target's distribution is the initial one."""
-        point, spread = (_mean(part[..., list(labels)]) for part in (self.point, self.spread))
+        point, spread = (mean_of_known(part[..., list(labels)]) for part in (self.point, self.spread))
         gain, *room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
         ap = dict(zip(self.which, point.tolist(), strict=True))
         return Gain(tuple(names), ap, gain, None if same_target or not room else room[0])
 
 
-def _mean(ap: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
+def mean_of_known(ap: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
     """Over the classes with a value; nan where none has one."""
     known = ~np.isnan(ap)
     counts = known.sum(-1)
