@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from neural_sim.checks import at_least
 from neural_sim.report.bootstrap import Outcomes, match
@@ -94,6 +95,6 @@ def _seeded(stage: TrainedStage, by: int) -> TrainedStage:
     raise TypeError(f"repeat: a training that has no seed, {type(stage).__name__}")
 
 
-def _document(group: Repeated) -> dict[str, object]:
+def _document(group: Repeated) -> dict[str, Any]:
     ahead = {f"{a} - {b}": dataclasses.asdict(estimate) for (a, b), estimate in group.ahead.items()}
     return dataclasses.asdict(group) | {"ahead": ahead}
