@@ -122,7 +122,8 @@ def _estimate(
 
 def sentence(found: Repeated, score: Score) -> str:
     """The verdict on the learned distribution, after as many trainings."""
-    return f"After {len(found.scores['ns'])} trainings of each distribution: {verdict(found.gain, score)}"
+    trainings = len(found.scores["ns"])
+    return f"After {trainings} trainings of each distribution: {verdict(found.gain, score, trainings)}"
 
 
 def table(found: Sequence[Repeated], score: Score) -> str:

@@ -36,8 +36,11 @@ def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
     # The binomial interval of 24 - 8 of 40 images: 0.4 +- 1.96 sqrt(0.4 0.6 / 40).
     assert better.gain.low == pytest.approx(0.4 - 1.96 * (0.4 * 0.6 / 40) ** 0.5, abs=0.06)
     assert better.closed == pytest.approx(16 / 24, abs=0.03)
-    text = verdict(better)
+    text = verdict(better, trainings=2)
     assert text.startswith("It worked") and "on mug" in text and f"{better.closed:.0%}" in text
+    one = verdict(better)
+    assert one.startswith("In one training of each, the learned distribution gave") and "more on mug" in one
+    assert f"({interval(better.gain)} over test images), from" in one and f"{better.closed:.0%}" in one
 
 
 def test_a_gain_without_a_known_target_has_no_room():
@@ -55,9 +58,12 @@ def test_a_class_without_boxes_is_in_no_mean():
 
 def test_a_loss_is_called_one():
     worse = gain(24, 8, 32)
-    assert worse.outcome == "worse" and verdict(worse).startswith("It made things worse")
+    assert worse.outcome == "worse" and verdict(worse, trainings=2).startswith("It made things worse")
     lost, least, most = (-100 * value for value in (worse.gain.value, worse.gain.high, worse.gain.low))
-    assert f"costs {lost:.1f} AP on mug ({least:.1f} to {most:.1f})" in verdict(worse) and 0 < least < most
+    several, one = verdict(worse, trainings=2), verdict(worse)
+    assert f"costs {lost:.1f} AP on mug ({least:.1f} to {most:.1f})." in several and 0 < least < most
+    assert one.startswith("In one training of each") and "worse" not in one
+    assert f"gave {lost:.1f} AP less on mug ({least:.1f} to {most:.1f} over test images)." in one
 
 
 def test_what_cannot_be_told_is_not_claimed():

@@ -1,4 +1,4 @@
-"""report.html of a run: whether it worked, what was learned, how far to trust it, what it cost, what to do next."""
+"""report.html of a run: what was gained, what was learned, how far to trust it, what it cost, what to do next."""
 
 from __future__ import annotations
 
@@ -85,7 +85,6 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
             results=results,
             verdict=verdict(gains.get("aim"), results.score),
             points=POINTS[results.score],
-            outcome=gains["aim"].outcome if gains else "not scored",
             others=gains.get("others"),
             lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
             psi=_psi(results),

@@ -15,7 +15,7 @@ from neural_sim.report.bootstrap import class_score, match
 from neural_sim.report.statistics import Estimate, with_intervals
 from neural_sim.types import LabelledImages
 
-Outcome = Literal["better", "worse", "no difference", "not scored"]
+Outcome = Literal["better", "worse", "no difference"]
 WHICH: tuple[str, ...] = ("ns", "learned", "matched")
 PERCENT = 100.0
 POINTS: dict[Score, str] = {"AP": "AP", "accuracy": "points of accuracy"}
@@ -124,18 +124,27 @@ def negated(estimate: Estimate) -> Estimate:
     return Estimate(-estimate.value, low, high)
 
 
-def verdict(gain: Gain | None, score: Score = "AP") -> str:
-    """One sentence for the top of the page; ``score`` is what ``gain`` is of."""
+def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1) -> str:
+    """One sentence for the top of the page; ``score`` is what ``gain`` is of.
+
+    Whether it worked is said of several trainings alone. The interval of one is over test images, and trainings on
+    distributions that are as good as each other often differ by more.
+    """
     if gain is None:
         return "The detectors were not scored on test images, so whether it worked is not known."
     points, bounds, who = PERCENT * gain.gain.value, interval(gain.gain), listed(gain.names)
     change = f"{abs(points):.1f} {POINTS[score]}"
     reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
+    one = "In one training of each, the learned distribution gave"
     if gain.outcome == "better":
-        text = f"It worked: training on the learned distribution gives {change} more on {who} ({bounds})"
-        return f"{text}, from {reached}{_of_the_room(gain)}."
+        several = "It worked: training on the learned distribution gives"
+        text = f"{several if trainings > 1 else one} {change} more on {who}"
+        over = bounds if trainings > 1 else f"{bounds} over test images"
+        return f"{text} ({over}), from {reached}{_of_the_room(gain)}."
     if gain.outcome == "worse":
         bounds = interval(negated(gain.gain))
+        if trainings == 1:
+            return f"{one} {change} less on {who} ({bounds} over test images)."
         return (
             f"It made things worse: training on the learned distribution costs {change} on {who} ({bounds})."
         )
