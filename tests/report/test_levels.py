@@ -25,6 +25,15 @@ def test_a_panel_is_an_object_and_a_line_a_method_over_the_gaps_in_their_order()
     assert [text.get_text() for text in figure.legends[0].texts] == ["NS", "LTS", "NSO", "matched"]
 
 
+def test_one_setting_shows_every_method_beside_the_others_and_a_dash_for_matched():
+    (axes, _) = levels_figure([setting(gap="same", methods=METHODS)], "gap").axes
+    lines = [line.lines[0] for line in axes.containers]
+    places = [line.get_xdata()[0] for line in lines if line.get_marker() == "o"]
+    assert len({round(float(x), 6) for x in places}) == len(places) == 3
+    (matched,) = [line for line in lines if line.get_marker() == "_"]
+    assert matched.get_xdata() == [0] and matched.get_markersize() > 10
+
+
 def test_targets_are_in_the_order_of_their_bins():
     made = [setting(gap=gap, target=target) for target in (3, 1) for gap in ("disjoint", "uniform")]
     titles = [axes.get_title() for axes in levels_figure(made, "target").axes]

@@ -20,6 +20,8 @@ Axis = Literal["gap", "target"]
 STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
 COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
 """As in the paper's Fig. 5."""
+APART = 0.03
+"""Between methods, of the distance between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}
 
 
@@ -70,8 +72,10 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
     handles: dict[str, Any] = {}
     for number, ((experiment, start, name), panel) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(rows, columns, number)
-        for method in dict.fromkeys(m for setting in panel.values() for m in setting.scores.methods):
-            handles.setdefault(called(method), _line(axes, list(panel.values()), name, method))
+        methods = list(dict.fromkeys(m for setting in panel.values() for m in setting.scores.methods))
+        for i, method in enumerate(methods):
+            aside = APART * (i - (len(methods) - 1) / 2)
+            handles.setdefault(called(method), _line(axes, list(panel.values()), name, method, aside))
         title = short(name) + (f", from the {start} start" if start else "")
         axes.set_title(f"{experiment}: {title}", fontsize=9, color=figures.INK)
         axes.set_xticks(range(len(panel)), list(panel))
@@ -86,8 +90,9 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
     return figure
 
 
-def _line(axes: Any, panel: Sequence[Setting], name: str, method: str) -> Any:
-    """One method's line; settings that it was not run on are gaps in it."""
+def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
+    """One method's line, ``aside`` of the ticks so that intervals do not hide each other; settings that it was not run
+    on are gaps in it. Matched has a dash at every setting, which shows where there is only one."""
     found = [setting.scores.ap.get(method, {}).get(name) for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
     low, high = (
@@ -97,7 +102,8 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str) -> Any:
     spread = np.nan_to_num(np.abs(np.stack([values - low, high - values])))
     bound = method == "matched"
     return axes.errorbar(
-        range(len(panel)), values, None if bound else spread, fmt="--" if bound else "o-", markersize=3.5,
+        np.arange(len(panel)) + (0.0 if bound else aside), values, None if bound else spread,
+        fmt="_--" if bound else "o-", markersize=24.0 if bound else 3.5,
         color=COLOURS.get(method, figures.MUTED if bound else "#7b5cc4"), linewidth=1.2, capsize=2,
     )  # fmt: skip
 
