@@ -1,20 +1,15 @@
 """Means, scatter and intervals of trainings whose scores are known."""
 
+import numpy as np
 import pytest
-import torch
+from finished_runs import IMAGES, matches
 from scipy.stats import t as student
 
-from neural_sim.report.bootstrap import match
+from neural_sim.report.bootstrap import THRESHOLDS, Matches
 from neural_sim.report.repeat import repeated, sentence, table
-from neural_sim.types import LabelledImages
 
-IMAGES = 40
-BOX = torch.tensor([[2.0, 2.0, 12.0, 12.0]])
-TEST = LabelledImages(
-    torch.zeros(IMAGES, 3, 16, 16),
-    BOX.expand(IMAGES, 1, 4),
-    torch.zeros(IMAGES, 1).long(),
-    torch.zeros(IMAGES).long(),
+NONE = Matches(
+    np.zeros(0, dtype=int), np.zeros((0, len(THRESHOLDS)), dtype=bool), np.zeros(IMAGES, dtype=int)
 )
 T2 = student.ppf(0.975, 2)
 
@@ -22,25 +17,13 @@ T2 = student.ppf(0.975, 2)
 def overlapping(tenths):
     """Every image has one detection, whose overlap is right at ``tenths`` of the ten thresholds from 0.5: AP is that
     fraction, whichever images are drawn."""
-    height = 10.0 * (0.475 + 0.05 * tenths)
-    box = BOX.clone()
-    box[0, 3] = box[0, 1] + height
-    return [{"boxes": box, "labels": torch.zeros(1).long(), "scores": torch.ones(1)}] * IMAGES
-
-
-def hitting(hits):
-    """Exact detections on the first ``hits`` images and none on the others: AP is about that fraction."""
-    one = {"boxes": BOX, "labels": torch.zeros(1).long(), "scores": torch.ones(1)}
-    none = {key: value[:0] for key, value in one.items()}
-    return [one] * hits + [none] * (IMAGES - hits)
+    correct = np.tile(np.arange(len(THRESHOLDS)) < tenths, (IMAGES, 1))
+    return Matches(np.arange(IMAGES), correct, np.ones(IMAGES, dtype=int))
 
 
 def of(groups=((["mug"], [0]),), **trainings):
-    """By distribution, from each training's detections; the second class has no box."""
-    matches = {
-        w: [[match(d, TEST, label) for label in (0, 1)] for d in each] for w, each in trainings.items()
-    }
-    return repeated(matches, groups, draws=400)
+    """By distribution, from each training's matches of the first class; the second has no box."""
+    return repeated({w: [[m, NONE] for m in each] for w, each in trainings.items()}, groups, draws=400)
 
 
 def half(estimate):
@@ -67,19 +50,19 @@ def test_what_all_trainings_gain_is_certain_however_they_scatter():
 
 
 def test_the_scatter_over_images_does_not_shrink_with_the_number_of_trainings():
-    few, many = (of(ns=[hitting(20)] * n, learned=[hitting(30)] * n)[0] for n in (2, 6))
+    few, many = (of(ns=[matches(0.5)] * n, learned=[matches(0.75)] * n)[0] for n in (2, 6))
     binomial = (0.5 * 0.5 / IMAGES) ** 0.5
     for found in (few, many):
         assert half(found.mean["ns"]) == pytest.approx(1.96 * binomial, rel=0.15)
         assert found.between < 1e-12 and found.over_images == pytest.approx(binomial, rel=0.15)
-        # 10 of 40 images tell them apart.
+        # A quarter of the images tells them apart.
         assert half(found.ahead["learned", "ns"]) == pytest.approx(
             1.96 * (0.25 * 0.75 / IMAGES) ** 0.5, rel=0.15
         )
 
 
 def test_both_parts_add_as_squares():
-    (found,) = of(ns=map(hitting, (16, 20, 24)), learned=[hitting(20)] * 3)
+    (found,) = of(ns=map(matches, (0.4, 0.5, 0.6)), learned=[matches(0.5)] * 3)
     images = half(found.mean["learned"])
     assert half(found.mean["ns"]) == pytest.approx((images**2 + (T2 * 0.1) ** 2 / 3) ** 0.5, rel=0.1)
 
@@ -102,4 +85,4 @@ def test_a_class_without_boxes_is_in_no_mean_and_the_target_sets_the_room():
 @pytest.mark.parametrize("counts", [(1, 1), (2, 3)])
 def test_trainings_that_tell_no_scatter_are_refused(counts):
     with pytest.raises(ValueError, match="want two trainings or more"):
-        of(ns=[hitting(20)] * counts[0], learned=[hitting(20)] * counts[1])
+        of(ns=[matches(0.5)] * counts[0], learned=[matches(0.5)] * counts[1])

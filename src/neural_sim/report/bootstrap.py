@@ -106,3 +106,17 @@ def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | N
         at = np.searchsorted(recall[:, t], RECALLS, side="left")
         values.append(precision[at[at < len(recall)], t].sum() / len(RECALLS))
     return float(np.mean(values))
+
+
+def class_scores(
+    rows: Sequence[Sequence[Outcomes]], draws: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "rows classes"], Float[np.ndarray, "draws rows classes"]]:
+    """Scores of several detectors (rows) by class on one test set, as they are and under resampled images, which are
+    the same for all, so that differences between any of them are paired."""
+    random, count = np.random.default_rng(seed), len(rows[0][0].boxes_per_image)
+
+    def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[float]]:
+        return [[class_score(outcomes, weights) for outcomes in row] for row in rows]
+
+    weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
+    return np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights])

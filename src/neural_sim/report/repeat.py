@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.stats import t as student
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import Outcomes, class_score
+from neural_sim.report.bootstrap import Outcomes, class_scores
 from neural_sim.report.compare import points
 from neural_sim.report.page.verdict import Gain, mean_of_known, verdict
 from neural_sim.report.statistics import Estimate
@@ -75,14 +75,9 @@ def repeated(
     if len(trainings) != 1 or min(trainings) < 2:
         raise ValueError(f"repeat: want two trainings or more of each distribution, got {sorted(trainings)}")
 
-    def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[list[float]]]:
-        return [[[class_score(m, weights) for m in row] for row in matches[w]] for w in which]
-
-    count, random = len(matches[which[0]][0][0].boxes_per_image), np.random.default_rng(seed)
-    drawn = (
-        np.bincount(random.integers(count, size=count), minlength=count).astype(float) for _ in range(draws)
-    )
-    point, spread = np.asarray(scored(None)), np.asarray([scored(weights) for weights in drawn])
+    n = min(trainings)
+    point, spread = class_scores([row for w in which for row in matches[w]], draws, seed)
+    point, spread = (part.reshape(*part.shape[:-2], len(which), n, -1) for part in (point, spread))
     return [
         _of_group(names, which, point[..., list(labels)], spread[..., list(labels)])
         for names, labels in groups

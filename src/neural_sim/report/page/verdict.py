@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import class_score, match
+from neural_sim.report.bootstrap import class_scores, match
 from neural_sim.report.statistics import Estimate, with_intervals
 from neural_sim.types import LabelledImages
 
@@ -70,20 +70,12 @@ class Resampled:
         draws: int = 200,
         score: Score = "AP",
     ) -> Resampled:
-        """All classes under the same resampled images, so that differences between any of them are paired."""
+        """All classes and detectors under the same resampled images."""
         known = tuple(which for which in WHICH if which in detections)
         matches = [
             [match(detections[which], test, label, score) for label in range(classes)] for which in known
         ]
-        random, count = np.random.default_rng(0), len(test)
-
-        def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[float]]:
-            return [[class_score(m, weights) for m in row] for row in matches]
-
-        weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
-        return Resampled(
-            known, np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights])
-        )
+        return Resampled(known, *class_scores(matches, draws))
 
     @property
     def present(self) -> list[int]:
