@@ -150,7 +150,7 @@ def test_a_page_keeps_settings_without_runs_here_beside_those_with(page, tmp_pat
 
 
 def test_our_scores_stand_beside_those_of_the_papers_table():
-    shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE), 5, 0)
+    shown = LAYOUTS["objects"](MEASURED["gap"][1:], Paper(**TABLE))
     assert shown.lines[0].startswith("gap, disjoint: mAP of NSO 75.2")
     head, _, mean, can, mug = shown.text.splitlines()[2:]
     assert head == "|  | NS, ours | LTS, ours | NSO, ours | matched, ours | NS, the paper | NSO, the paper |"
@@ -159,7 +159,7 @@ def test_our_scores_stand_beside_those_of_the_papers_table():
 
 
 def test_seconds_of_an_iteration_and_of_a_field_count_stored_fields():
-    (line,) = LAYOUTS["seconds"]([setting(seeds=(0, 1))], None, 5, 0).lines
+    (line,) = LAYOUTS["seconds"]([setting(seeds=(0, 1))], None).lines
     # Phases hypergradient_* are within hypergradient: 2 + 3. Two objects' fields took 1 s now and 5 s when stored.
     assert line == "gap, disjoint: an iteration takes 5.0 s, an object's field 3.0 s"
 
@@ -168,7 +168,7 @@ def test_seconds_that_differ_are_a_median_and_a_range():
     measured = setting(seeds=(0, 1))
     for factor, run in enumerate(measured.of_reference, start=1):
         run["seconds"]["field"] *= factor
-    (line,) = LAYOUTS["seconds"]([measured], None, 5, 0).lines
+    (line,) = LAYOUTS["seconds"]([measured], None).lines
     assert line.endswith("an object's field 3.2 (3.0 to 3.5) s")
 
 

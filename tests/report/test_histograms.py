@@ -12,7 +12,7 @@ HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
 
 def test_bins_that_look_the_same_are_one():
     groups = {"can": {"pose": [[1, 8], [2, 7], [3, 6], [4, 5]]}}
-    can, mug = histograms([setting(learned=HALF, symmetric_bins=groups)], draws=10, seed=0)
+    can, mug = histograms([setting(learned=HALF, symmetric_bins=groups)])
     assert (can.name, can.start, can.aim, can.factor) == ("can", "4", "1", "pose")
     assert can.p["learned"].tolist() == [[1.0, 0.0, 0.0, 0.0]]
     assert can.p["target"] == pytest.approx(np.array([[0.88, 0.04, 0.04, 0.04]]))
@@ -21,7 +21,7 @@ def test_bins_that_look_the_same_are_one():
 
 def test_total_variation_has_an_interval_over_seeds():
     runs = [setting(seeds=(0, 1, 2)), setting(seeds=(0,), learned=dominant(2))]
-    spread, single = list(histograms(runs, draws=50, seed=0))[::2]
+    spread, single = list(histograms(runs))[::2]
     assert (spread.distance["learned"].value, spread.distance["learned"].high) == (0.0, 0.0)
     assert spread.distance["initial"].value == pytest.approx(0.84)  # 0.86 - 0.02, of two dominant bins
     assert single.distance["learned"].value == pytest.approx(0.84) and single.distance["learned"].low is None
@@ -34,7 +34,7 @@ def test_total_variation_has_an_interval_over_seeds():
 
 
 def test_bars_are_the_probabilities():
-    figure = histogram_figure(list(histograms([setting(learned=HALF)], draws=5, seed=0)))
+    figure = histogram_figure(list(histograms([setting(learned=HALF)])))
     axes = figure.axes[0]
     initial, learned, target = [[bar.get_height() for bar in bars.patches] for bars in axes.containers]
     assert (

@@ -109,14 +109,30 @@ def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | N
 
 
 def class_scores(
-    rows: Sequence[Sequence[Outcomes]], draws: int, seed: int = 0
-) -> tuple[Float[np.ndarray, "rows classes"], Float[np.ndarray, "draws rows classes"]]:
-    """Scores of several detectors (rows) by class on one test set, as they are and under resampled images, which are
-    the same for all, so that differences between any of them are paired."""
-    random, count = np.random.default_rng(seed), len(rows[0][0].boxes_per_image)
+    matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "groups rows classes"], Float[np.ndarray, "draws groups rows classes"]]:
+    """Scores of ``matches`` [group][detector][class], as they are and under resampled test images.
 
-    def scored(weights: Float[np.ndarray, "images"] | None) -> list[list[float]]:
-        return [[class_score(outcomes, weights) for outcomes in row] for row in rows]
+    Detectors scored on as many images have the same ones resampled, so that differences between those that share a
+    test set are paired.
+    """
+    random = np.random.default_rng(seed)
+    counts = sorted({len(outcomes.boxes_per_image) for group in matches for row in group for outcomes in row})
 
-    weights = (np.bincount(random.integers(count, size=count), minlength=count) for _ in range(draws))
-    return np.asarray(scored(None)), np.asarray([scored(w.astype(float)) for w in weights])
+    def scored(weights: Mapping[int, Float[np.ndarray, "images"] | None]) -> list[list[list[float]]]:
+        return [
+            [[class_score(o, weights[len(o.boxes_per_image)]) for o in row] for row in g] for g in matches
+        ]
+
+    def drawn() -> dict[int, Float[np.ndarray, "images"]]:
+        return {n: np.bincount(random.integers(n, size=n), minlength=n).astype(float) for n in counts}
+
+    point = np.asarray(scored(dict.fromkeys(counts)))
+    return point, np.asarray([scored(drawn()) for _ in range(draws)])
+
+
+def mean_of_known(scores: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
+    """Over the classes with a value; nan where none has one."""
+    known = ~np.isnan(scores)
+    counts = known.sum(-1)
+    return np.where(counts, np.where(known, scores, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)

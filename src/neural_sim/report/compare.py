@@ -14,9 +14,10 @@ from neural_sim.report import figures, logged, tracking
 from neural_sim.report.costs import costs, costs_table
 from neural_sim.report.curves import curves
 from neural_sim.report.finished import FinishedRun, candidates, read_run
+from neural_sim.report.intervals import Estimate
 from neural_sim.report.page.comparison_page import Section, write_comparison_page
 from neural_sim.report.selection import Group, LeftOut, Selection
-from neural_sim.report.statistics import Clock, Comparison, Estimate, compare
+from neural_sim.report.statistics import Clock, Comparison, compare
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Compare:
         experiments: MLflow experiments whose runs are compared, each by itself and at each gap.
         reference: the method that the others are compared with.
         methods: these; null: all that have runs. Seeds are those that all of them have.
-        draws: of the bootstrap.
+        draws: of the bootstrap over test images.
         clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
 
     Raises:
@@ -149,8 +150,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         f"## {c.setting}" + (f": {heading}" if heading else ""),
         f"Seed{'s' if count > 1 else ''} {', '.join(map(str, c.seeds))}; "
         f"{IN_FULL[c.score]} of {', '.join(runs[0].results['biased'])} in points, "
-        "with 95 % bootstrap intervals over seeds and test images"
-        + (" (one seed: over images alone)." if count == 1 else "."),
+        f"with 95 % intervals over {'seeds and test images' if count > 1 else 'test images alone'}.",
         *_on_other_devices(runs),
         "",
         f"| method | {c.score} | of the gap closed | {c.reference} ahead by | area ahead by "
@@ -175,6 +175,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
     lines += ["", f"{bold}Images, steps and seconds "
               "include the warm start, whose backbone every loop trains on; fields, which all methods share, and the "
               "labelled validation images are not counted. "
+              "The fraction closed has no interval where the gap's own includes 0. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
               "iterations linear in log seconds.", ""]  # fmt: skip
     return "\n".join([*lines, *_leads(c, unit), *_distances(c, runs), "", costs_table(runs)])

@@ -87,7 +87,7 @@ class Experiments:
         only: names of the rows to read runs of; null: all.
         page: where the page goes besides the run's folder, with all rows; null: nowhere.
         reference: the method that the others are compared with.
-        draws: of the bootstrap.
+        draws: of the bootstrap over test images.
 
     Raises:
         ValueError: an unknown row, claim or table, or fewer than two draws.
@@ -162,7 +162,7 @@ class Experiments:
         if not found:
             return None, {}, left_out
         table = self._tables.get(row.table) if row.table else None
-        shown = LAYOUTS[row.layout](found, table, settings.draws, settings.seed)
+        shown = LAYOUTS[row.layout](found, table)
         runs = [run for setting in found for run in setting.runs]
         text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
         commits = sorted({commit for setting in found for commit in setting.commits})
@@ -178,9 +178,9 @@ class Experiments:
             "",
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
-            "set, in points; brackets are 95 % bootstrap intervals over seeds and test images. Where there is one "
-            "seed, they are over test images alone, and another training may differ by more (docs/results.md, The "
-            "same training again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
+            "set, in points; brackets are 95 % intervals over seeds and test images. Where there is one seed, they "
+            "are over test images alone, and another training may differ by more (docs/results.md, The same training "
+            "again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
             "paper's LaTeX source.",
             "",
             "| the paper's experiment | command | ours | the paper | what differs |",

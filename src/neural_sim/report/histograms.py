@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from neural_sim.parameter.distributions import merged
 from neural_sim.report import figures
 from neural_sim.report.entries import Entry
+from neural_sim.report.intervals import Estimate, over_seeds
 from neural_sim.report.levels import short
 from neural_sim.report.settings import Setting, modes
-from neural_sim.report.statistics import Estimate, over_seeds
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class Histogram:
     commits: Sequence[str]
 
 
-def histograms(settings: Sequence[Setting], draws: int, seed: int) -> Iterator[Histogram]:
+def histograms(settings: Sequence[Setting]) -> Iterator[Histogram]:
     """Of the reference method's runs, for every biased object and factor."""
     for setting in settings:
         for name in setting.scores.objects:
             for factor in setting.factors(name):
-                yield _histogram(setting, name, factor, draws, seed)
+                yield _histogram(setting, name, factor)
 
 
-def _histogram(setting: Setting, name: str, factor: str, draws: int, seed: int) -> Histogram:
+def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
     runs = setting.of_reference
     own = [run["psi"][name][factor] for run in runs]
     bins = range(1, len(own[0]["target"]) + 1)
@@ -55,13 +55,12 @@ def _histogram(setting: Setting, name: str, factor: str, draws: int, seed: int) 
         which: merged(torch.tensor([each[which] for each in own]), groups).numpy()
         for which in ("initial", "learned", "target")
     }
-    away = {
-        which: [run["total_variation"][name][factor][which] for run in runs]
+    distance = {
+        which: over_seeds(np.asarray([run["total_variation"][name][factor][which] for run in runs]))
         for which in ("initial", "learned")
     }
     start, aim = (modes(setting.distribution(which, name, factor)) for which in ("initial", "target"))
     seeds = tuple(run["seed"] for run in runs)
-    distance = over_seeds(away, draws, seed)
     return Histogram(
         setting.experiment, name, factor, start, aim, seeds, groups, p, distance, setting.commits
     )

@@ -59,19 +59,19 @@ class Paper:
 
 
 def _levels(axis: Axis) -> Callable[..., Shown]:
-    def show(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+    def show(settings: Sequence[Setting], paper: Paper | None) -> Shown:
         figure = levels_figure(settings, axis)
         return Shown(entries=levels_entries(settings, axis), figures={"levels": figure})
 
     return show
 
 
-def _histograms(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
-    found = list(histograms(settings, draws, seed))
+def _histograms(settings: Sequence[Setting], paper: Paper | None) -> Shown:
+    found = list(histograms(settings))
     return Shown(entries=histogram_entries(found), figures={"histograms": histogram_figure(found)})
 
 
-def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+def _objects(settings: Sequence[Setting], paper: Paper | None) -> Shown:
     """The paper's Table 1: rows are objects, columns methods, ours and the paper's."""
     lines, parts = [], []
     means = {"AP": MEAN, "accuracy": "mean accuracy"}
@@ -91,7 +91,7 @@ def _objects(settings: Sequence[Setting], paper: Paper | None, draws: int, seed:
     return Shown(lines, "\n\n".join(parts))
 
 
-def _photographs(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+def _photographs(settings: Sequence[Setting], paper: Paper | None) -> Shown:
     """The paper's Table 2: rows are ways of training, columns numbers of photographs, ours and then the paper's."""
     tables = [photographs_table(settings), *([] if paper is None else [paper.markdown()])]
     return Shown(photographs_summary(settings), "\n\n".join(tables))
@@ -113,7 +113,7 @@ def beside(scores: ObjectScores, paper: Paper | None, mean: str = MEAN) -> str:
     return "\n".join(lines)
 
 
-def _seconds(settings: Sequence[Setting], paper: Paper | None, draws: int, seed: int) -> Shown:
+def _seconds(settings: Sequence[Setting], paper: Paper | None) -> Shown:
     """Wall-clock seconds of the reference method's iterations and of an object's field."""
     lines = []
     for setting in settings:
@@ -142,7 +142,7 @@ def _range(values: Sequence[float]) -> str:
     return low if low == high else f"{middle} ({low} to {high})"
 
 
-LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None, int, int], Shown]] = {
+LAYOUTS: Mapping[str, Callable[[Sequence[Setting], Paper | None], Shown]] = {
     "gaps": _levels("gap"),
     "targets": _levels("target"),
     "objects": _objects,

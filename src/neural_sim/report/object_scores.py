@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from neural_sim.report.bootstrap import Outcomes, class_score
+from neural_sim.report.bootstrap import Outcomes, class_scores, mean_of_known
 from neural_sim.report.finished import FinishedRun
-from neural_sim.report.statistics import BOUNDS, FIXED, Estimate, resampled, with_intervals
+from neural_sim.report.intervals import Estimate, over_seeds_and_images
+from neural_sim.report.statistics import BOUNDS, FIXED
 
 MEAN = "mAP"
 """The name of the mean over the biased objects among them."""
@@ -49,7 +50,7 @@ class ObjectScores:
 def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> ObjectScores:
     """Of the runs of one group: one of each method at each seed, on equal test images.
 
-    Seeds and test images are resampled, the same ones for all methods and objects, so that differences are paired.
+    Methods of a seed share its test images, so that differences are paired.
 
     Raises:
         ValueError: a method that lacks a seed of another.
@@ -64,22 +65,19 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
     methods = (bounds[0], *reversed(learned), *bounds[1:])
     objects = tuple(runs[0].results["biased"])
     columns = (*methods, *(w for w in WITHOUT if all(w in table[reference, at].matches for at in seeds)))
-    matches = [
-        [[own] for column in columns for own in _matches(table, reference, column, at)] for at in seeds
-    ]
-    shape = (-1, len(columns), len(objects))
-    point = np.asarray([[class_score(own) for (own,) in row] for row in matches]).mean(0)
-    point = _with_mean(point.reshape(shape))[0]
-    spread = _with_mean(resampled(matches, draws, seed).reshape(shape))
-    rows, ours = (*objects, MEAN), methods.index(reference)
-    ap = {column: with_intervals(point[i], spread[:, i]) for i, column in enumerate(columns)}
-    ahead = {
-        m: with_intervals(point[ours] - point[i], spread[:, ours] - spread[:, i])
-        for i, m in enumerate(methods)
-        if m != reference
-    }
-    named = [{m: dict(zip(rows, each, strict=True)) for m, each in of.items()} for of in (ap, ahead)]
-    return ObjectScores(reference, methods, objects, seeds, *named)
+    matches = [[_matches(table, reference, column, at) for column in columns] for at in seeds]
+    point, spread = (_with_mean(scores) for scores in class_scores(matches, draws, seed))
+    rows, ours = (*objects, MEAN), columns.index(reference)
+
+    def estimates(column: int, minus: int | None = None) -> dict[str, Estimate]:
+        own = [scores[..., column, :] for scores in (point, spread)]
+        if minus is not None:
+            own = [each - scores[..., minus, :] for each, scores in zip(own, (point, spread), strict=True)]
+        return {name: over_seeds_and_images(*(each[..., i] for each in own)) for i, name in enumerate(rows)}
+
+    ap = {column: estimates(i) for i, column in enumerate(columns)}
+    ahead = {m: estimates(ours, i) for i, m in enumerate(methods) if m != reference}
+    return ObjectScores(reference, methods, objects, seeds, ap, ahead)
 
 
 def _matches(
@@ -92,6 +90,6 @@ def _matches(
     return table[method, seed].matches["learned"]
 
 
-def _with_mean(values: Float[np.ndarray, "n m objects"]) -> Float[np.ndarray, "n m rows"]:
+def _with_mean(scores: Float[np.ndarray, "*n objects"]) -> Float[np.ndarray, "*n rows"]:
     """With the mean over objects as a last one; an object without a box stays out of it."""
-    return np.concatenate([values, np.nanmean(values, -1, keepdims=True)], -1)
+    return np.concatenate([scores, mean_of_known(scores)[..., None]], -1)

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neural_sim.report.compare import points
+from neural_sim.report.intervals import Estimate
 from neural_sim.report.object_scores import MEAN, called
 from neural_sim.report.settings import Setting
-from neural_sim.report.statistics import Estimate
 
 NONE = "none"
 WAYS = {NONE: "synthetic alone", "pretrain": "synthetic, then photographs", "combined": "both together"}

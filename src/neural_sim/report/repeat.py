@@ -1,27 +1,23 @@
 """Detectors that were trained several times on the same distributions: how far their scores scatter, and which
 differences exceed that.
 
-The score of a detector differs between trainings (initial parameters, images, batches) and between test images. The
-test images are the same in all trainings, so their part of a mean does not shrink with the number of trainings. Both
-parts are independent, and an interval has the root of the sum of their squares: Student's t of the trainings' standard
-error, and 1.96 bootstrap standard errors over images. Differences are paired, training by training and image by image.
+The test images are the same in all trainings. Intervals (:mod:`neural_sim.report.intervals`) are over both, and
+differences are paired, training by training and image by image.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t as student
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import Outcomes, class_scores
+from neural_sim.report.bootstrap import Outcomes, class_scores, mean_of_known
 from neural_sim.report.compare import points
-from neural_sim.report.page.verdict import Gain, mean_of_known, verdict
-from neural_sim.report.statistics import Estimate
+from neural_sim.report.intervals import Estimate, over_seeds_and_images
+from neural_sim.report.page.verdict import Gain, verdict
 
 
 @dataclass(frozen=True)
@@ -75,9 +71,7 @@ def repeated(
     if len(trainings) != 1 or min(trainings) < 2:
         raise ValueError(f"repeat: want two trainings or more of each distribution, got {sorted(trainings)}")
 
-    n = min(trainings)
-    point, spread = class_scores([row for w in which for row in matches[w]], draws, seed)
-    point, spread = (part.reshape(*part.shape[:-2], len(which), n, -1) for part in (point, spread))
+    point, spread = class_scores(list(matches.values()), draws, seed)
     return [
         _of_group(names, which, point[..., list(labels)], spread[..., list(labels)])
         for names, labels in groups
@@ -92,9 +86,11 @@ def _of_group(
 ) -> Repeated:
     own, resampled = mean_of_known(point), mean_of_known(spread)
     place = {w: i for i, w in enumerate(which)}
-    mean = {w: _estimate(own[i], resampled[:, i]) for w, i in place.items()}
+    mean = {w: over_seeds_and_images(own[i], resampled[:, i]) for w, i in place.items()}
     ahead = {
-        (a, b): _estimate(own[place[a]] - own[place[b]], resampled[:, place[a]] - resampled[:, place[b]])
+        (a, b): over_seeds_and_images(
+            own[place[a]] - own[place[b]], resampled[:, place[a]] - resampled[:, place[b]]
+        )
         for a, b in DIFFERENCES
         if a in place and b in place
     }
@@ -102,17 +98,6 @@ def _of_group(
         tuple(names), {w: own[i].tolist() for w, i in place.items()}, mean, ahead,
         float(np.sqrt(own.var(1, ddof=1).mean())), float(np.sqrt(np.nanvar(resampled, 0, ddof=1).mean())),
     )  # fmt: skip
-
-
-def _estimate(
-    values: Float[np.ndarray, "trainings"], resampled: Float[np.ndarray, "draws trainings"]
-) -> Estimate:
-    """The mean over trainings and its interval."""
-    n = len(values)
-    of_trainings = student.ppf(0.975, n - 1) * values.std(ddof=1) / math.sqrt(n)
-    half = float(np.hypot(of_trainings, 1.96 * np.nanstd(resampled.mean(1), ddof=1)))
-    value = float(values.mean())
-    return Estimate(value, value - half, value + half)
 
 
 def sentence(found: Repeated, score: Score) -> str:

@@ -14,10 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from neural_sim.report import figures, tracking
-from neural_sim.report.bootstrap import Outcomes, class_score
+from neural_sim.report.bootstrap import Outcomes, class_scores, mean_of_known
 from neural_sim.report.compare import points
 from neural_sim.report.figures import CLASS_COLOURS, GRID, INK
-from neural_sim.report.statistics import Estimate, mean_ap, resampled, with_intervals
+from neural_sim.report.intervals import Estimate, over_seeds_and_images
 from neural_sim.types import LabelledImages
 
 
@@ -43,23 +43,23 @@ def side_by_side(
     images: Mapping[str, int],
     draws: int,
 ) -> SideBySide:
-    """From ``matches`` [seed][source][class] by test set, with ``draws`` bootstrap draws over seeds and test images.
+    """From ``matches`` [seed][source][class] by test set, with ``draws`` bootstrap draws over test images.
 
-    All sources of a seed are scored on the same test images, so that a draw takes the same ones for all of them.
+    All sources of a seed are scored on the same test images, so that differences are paired.
     """
     ap, ahead, per_class = {}, {}, {}
     for kind, rows in matches.items():
-        point = np.asarray([[mean_ap(each) for each in row] for row in rows]).mean(0)
-        spread = resampled(rows, draws, seed=0)
-        ap[kind] = dict(zip(sources, with_intervals(point, spread), strict=True))
-        differences = with_intervals(point[0] - point[1:], spread[:, :1] - spread[:, 1:])
-        ahead[kind] = dict(zip(sources[1:], differences, strict=True))
+        by_class, resampled = class_scores(rows, draws)
+        point, spread = mean_of_known(by_class), mean_of_known(resampled)
+        ap[kind] = {s: over_seeds_and_images(point[:, i], spread[..., i]) for i, s in enumerate(sources)}
+        ahead[kind] = {
+            s: over_seeds_and_images(point[:, 0] - point[:, i], spread[..., 0] - spread[..., i])
+            for i, s in enumerate(sources)
+            if i
+        }
+        means = by_class.mean(0)
         per_class[kind] = {
-            source: {
-                name: float(np.mean([class_score(row[column][label]) for row in rows]))
-                for label, name in enumerate(classes)
-            }
-            for column, source in enumerate(sources)
+            source: dict(zip(classes, means[i].tolist(), strict=True)) for i, source in enumerate(sources)
         }
     return SideBySide(tuple(sources), tuple(seeds), images, ap, ahead, per_class)
 
@@ -70,7 +70,7 @@ def table(found: SideBySide, heading: str) -> str:
     count = len(found.seeds)
     over = "seeds and test images" if count > 1 else "test images"
     lines = [
-        f"{heading} AP (0.50 to 0.95) in points, mean of all classes, with 95 % bootstrap intervals over {over}; "
+        f"{heading} AP (0.50 to 0.95) in points, mean of all classes, with 95 % intervals over {over}; "
         f"seed{'s' if count > 1 else ''} {', '.join(map(str, found.seeds))}."
         + (" Differences in bold exceed the spread." if count > 1 else ""),
         "",

@@ -1,7 +1,6 @@
 """Differences between methods, and whether they exceed the spread over seeds and test images.
 
-All methods of a seed are scored on one test set, so that they are compared in pairs: a bootstrap draw takes the same
-seeds and the same images for all of them.
+All methods of a seed are scored on one test set, so that they are compared in pairs, seed by seed and image by image.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import Outcomes, class_score
+from neural_sim.report.bootstrap import class_scores, mean_of_known
 from neural_sim.report.finished import FinishedRun
+from neural_sim.report.intervals import Estimate, over_seeds, over_seeds_and_images, ratio
 
 BOUNDS = ("ns", "matched")
 """Detectors that every run of a seed has, and that do not depend on its method. They stand for the methods ``ns`` and
@@ -27,20 +27,6 @@ BUDGETS = 6
 """Seconds at which the methods are compared, evenly spaced in their logarithm."""
 Clock = Literal["seconds", "cpu_seconds"]
 """What a method has taken: by the clock on the wall, or of all processor cores together."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % bootstrap interval, None where there is nothing to resample."""
-
-    value: float
-    low: float | None = None
-    high: float | None = None
-
-    @property
-    def certain(self) -> bool:
-        """Whether there is an interval, and leaves 0 out."""
-        return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
 
 @dataclass(frozen=True)
@@ -96,50 +82,36 @@ def compare(
     if not seeds:
         raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
     bounds = [bound for bound in BOUNDS if all(bound in table[reference, s].matches for s in seeds)]
-    columns, first = (*bounds, *methods), len(bounds)
     matches = [
         [table[reference, s].matches[bound] for bound in bounds]
         + [table[method, s].matches["learned"] for method in methods]
         for s in seeds
     ]
-    point = np.asarray([[mean_ap(classes) for classes in row] for row in matches]).mean(0)
-    spread = resampled(matches, draws, seed)
-    ap = dict(zip(columns, with_intervals(point, spread), strict=True))
-    won = {}
-    if "matched" in bounds:
-        gap, spread_gap = point[1] - point[0], spread[:, 1] - spread[:, 0]
-        parts = (point[first:] - point[0]) / gap, (spread[:, first:] - spread[:, :1]) / spread_gap[:, None]
-        won = dict(zip(methods, with_intervals(*parts), strict=True))
-    ours, others = slice(first, first + 1), slice(first + 1, None)
-    ahead = with_intervals(point[ours] - point[others], spread[:, ours] - spread[:, others])
+    point, spread = (mean_of_known(scores) for scores in class_scores(matches, draws, seed))
+    of = {name: (point[:, i], spread[..., i]) for i, name in enumerate((*bounds, *methods))}
+    ap = {name: over_seeds_and_images(*own) for name, own in of.items()}
+    won = {m: _won_back(of[m], of["ns"], of["matched"]) for m in methods} if "matched" in bounds else {}
+    ahead = {m: over_seeds_and_images(*_minus(of[reference], of[m])) for m in methods[1:]}
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, won,
-        dict(zip(methods[1:], ahead, strict=True)), _areas(table, seeds, methods, draws, seed, clock),
+        ahead, _areas(table, seeds, methods, clock),
         {m: {k: _mean(table[m, s].spent(k) for s in seeds) for k in ("images", "detector_steps", "products", clock)}
-         for m in methods}, *_at_equal_cost(table, seeds, methods, draws, seed, clock),
-        *_ahead_at(table, seeds, methods, draws, seed, clock), clock, runs[0].score,
+         for m in methods}, *_at_equal_cost(table, seeds, methods, clock),
+        *_ahead_at(table, seeds, methods, clock), clock, runs[0].score,
     )  # fmt: skip
 
 
-def mean_ap(matches: Sequence[Outcomes], weights: Float[np.ndarray, "images"] | None = None) -> float:
-    """Mean over classes; those without a box among the weighted images stay out of it."""
-    known = [ap for m in matches if not math.isnan(ap := class_score(m, weights))]
-    return float(np.mean(known)) if known else math.nan
+_Scores = tuple[Float[np.ndarray, "seeds"], Float[np.ndarray, "draws seeds"]]
+"""Of a detector, on the test images and on resampled ones."""
 
 
-def resampled(
-    matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int
-) -> Float[np.ndarray, "draws columns"]:
-    """Mean AP of each column of ``matches`` [seeds][columns][classes] under resampled seeds and images."""
-    random, rows = np.random.default_rng(seed), []
-    for _ in range(draws):
-        each = []
-        for i in random.integers(len(matches), size=len(matches)):
-            count = len(matches[i][0][0].boxes_per_image)
-            weights = np.bincount(random.integers(count, size=count), minlength=count).astype(float)
-            each.append([mean_ap(classes, weights) for classes in matches[i]])
-        rows.append(np.mean(each, 0))
-    return np.asarray(rows)
+def _minus(a: _Scores, b: _Scores) -> _Scores:
+    return a[0] - b[0], a[1] - b[1]
+
+
+def _won_back(own: _Scores, ns: _Scores, matched: _Scores) -> Estimate:
+    (gain, gains), (gap, gaps) = _minus(own, ns), _minus(matched, ns)
+    return ratio(gain, gap, gains, gaps)
 
 
 def biased_ap(
@@ -177,8 +149,6 @@ def _at_equal_cost(
     table: Mapping[tuple[str, int], FinishedRun],
     seeds: Sequence[int],
     methods: Sequence[str],
-    draws: int,
-    seed: int,
     clock: Clock,
 ) -> tuple[dict[str, Estimate], float]:
     """Every method's AP at the least seconds that any of them took in all, seed by seed, and those seconds' mean."""
@@ -188,15 +158,13 @@ def _at_equal_cost(
     ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
     reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
-    return over_seeds(reached, draws, seed), _mean(budgets.values())
+    return {m: over_seeds(np.asarray(own)) for m, own in reached.items()}, _mean(budgets.values())
 
 
 def _ahead_at(
     table: Mapping[tuple[str, int], FinishedRun],
     seeds: Sequence[int],
     methods: Sequence[str],
-    draws: int,
-    seed: int,
     clock: Clock,
 ) -> tuple[list[float], dict[str, list[Estimate]]]:
     """Budgets of seconds, and the first method's lead over each other one at each of them."""
@@ -208,9 +176,8 @@ def _ahead_at(
     ahead: dict[str, list[Estimate]] = {m: [] for m in methods[1:]}
     for budget in budgets:
         reached = {key: ap_at(*curve, budget) for key, curve in curves.items()}
-        leads = {m: [reached[methods[0], s] - reached[m, s] for s in seeds] for m in methods[1:]}
-        for method, lead in over_seeds(leads, draws, seed).items():
-            ahead[method].append(lead)
+        for method, own in ahead.items():
+            own.append(over_seeds(np.asarray([reached[methods[0], s] - reached[method, s] for s in seeds])))
     return budgets, ahead
 
 
@@ -218,8 +185,6 @@ def _areas(
     table: Mapping[tuple[str, int], FinishedRun],
     seeds: Sequence[int],
     methods: Sequence[str],
-    draws: int,
-    seed: int,
     clock: Clock,
 ) -> dict[str, Estimate]:
     curves = {key: biased_ap(run, clock) for key, run in table.items() if key[1] in seeds}
@@ -228,30 +193,9 @@ def _areas(
     if not starts or min(starts) >= max(ends):
         return {}
     areas = {key: area_under(*curve, min(starts), max(ends)) for key, curve in curves.items()}
-    ahead = {m: [areas[methods[0], s] - areas[m, s] for s in seeds] for m in methods[1:]}
-    return over_seeds(ahead, draws, seed)
-
-
-def over_seeds(values: Mapping[str, Sequence[float]], draws: int, seed: int) -> dict[str, Estimate]:
-    """Means over seeds of numbers by name; seeds alone are resampled. One seed has no interval."""
-    found = {}
-    for method, each in values.items():
-        numbers, random = np.asarray(each), np.random.default_rng(seed)
-        chosen = random.integers(len(each), size=(draws, len(each)))
-        found[method] = with_intervals(numbers.mean(keepdims=True), numbers[chosen].mean(1, keepdims=True))[0]
-        if len(each) == 1:
-            found[method] = Estimate(found[method].value)
-    return found
-
-
-def with_intervals(
-    point: Float[np.ndarray, "columns"], spread: Float[np.ndarray, "draws columns"]
-) -> list[Estimate]:
-    """Of each column: its value, and the 2.5 % and 97.5 % quantiles of its resampled values, nan left out."""
-    if not len(point):  # of which nanquantile has no bounds
-        return []
-    low, high = np.nanquantile(spread, [0.025, 0.975], axis=0)
-    return [Estimate(float(p), float(a), float(b)) for p, a, b in zip(point, low, high, strict=True)]
+    return {
+        m: over_seeds(np.asarray([areas[methods[0], s] - areas[m, s] for s in seeds])) for m in methods[1:]
+    }
 
 
 def _mean(values) -> float:

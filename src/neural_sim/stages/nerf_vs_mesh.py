@@ -42,7 +42,7 @@ class NerfVsMeshStep:
             the mesh renderer.
         categories: its category names -> object names, null to leave a category out. Names not listed stand for
             themselves.
-        draws: of the bootstrap over seeds and test images.
+        draws: of the bootstrap over test images.
         shown: training images of each kind in the figure.
 
     Raises:
@@ -51,7 +51,7 @@ class NerfVsMeshStep:
 
     single: Sequence[int] = (1, 1)
     multiple: Sequence[int] = (2, 4)
-    seeds: int = 2
+    seeds: int = 5
     blenderproc: str | None = None
     categories: Mapping[str, str | None] | None = None
     draws: int = 300

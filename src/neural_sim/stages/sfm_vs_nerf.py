@@ -40,7 +40,7 @@ class SfmVsNerfStep:
     Args:
         resolution: cells of the reconstruction along the unit sphere's diameter, a power of two from 32.
         seeds: how many detectors of each kind, from the run's seed on.
-        draws: of the bootstrap over seeds and test images.
+        draws: of the bootstrap over test images.
         shown: training images of each kind in the figure.
 
     Raises:
@@ -48,7 +48,7 @@ class SfmVsNerfStep:
     """
 
     resolution: int = 128
-    seeds: int = 2
+    seeds: int = 5
     draws: int = 300
     shown: int = 8
 

@@ -7,8 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from neural_sim.report.costs import HEAD, NOTE, Costs
+from neural_sim.report.intervals import Estimate
 from neural_sim.report.page.comparison_page import Section, verdict, write_comparison_page
-from neural_sim.report.statistics import Comparison, Estimate
+from neural_sim.report.statistics import Comparison
 
 
 @pytest.fixture
@@ -54,11 +55,11 @@ def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
     row = page.split("<tr><th>ours ahead after so many s, of</th>")[1]
     assert re.match(r'<th class="n">5</th><th class="n">60</th></tr>\s*<tr><th>first</th>\s*<td>\s*5\.0', row)
     assert re.search(r'<td class="accepted">\s*15\.0 <span class="note">\(11\.0 to 20\.0\)', row)
-    assert "by resampling seeds and test images" in page
+    assert "95 %, over seeds and test images" in page
 
 
 def test_differences_of_one_seed_do_not_stand_out(comparison, tmp_path):
     section = Section(replace(comparison, seeds=(0,)), Figure(figsize=(2, 2)), "", ["mug"], {})
     page = write_comparison_page([section], {}, tmp_path).read_text()
     assert 'class="accepted"' not in page and 'class="rejected"' not in page
-    assert "by resampling test images alone" in page and re.search(r"<td>\s*20\.0", page)
+    assert "95 %, over test images alone" in page and re.search(r"<td>\s*20\.0", page)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from neural_sim.report.intervals import Estimate
 from neural_sim.report.page.verdict import Resampled, interval, listed, verdict
-from neural_sim.report.statistics import Estimate
 from neural_sim.types import LabelledImages
 
 IMAGES = 40

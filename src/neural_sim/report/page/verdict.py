@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import class_scores, match
-from neural_sim.report.statistics import Estimate, with_intervals
+from neural_sim.report.bootstrap import class_scores, match, mean_of_known
+from neural_sim.report.intervals import Estimate, over_images
 from neural_sim.types import LabelledImages
 
 Outcome = Literal["better", "worse", "no difference"]
@@ -26,7 +26,7 @@ POINTS: dict[Score, str] = {"AP": "AP", "accuracy": "points of accuracy"}
 class Gain:
     """AP (or accuracy) of a set of classes, as fractions.
 
-    ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % bootstrap intervals over test images.
+    ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % intervals.
     ``room`` is None where matched and ns are one distribution, and where matched is not known.
     """
 
@@ -75,7 +75,8 @@ class Resampled:
         matches = [
             [match(detections[which], test, label, score) for label in range(classes)] for which in known
         ]
-        return Resampled(known, *class_scores(matches, draws))
+        point, spread = class_scores([matches], draws)
+        return Resampled(known, point[0], spread[:, 0])
 
     @property
     def present(self) -> list[int]:
@@ -86,16 +87,11 @@ class Resampled:
         """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
         the target's distribution is the initial one."""
         point, spread = (mean_of_known(part[..., list(labels)]) for part in (self.point, self.spread))
-        gain, *room = with_intervals(point[1:] - point[0], spread[:, 1:] - spread[:, :1])
+        gain, *room = (
+            over_images(float(point[i] - point[0]), spread[:, i] - spread[:, 0]) for i in range(1, len(point))
+        )
         ap = dict(zip(self.which, point.tolist(), strict=True))
         return Gain(tuple(names), ap, gain, None if same_target or not room else room[0])
-
-
-def mean_of_known(ap: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
-    """Over the classes with a value; nan where none has one."""
-    known = ~np.isnan(ap)
-    counts = known.sum(-1)
-    return np.where(counts, np.where(known, ap, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)
 
 
 def listed(names: Sequence[str]) -> str:
