@@ -29,6 +29,12 @@ def test_without_images_the_interval_is_that_of_students_test(found):
     assert bounds(found(VALUES)) == pytest.approx((expected.low, expected.high))
 
 
+def test_the_interval_of_a_fraction_ends_where_fractions_do():
+    assert Estimate(0.1, -0.2, 0.4).as_fraction == Estimate(0.1, 0.0, 0.4)
+    assert Estimate(0.9, 0.7, 1.1).as_fraction == Estimate(0.9, 0.7, 1.0)
+    assert Estimate(0.9).as_fraction == Estimate(0.9)
+
+
 def test_one_seed_has_quantiles_over_images_or_no_interval():
     one = np.array([0.4])
     assert over_seeds(one) == Estimate(0.4) and not over_seeds(one).certain

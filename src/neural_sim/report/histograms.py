@@ -55,8 +55,9 @@ def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
         which: merged(torch.tensor([each[which] for each in own]), groups).numpy()
         for which in ("initial", "learned", "target")
     }
+    away = [run["total_variation"][name][factor] for run in runs]
     distance = {
-        which: over_seeds(np.asarray([run["total_variation"][name][factor][which] for run in runs]))
+        which: over_seeds(np.asarray([each[which] for each in away])).as_fraction
         for which in ("initial", "learned")
     }
     start, aim = (modes(setting.distribution(which, name, factor)) for which in ("initial", "target"))

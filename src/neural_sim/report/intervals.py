@@ -34,6 +34,13 @@ class Estimate:
         """Whether there is an interval, and leaves 0 out."""
         return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
+    @property
+    def as_fraction(self) -> Estimate:
+        """Of a number in [0, 1], such as a score: the part of the interval that lies there."""
+        if self.low is None or self.high is None:
+            return self
+        return Estimate(self.value, max(self.low, 0.0), min(self.high, 1.0))
+
 
 def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
     """The mean with Student's interval; that of one seed has none."""

@@ -75,7 +75,7 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
             own = [each - scores[..., minus, :] for each, scores in zip(own, (point, spread), strict=True)]
         return {name: over_seeds_and_images(*(each[..., i] for each in own)) for i, name in enumerate(rows)}
 
-    ap = {column: estimates(i) for i, column in enumerate(columns)}
+    ap = {c: {n: e.as_fraction for n, e in estimates(i).items()} for i, c in enumerate(columns)}
     ahead = {m: estimates(ours, i) for i, m in enumerate(methods) if m != reference}
     return ObjectScores(reference, methods, objects, seeds, ap, ahead)
 

@@ -86,7 +86,7 @@ def _of_group(
 ) -> Repeated:
     own, resampled = mean_of_known(point), mean_of_known(spread)
     place = {w: i for i, w in enumerate(which)}
-    mean = {w: over_seeds_and_images(own[i], resampled[:, i]) for w, i in place.items()}
+    mean = {w: over_seeds_and_images(own[i], resampled[:, i]).as_fraction for w, i in place.items()}
     ahead = {
         (a, b): over_seeds_and_images(
             own[place[a]] - own[place[b]], resampled[:, place[a]] - resampled[:, place[b]]

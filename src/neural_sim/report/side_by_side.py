@@ -51,7 +51,9 @@ def side_by_side(
     for kind, rows in matches.items():
         by_class, resampled = class_scores(rows, draws)
         point, spread = mean_of_known(by_class), mean_of_known(resampled)
-        ap[kind] = {s: over_seeds_and_images(point[:, i], spread[..., i]) for i, s in enumerate(sources)}
+        ap[kind] = {
+            s: over_seeds_and_images(point[:, i], spread[..., i]).as_fraction for i, s in enumerate(sources)
+        }
         ahead[kind] = {
             s: over_seeds_and_images(point[:, 0] - point[:, i], spread[..., 0] - spread[..., i])
             for i, s in enumerate(sources)

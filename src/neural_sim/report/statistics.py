@@ -89,7 +89,7 @@ def compare(
     ]
     point, spread = (mean_of_known(scores) for scores in class_scores(matches, draws, seed))
     of = {name: (point[:, i], spread[..., i]) for i, name in enumerate((*bounds, *methods))}
-    ap = {name: over_seeds_and_images(*own) for name, own in of.items()}
+    ap = {name: over_seeds_and_images(*own).as_fraction for name, own in of.items()}
     won = {m: _won_back(of[m], of["ns"], of["matched"]) for m in methods} if "matched" in bounds else {}
     ahead = {m: over_seeds_and_images(*_minus(of[reference], of[m])) for m in methods[1:]}
     return Comparison(
@@ -158,7 +158,8 @@ def _at_equal_cost(
     ends = {s: [curves[m, s][0][-1] for m in methods if curves[m, s][0][-1] > 0.0] for s in seeds}
     budgets = {s: min(end, default=0.0) for s, end in ends.items()}
     reached = {m: [ap_at(*curves[m, s], budgets[s]) for s in seeds] for m in methods}
-    return {m: over_seeds(np.asarray(own)) for m, own in reached.items()}, _mean(budgets.values())
+    at = {m: over_seeds(np.asarray(own)).as_fraction for m, own in reached.items()}
+    return at, _mean(budgets.values())
 
 
 def _ahead_at(
