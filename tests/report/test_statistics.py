@@ -9,7 +9,7 @@ import pytest
 from neural_sim.report.bootstrap import THRESHOLDS, Matches
 from neural_sim.report.compare import markdown, points
 from neural_sim.report.finished import FinishedRun
-from neural_sim.report.statistics import ap_at, area_under, biased_ap, compare
+from neural_sim.report.statistics import ONLY_AT_END, ap_at, area_under, biased_ap, compare
 
 IMAGES = 100
 
@@ -28,7 +28,7 @@ def run(method, seed, learned, seconds=(10.0, 100.0)):
             "seconds": s, "cpu_seconds": 100.0 - s, "images": 10 * s, "detector_steps": 1, "products": 0,
             "ap": {"per_class": {"mug": ap}},
         }
-        for s, ap in zip((0.0, *seconds), (0.2, 0.5 * (0.2 + learned), learned), strict=True)
+        for s, ap in zip((0.0, *seconds), (0.2, *(0.5 * (0.2 + learned), learned)[-len(seconds) :]), strict=True)
     ]  # fmt: skip
     results = {
         "method": method, "seed": seed, "experiment": "gap", "gap": "disjoint", "biased": ["mug"], "curve": curve,
@@ -127,6 +127,17 @@ def test_leads_by_budget_reach_from_the_first_scored_iteration_of_any_run_to_the
     text = markdown(found, [_with_distances(each) for each in runs])
     assert "| ours ahead after so many seconds, of | 10 | 25 | 63 | 158 | 398 | 1000 |" in text
     assert "| other | **25.0** (25.0 to 25.0) | **35.0** (35.0 to 35.0) | " in text
+
+
+def test_runs_that_were_scored_once_do_not_tell_who_is_ahead_before():
+    """Their leads are not in bold, and a line says why; the lead at the end is."""
+    runs = [run("ours", s, 0.7, (100.0,)) for s in range(3)] + [run("other", s, 0.4) for s in range(3)]
+    found = compare(runs, "ours", draws=20)
+    assert found.only_at_end and found.ahead_at["other"][0].certain  # 0.2 until its end, behind 0.3
+    text = markdown(found, [_with_distances(each) for each in runs])
+    assert text.count("**") == 2 and ONLY_AT_END in text
+    on_the_way = compare([run(m, s, 0.5) for s in range(3) for m in ("ours", "other")], "ours", draws=20)
+    assert not on_the_way.only_at_end
 
 
 def test_one_method_alone_leads_nobody():

@@ -17,7 +17,7 @@ from neural_sim.report.finished import FinishedRun, candidates, read_run
 from neural_sim.report.intervals import Estimate
 from neural_sim.report.page.comparison_page import Section, write_comparison_page
 from neural_sim.report.selection import Group, LeftOut, Selection
-from neural_sim.report.statistics import Clock, Comparison, compare
+from neural_sim.report.statistics import ONLY_AT_END, Clock, Comparison, compare
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
         lines.append(f"| {bound} | {points(c.ap[bound])} | | | | | | | |")
     for method in c.methods:
         ahead = points(c.ahead[method], sure=count > 1) if method in c.ahead else ""
-        area = points(c.area[method], sure=count > 1) if method in c.area else ""
+        area = points(c.area[method], sure=count > 1 and not c.only_at_end) if method in c.area else ""
         won = points(c.won_back[method], "%") if method in c.won_back else ""
         spent = c.spent[method]
         lines.append(
@@ -178,6 +178,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
               "The fraction closed has no interval where the gap's own includes 0. "
               f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
               "iterations linear in log seconds.", ""]  # fmt: skip
+    lines += [ONLY_AT_END, ""] * c.only_at_end
     return "\n".join([*lines, *_leads(c, unit), *_distances(c, runs), "", costs_table(runs)])
 
 
@@ -191,7 +192,9 @@ def _leads(c: Comparison, unit: str) -> list[str]:
         + " |"
     )
     rows = [
-        f"| {method} | " + " | ".join(points(lead, sure=len(c.seeds) > 1) for lead in leads) + " |"
+        f"| {method} | "
+        + " | ".join(points(lead, sure=len(c.seeds) > 1 and not c.only_at_end) for lead in leads)
+        + " |"
         for method, leads in c.ahead_at.items()
     ]
     note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from neural_sim.report.costs import HEAD, NOTE, Costs
 from neural_sim.report.intervals import Estimate
 from neural_sim.report.page.comparison_page import Section, verdict, write_comparison_page
-from neural_sim.report.statistics import Comparison
+from neural_sim.report.statistics import ONLY_AT_END, Comparison
 
 
 @pytest.fixture
@@ -36,6 +36,14 @@ def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
     )
     one = verdict(replace(comparison, seeds=(3,)))
     assert one.endswith("from third; one seed, so that how much trainings differ is not in this.")
+
+
+def test_leads_of_runs_that_were_scored_once_do_not_stand_out(comparison, tmp_path):
+    once = replace(comparison, only_at_end=True)
+    page = write_comparison_page(
+        [Section(once, Figure(figsize=(2, 2)), "", ["mug"], {})], {}, tmp_path
+    ).read_text()
+    assert ONLY_AT_END in page and page.count('class="accepted"') == 1 and page.count('class="rejected"') == 1
 
 
 def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):

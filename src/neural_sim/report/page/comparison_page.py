@@ -12,7 +12,7 @@ from neural_sim.detector.metrics import IN_FULL
 from neural_sim.report.costs import HEAD, NOTE, Costs, cells
 from neural_sim.report.page import charts, render
 from neural_sim.report.page.verdict import POINTS, interval, listed
-from neural_sim.report.statistics import Comparison
+from neural_sim.report.statistics import ONLY_AT_END, Comparison
 
 FILE = "report.html"
 
@@ -50,6 +50,11 @@ class Section:
     def verdict(self) -> str:
         """One sentence: whom the reference is ahead of, and whom not."""
         return verdict(self.comparison)
+
+    @property
+    def warning(self) -> str:
+        """What the scores at fewer seconds do not tell; empty if they do."""
+        return ONLY_AT_END if self.comparison.only_at_end else ""
 
     @property
     def in_full(self) -> str:
