@@ -77,7 +77,7 @@ def test_intervals_contain_the_truth_at_least_as_often_as_they_say(seeds, shared
 
 def test_a_ratio_lies_where_students_test_does_not_reject_it():
     gap, gain = np.array([0.30, 0.36, 0.33]), np.array([0.28, 0.30, 0.33])
-    found = ratio(gain, gap, gain + STILL, gap + STILL)
+    found = ratio((gain, gain + STILL), (gap, gap + STILL))
     assert found.value == pytest.approx(gain.mean() / gap.mean())
     for bound in bounds(found):
         assert ttest_1samp(gain - bound * gap, 0.0).pvalue == pytest.approx(0.05, abs=1e-6)
@@ -88,7 +88,7 @@ def test_a_ratio_lies_where_students_test_does_not_reject_it():
 def test_a_ratio_of_one_seed_lies_where_the_images_do_not_reject_it():
     random = np.random.default_rng(1)
     gains, gaps = (at + random.normal(0.0, 0.02, (500, 1)) for at in (0.2, 0.3))
-    found = ratio(np.array([0.2]), np.array([0.3]), gains, gaps)
+    found = ratio((np.array([0.2]), gains), (np.array([0.3]), gaps))
     for bound in bounds(found):
         z = (0.2 - bound * 0.3) / (gains - bound * gaps).std(ddof=1)
         assert 2 * norm.sf(abs(z)) == pytest.approx(0.05, abs=1e-6)
@@ -96,13 +96,13 @@ def test_a_ratio_of_one_seed_lies_where_the_images_do_not_reject_it():
 
 def test_a_ratio_to_what_is_not_told_from_nothing_has_no_interval():
     gap = np.array([0.1, -0.05, 0.02])
-    found = ratio(2.0 * gap, gap, 2.0 * gap + STILL, gap + STILL)
+    found = ratio((2.0 * gap, 2.0 * gap + STILL), (gap, gap + STILL))
     assert found.value == pytest.approx(2.0) and bounds(found) == (None, None)
     nothing = np.zeros(3)
-    assert math.isnan(ratio(gap, nothing, gap + STILL, nothing + STILL).value)
+    assert math.isnan(ratio((gap, gap + STILL), (nothing, nothing + STILL)).value)
 
 
 def test_all_that_is_gained_of_a_gap_is_certain_though_the_gap_varies():
     gap = np.array([0.2, 0.3, 0.4])
-    found = ratio(gap, gap, around(gap, 0.01), around(gap, 0.01))
+    found = ratio((gap, around(gap, 0.01)), (gap, around(gap, 0.01)))
     assert (found.value, *bounds(found)) == pytest.approx((1.0, 1.0, 1.0))

@@ -144,13 +144,13 @@ def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
 def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
     """The table of one setting, its differences, the distances of the learned distributions, and costs. ``heading`` is
     how these runs differ from others of the setting."""
-    c, count = comparison, len(comparison.seeds)
+    c = comparison
     unit = "seconds" if c.clock == "seconds" else "CPU seconds"
     lines = [
         f"## {c.setting}" + (f": {heading}" if heading else ""),
-        f"Seed{'s' if count > 1 else ''} {', '.join(map(str, c.seeds))}; "
+        f"Seed{'s' if c.several else ''} {', '.join(map(str, c.seeds))}; "
         f"{IN_FULL[c.score]} of {', '.join(runs[0].results['biased'])} in points, "
-        f"with 95 % intervals over {'seeds and test images' if count > 1 else 'test images alone'}.",
+        f"with 95 % intervals over {'seeds and test images' if c.several else 'test images alone'}.",
         *_on_other_devices(runs),
         "",
         f"| method | {c.score} | of the gap closed | {c.reference} ahead by | area ahead by "
@@ -160,8 +160,8 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
     for bound in c.bounds:
         lines.append(f"| {bound} | {points(c.ap[bound])} | | | | | | | |")
     for method in c.methods:
-        ahead = points(c.ahead[method], sure=count > 1) if method in c.ahead else ""
-        area = points(c.area[method], sure=count > 1 and not c.only_at_end) if method in c.area else ""
+        ahead = points(c.ahead[method], sure=c.several) if method in c.ahead else ""
+        area = points(c.area[method], sure=c.timed) if method in c.area else ""
         won = points(c.won_back[method], "%") if method in c.won_back else ""
         spent = c.spent[method]
         lines.append(
@@ -170,7 +170,7 @@ def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str =
             f"| {spent['images']:.0f} | {spent['detector_steps']:.0f} | {spent[c.clock]:.0f} |"
         )
     bold = "Differences in bold exceed the spread: their interval leaves 0 out. "
-    if count == 1:
+    if not c.several:
         bold = "None is in bold: intervals of one seed leave out how much trainings differ. "
     lines += ["", f"{bold}Images, steps and seconds "
               "include the warm start, whose backbone every loop trains on; fields, which all methods share, and the "
@@ -192,9 +192,7 @@ def _leads(c: Comparison, unit: str) -> list[str]:
         + " |"
     )
     rows = [
-        f"| {method} | "
-        + " | ".join(points(lead, sure=len(c.seeds) > 1 and not c.only_at_end) for lead in leads)
-        + " |"
+        f"| {method} | " + " | ".join(points(lead, sure=c.timed) for lead in leads) + " |"
         for method, leads in c.ahead_at.items()
     ]
     note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."

@@ -69,14 +69,16 @@ def object_scores(runs: Sequence[FinishedRun], reference: str, draws: int, seed:
     point, spread = (_with_mean(scores) for scores in class_scores(matches, draws, seed))
     rows, ours = (*objects, MEAN), columns.index(reference)
 
-    def estimates(column: int, minus: int | None = None) -> dict[str, Estimate]:
-        own = [scores[..., column, :] for scores in (point, spread)]
-        if minus is not None:
-            own = [each - scores[..., minus, :] for each, scores in zip(own, (point, spread), strict=True)]
-        return {name: over_seeds_and_images(*(each[..., i] for each in own)) for i, name in enumerate(rows)}
+    def named(
+        values: Float[np.ndarray, "seeds rows"], resampled: Float[np.ndarray, "draws seeds rows"]
+    ) -> dict[str, Estimate]:
+        return {name: over_seeds_and_images(values[:, i], resampled[..., i]) for i, name in enumerate(rows)}
 
-    ap = {c: {n: e.as_fraction for n, e in estimates(i).items()} for i, c in enumerate(columns)}
-    ahead = {m: estimates(ours, i) for i, m in enumerate(methods) if m != reference}
+    of = [(point[:, i], spread[..., i, :]) for i in range(len(columns))]
+    ap = {c: {n: e.as_fraction for n, e in named(*of[i]).items()} for i, c in enumerate(columns)}
+    ahead = {
+        m: named(of[ours][0] - of[i][0], of[ours][1] - of[i][1]) for i, m in enumerate(methods) if i != ours
+    }
     return ObjectScores(reference, methods, objects, seeds, ap, ahead)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from neural_sim.detector.protocol import Score
 from neural_sim.report.bootstrap import class_scores, mean_of_known
 from neural_sim.report.finished import FinishedRun
-from neural_sim.report.intervals import Estimate, over_seeds, over_seeds_and_images, ratio
+from neural_sim.report.intervals import Estimate, Sample, over_seeds, over_seeds_and_images, ratio
 
 BOUNDS = ("ns", "matched")
 """Detectors that every run of a seed has, and that do not depend on its method. They stand for the methods ``ns`` and
@@ -66,6 +66,16 @@ class Comparison:
     only_at_end: bool = False
 
     @property
+    def several(self) -> bool:
+        """Whether intervals are over seeds, so that differences that leave 0 out exceed the spread."""
+        return len(self.seeds) > 1
+
+    @property
+    def timed(self) -> bool:
+        """The same of what is read at fewer seconds than a run took."""
+        return self.several and not self.only_at_end
+
+    @property
     def bounds(self) -> list[str]:
         """The detectors of ``BOUNDS`` that the runs have."""
         return [bound for bound in BOUNDS if bound in self.ap]
@@ -96,7 +106,10 @@ def compare(
     point, spread = (mean_of_known(scores) for scores in class_scores(matches, draws, seed))
     of = {name: (point[:, i], spread[..., i]) for i, name in enumerate((*bounds, *methods))}
     ap = {name: over_seeds_and_images(*own).as_fraction for name, own in of.items()}
-    won = {m: _won_back(of[m], of["ns"], of["matched"]) for m in methods} if "matched" in bounds else {}
+    won = {}
+    if "matched" in bounds:
+        gap = _minus(of["matched"], of["ns"])
+        won = {m: ratio(_minus(of[m], of["ns"]), gap) for m in methods}
     ahead = {m: over_seeds_and_images(*_minus(of[reference], of[m])) for m in methods[1:]}
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, won,
@@ -108,17 +121,8 @@ def compare(
     )  # fmt: skip
 
 
-_Scores = tuple[Float[np.ndarray, "seeds"], Float[np.ndarray, "draws seeds"]]
-"""Of a detector, on the test images and on resampled ones."""
-
-
-def _minus(a: _Scores, b: _Scores) -> _Scores:
+def _minus(a: Sample, b: Sample) -> Sample:
     return a[0] - b[0], a[1] - b[1]
-
-
-def _won_back(own: _Scores, ns: _Scores, matched: _Scores) -> Estimate:
-    (gain, gains), (gap, gaps) = _minus(own, ns), _minus(matched, ns)
-    return ratio(gain, gap, gains, gaps)
 
 
 def biased_ap(
