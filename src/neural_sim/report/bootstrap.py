@@ -60,7 +60,10 @@ def match(
         counts.append(len(truth))
         own = detections["labels"] == label
         order = detections["scores"][own].argsort(descending=True, stable=True)[:100]
-        overlap = box_iou(detections["boxes"][own][order].float(), truth.float()).numpy()
+        if len(truth):
+            overlap = box_iou(detections["boxes"][own][order].float(), truth.float()).numpy()
+        else:  # most images of another object
+            overlap = np.zeros((len(order), 0))
         rows += [index] * len(order)
         scores += detections["scores"][own][order].tolist()
         correct += list(_greedy(overlap))
@@ -71,13 +74,13 @@ def match(
 
 def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, "detections thresholds"]:
     correct = np.zeros((overlap.shape[0], len(THRESHOLDS)), dtype=bool)
-    for t, threshold in enumerate(THRESHOLDS):
-        free = np.ones(overlap.shape[1], dtype=bool)
-        for d, row in enumerate(overlap):
-            candidates = np.where(free, row, -1.0)
-            if candidates.size and candidates.max() >= threshold:
-                free[candidates.argmax()] = False
-                correct[d, t] = True
+    free = np.ones((len(THRESHOLDS), overlap.shape[1]), dtype=bool)
+    every = np.arange(len(THRESHOLDS))
+    for d, row in enumerate(overlap if overlap.shape[1] else ()):
+        candidates = np.where(free, row, -1.0)
+        best = candidates.argmax(1)
+        correct[d] = candidates[every, best] >= THRESHOLDS
+        free[every, best] &= ~correct[d]
     return correct
 
 
