@@ -112,6 +112,20 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
     torch.testing.assert_close(found.probes, total, rtol=1e-6, atol=1e-6 * float(total.abs().max()))
 
 
+def test_more_probes_a_step_than_there_are_score_each_once(micro):
+    made, found = micro.trained(RULE, micro.examples), []
+    for count in (0, 5):
+        how = Unrolled("reverse_over_reverse", probes_per_step=count, scored_steps=0, floor=0.0)
+        found.append(
+            how.accumulate(
+                made, micro.examples, micro.like, micro.slope(made.end), torch.Generator().manual_seed(0),
+                ProbeGroups(micro.cached.losses, [GROUP]),
+            )
+        )  # fmt: skip
+    assert found[0].scored == found[1].scored == len(made) * GROUP.numel()
+    torch.testing.assert_close(found[0].probes, found[1].probes, rtol=0.0, atol=0.0)
+
+
 def test_every_place_has_its_turn(generator):
     turns = list(itertools.islice(shuffled_passes(5, 2, generator), 10))
     assert torch.bincount(torch.cat(turns), minlength=5).tolist() == [4] * 5

@@ -96,6 +96,8 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
     rose = [learned.records[1].verdicts[name].accepted for name in ("a", "b")]
     assert torch.equal(accepted, torch.where(torch.tensor(rose)[:, None], tried, start))
     assert not torch.equal(last, accepted)
+    # Both derivatives of the first iteration are charged.
+    assert learned.records[0].products == 2 * learned.records[1].products > 0
 
 
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):

@@ -99,7 +99,8 @@ class Unrolled:
         product: how a batch's Hessian is multiplied, see :func:`gradient.unrolled.reversed_steps`.
         part: fraction of the steps, the last ones, that are reversed; 1 is exact.
         max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
-        probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them.
+        probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them. With
+            one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
         scored_steps: about the number of steps that score probes; 0: all. A longer training is divided into blocks, of
             which one step, drawn at random, scores probes with the block's weight, see :func:`step_weights`. More
             objects have more probes and more steps: were all scored, the cost would grow with their square.
@@ -151,7 +152,7 @@ class Unrolled:
         steps = reversed_steps(trajectory, examples, like, slope, self.product, wanted, self.floor)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
         per_bin = probes.per_bin if probes else 1
-        columns = shuffled_passes(per_bin, self.probes_per_step or per_bin, generator)
+        columns = shuffled_passes(per_bin, min(self.probes_per_step or per_bin, per_bin), generator)
         count = len(trajectory) - trajectory.first
         every = math.ceil(count / self.scored_steps) if self.scored_steps else 1
         weights = step_weights(count, every, generator)

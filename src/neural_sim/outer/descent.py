@@ -66,17 +66,19 @@ class GradientLoop(OuterLoop, ABC):
         self.psi.data[self._learned] = self.steps.reported
         checks, first, every = self.settings.steps == "checked", not self.records, self.settings.certify_every
         due = every > 0 and (len(self.records) + 1) % every == 0
+        products = 0
         for trial in range(self.settings.checks.trainings if checks and first else 1):
             if trial or not first:
                 self.inner.renew()  # what is peculiar to one training averages out of the derivatives
             rendered, result, training_loss = self._differentiated(seconds, whole=due)
+            products += _products(result)
             p_values = self.steps.observe(result)
         with timed(seconds, "certify", self.inner.device):
             cosine = self._cosine(result) if due else math.nan
         factors = self.scene.distribution.names
         trust, otherwise = self.settings.trust, self.settings.on_untrusted
         certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
-        products, by_class, images = _products(result), self._before.sum(1), rendered.images
+        by_class, images = self._before.sum(1), rendered.images
         after = self.steps.next(certificate)
         certificate = certificate.waiting(self.steps.waiting)
         self.record(
