@@ -17,11 +17,10 @@ from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.objective import Objective
-from neural_sim.outer.steps import stacked
+from neural_sim.outer.steps import by_p, stacked
 from neural_sim.stages.context import Context
 
 
@@ -48,22 +47,14 @@ class Setting:
         return torch.stack(self.variances).mean(0)
 
 
-def by_p(loop: GradientLoop, result: Hypergradient) -> tuple[Tensor, Tensor]:
-    """The gain by p of the first factor, centred, and the mean variance of a component, of every object."""
-    psi = loop.psi.detach()
-    factor = loop.scene.distribution.factors[0]
-    gradient, error = (
-        loop.scene.distribution.split(values)[factor.name]
-        for values in stacked(result, loop.scene.names, psi)
-    )
-    scale = factor.log_slopes(loop.scene.distribution.split(psi)[factor.name]).exp()
-    direction = -gradient / scale
-    return direction - direction.mean(-1, keepdim=True), (error / scale).square().mean(-1)
-
-
 def measure(loop: GradientLoop, settings: list[Setting], trainings: int) -> float:
-    """Fill ``settings``; returns an iteration's seconds without the derivative, on average."""
+    """Fill ``settings`` with derivatives by p of the first factor.
+
+    Returns the seconds of the rest of an iteration, on average.
+    """
     inner, own, spent = loop.inner, loop.inner.settings, 0.0
+    distribution, psi = loop.scene.distribution, loop.psi.detach()
+    factor = distribution.factors[0]
     inner.common_numbers = True
     for _ in range(trainings):
         begun = time.perf_counter()
@@ -78,9 +69,11 @@ def measure(loop: GradientLoop, settings: list[Setting], trainings: int) -> floa
             inner.settings = loop.settings = replace(
                 own, unrolled=replace(own.unrolled, probes_per_step=setting.probes)
             )
-            direction, variance = by_p(loop, loop._derivative(rendered, cached))
+            of_psi = stacked(loop._derivative(rendered, cached), loop.scene.names, psi)
+            parts = (distribution.split(values)[factor.name] for values in (psi, *of_psi))
+            direction, variance = by_p(factor, *parts)
             setting.derivatives.append(direction)
-            setting.variances.append(variance)
+            setting.variances.append(variance.mean(-1))
             setting.seconds.append(time.perf_counter() - begun)
         inner.settings = loop.settings = own
         inner.renew()

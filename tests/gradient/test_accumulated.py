@@ -59,9 +59,10 @@ def up_to_a_constant(values):
     return values - values.mean(-1, keepdim=True)
 
 
-def test_all_probes_in_all_steps_are_the_sum_of_their_scores(micro):
+@pytest.mark.parametrize("per_step", [0, 5])  # 5: more than there are
+def test_all_probes_in_all_steps_are_the_sum_of_their_scores(micro, per_step):
     made = micro.trained(RULE, micro.examples)
-    how = dataclasses.replace(EXACT, probes_per_step=0, chunk_size=3)
+    how = dataclasses.replace(EXACT, probes_per_step=per_step, chunk_size=3)
     found = micro.accumulated(RULE, how, probes=ProbeGroups(micro.cached.losses, [GROUP]))
     expected = up_to_a_constant(all_scores(micro, made).sum(0))
     assert found.scored == 6 * 8
@@ -110,20 +111,6 @@ def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
             levels = means
     assert found.scored == 3 * 4
     torch.testing.assert_close(found.probes, total, rtol=1e-6, atol=1e-6 * float(total.abs().max()))
-
-
-def test_more_probes_a_step_than_there_are_score_each_once(micro):
-    made, found = micro.trained(RULE, micro.examples), []
-    for count in (0, 5):
-        how = Unrolled("reverse_over_reverse", probes_per_step=count, scored_steps=0, floor=0.0)
-        found.append(
-            how.accumulate(
-                made, micro.examples, micro.like, micro.slope(made.end), torch.Generator().manual_seed(0),
-                ProbeGroups(micro.cached.losses, [GROUP]),
-            )
-        )  # fmt: skip
-    assert found[0].scored == found[1].scored == len(made) * GROUP.numel()
-    torch.testing.assert_close(found[0].probes, found[1].probes, rtol=0.0, atol=0.0)
 
 
 def test_every_place_has_its_turn(generator):

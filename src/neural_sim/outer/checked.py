@@ -22,7 +22,7 @@ from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.evidence import Average
 from neural_sim.outer.settings import Checks
-from neural_sim.outer.steps import PValues, Verdict, fractions, stacked
+from neural_sim.outer.steps import PValues, Verdict, by_p, fractions, stacked
 from neural_sim.outer.trust_region import within
 from neural_sim.parameter.product import SceneDistribution
 
@@ -140,11 +140,7 @@ class CheckedSteps:
         p_values: dict[str, dict[str, float]] = {name: {} for name in self.names}
         for factor in self.distribution.factors:
             name = factor.name
-            scale = factor.log_slopes(psi[name]).exp()
-            # The derivative by p: that by logits is p - floor times it, and would hardly move a bin of small p.
-            direction = -slope[name] / scale
-            direction = direction - direction.mean(-1, keepdim=True)
-            self._joined[name] = self._joined[name].joined(direction, (noise[name] / scale).square())
+            self._joined[name] = self._joined[name].joined(*by_p(factor, psi[name], slope[name], noise[name]))
             for object_name, value in zip(self.names, self._joined[name].p_values.tolist(), strict=True):
                 p_values[object_name][name] = value
         return p_values

@@ -12,7 +12,7 @@ from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.evidence import Average
 from neural_sim.outer.settings import Checks
-from neural_sim.outer.steps import stacked
+from neural_sim.outer.steps import by_p, stacked
 from neural_sim.outer.trust_region import within
 from neural_sim.parameter.product import SceneDistribution
 
@@ -70,14 +70,11 @@ def expected(
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
-        p, scale = factor.p_of(own), factor.log_slopes(own).exp()
+        p = factor.p_of(own)
         average = Average.zeros(own)
         for result in results:
             gradient, error = (distribution.split(v)[factor.name] for v in stacked(result, names, psi))
-            # By p, as in CheckedSteps: that by logits is p - floor times it.
-            direction = -gradient / scale
-            direction = direction - direction.mean(-1, keepdim=True)
-            average = average.joined(direction, (error / scale).square())
+            average = average.joined(*by_p(factor, own, gradient, error))
         variance = average.variance
         bins = torch.eye(p.shape[-1], dtype=p.dtype)
         toward = moved * (bins - p[:, None, :])  # [objects, bin moved to, change of p]

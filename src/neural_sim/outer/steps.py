@@ -133,6 +133,22 @@ def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrin
     return [taken[certificate.actions[name][factor]] for name in names]
 
 
+def by_p(
+    factor: Factor,
+    psi: Float[Tensor, "objects k"],
+    gradient: Float[Tensor, "objects k"],
+    error: Float[Tensor, "objects k"],
+) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
+    """The derivative of minus L_val by a factor's p, centred, and its components' variances.
+
+    ``gradient`` and ``error`` are the derivative of L_val by psi and its standard errors. By logits it is p - floor
+    times that by p, and would hardly move a bin of small p.
+    """
+    scale = factor.log_slopes(psi).exp()
+    direction = -gradient / scale
+    return direction - direction.mean(-1, keepdim=True), (error / scale).square()
+
+
 def stacked(
     result: Hypergradient, names: Sequence[str], like: Tensor
 ) -> tuple[Float[Tensor, "objects K"], Float[Tensor, "objects K"]]:

@@ -74,9 +74,11 @@ def match(
 
 def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, "detections thresholds"]:
     correct = np.zeros((overlap.shape[0], len(THRESHOLDS)), dtype=bool)
+    if overlap.shape[1] == 0:
+        return correct
     free = np.ones((len(THRESHOLDS), overlap.shape[1]), dtype=bool)
     every = np.arange(len(THRESHOLDS))
-    for d, row in enumerate(overlap if overlap.shape[1] else ()):
+    for d, row in enumerate(overlap):
         candidates = np.where(free, row, -1.0)
         best = candidates.argmax(1)
         correct[d] = candidates[every, best] >= THRESHOLDS
