@@ -1,6 +1,7 @@
 """Comparisons on made-up runs whose answers are known: who is ahead, by how much, and whether it is certain."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -61,6 +62,15 @@ def test_leads_do_not_need_a_known_target():
     found, beside = compare(bare, "ours", draws=50), compare(runs, "ours", draws=50)
     assert found.bounds == ["ns"] and beside.bounds == ["ns", "matched"] and found.won_back == {}
     assert found.ahead == beside.ahead and found.ap == {m: e for m, e in beside.ap.items() if m != "matched"}
+
+
+def test_no_fraction_is_closed_where_there_is_no_gap():
+    runs = [run(method, s, ap) for s in range(3) for method, ap in (("ours", 0.2), ("other", 0.3))]
+    at_target = [dataclasses.replace(r, matches=r.matches | {"matched": r.matches["ns"]}) for r in runs]
+    found = compare(at_target, "ours", draws=50)
+    assert found.won_back == {} and found.ahead["other"].value == pytest.approx(-0.1, abs=0.01)
+    assert "nan" not in markdown(found, [_with_distances(each) for each in at_target])
+    json.dumps(dataclasses.asdict(found), allow_nan=False)
 
 
 def test_a_lead_that_hangs_on_the_seed_is_not_certain():

@@ -38,9 +38,9 @@ class Comparison:
     """The methods of one setting over the seeds that all of them have.
 
     ``ap`` is the biased objects' mean AP, of ``bounds`` too; ``won_back`` the fraction of the gap from ns to matched,
-    empty without matched; ``ahead`` the
-    reference method's AP minus each other's, ``area`` the difference of their areas under AP against log seconds, per
-    unit of log seconds, by ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
+    empty without matched, and where the start is the target's and there is no gap; ``ahead`` the reference method's AP
+    minus each other's, ``area`` the difference of their areas under AP against log seconds, per unit of log seconds, by
+    ``clock``. ``at_equal_cost`` is every method's AP at the seconds that the cheapest of them
     took in all (their mean over seeds is ``equal_cost``), see :func:`ap_at`; ``ahead_at`` is the reference method's
     lead over each other one at each of ``budgets`` seconds, which reach from the first scored iteration of any run to
     the last; a method that has ended by then keeps its last AP. ``spent`` are means over seeds, with the warm start.
@@ -109,7 +109,8 @@ def compare(
     won = {}
     if "matched" in bounds:
         gap = _minus(of["matched"], of["ns"])
-        won = {m: ratio(_minus(of[m], of["ns"]), gap) for m in methods}
+        each = {m: ratio(_minus(of[m], of["ns"]), gap) for m in methods}
+        won = {m: fraction for m, fraction in each.items() if not math.isnan(fraction.value)}
     ahead = {m: over_seeds_and_images(*_minus(of[reference], of[m])) for m in methods[1:]}
     return Comparison(
         runs[0].setting, seeds, methods, reference, ap, won,
