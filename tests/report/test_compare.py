@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from neural_sim.report import logged, tracking
-from neural_sim.report.compare import Compare
+from neural_sim.report.compare import Compare, plain
 
 CONFIG = {
     **{group: {"size": 1} for group in (
@@ -158,3 +158,8 @@ def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):
     Compare(("gap",), draws=5).compare(uri, 0, {}, tmp_path / "compare")
     text = (tmp_path / "compare" / "compare.md").read_text()
     assert "Seconds are not comparable" in text and "cpu: lts seed 0" in text
+
+
+def test_numbers_that_json_lacks_are_null():
+    document = {"a": [float("nan"), (1.0, float("inf"))], "b": {"c": 2, "d": "nan"}}
+    assert plain(document) == {"a": [None, [1.0, None]], "b": {"c": 2, "d": "nan"}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,7 +105,7 @@ class Compare:
         text = "\n\n".join([*parts, *left_out_table(chosen.left_out)])
         left = [dataclasses.asdict(run) for run in chosen.left_out]
         (folder / "compare.json").write_text(
-            json.dumps({"comparisons": documents, "left_out": left}, indent=1)
+            json.dumps(plain({"comparisons": documents, "left_out": left}), indent=1, allow_nan=False)
         )
         (folder / "compare.md").write_text(text + "\n")
         page = write_comparison_page(sections, dict(by_reason(chosen.left_out)), folder)
@@ -209,6 +210,15 @@ def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
     return ["", f"Seconds are not comparable, the runs were made on devices of several kinds ({named})."] * (
         len(kinds) > 1
     )
+
+
+def plain(tree: Any) -> Any:
+    """NaN as None, so that the file is JSON by the standard."""
+    if isinstance(tree, Mapping):
+        return {key: plain(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [plain(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
 
 
 def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:

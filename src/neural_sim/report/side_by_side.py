@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 
 from neural_sim.report import figures, tracking
 from neural_sim.report.bootstrap import Outcomes, class_scores, mean_of_known
-from neural_sim.report.compare import points
+from neural_sim.report.compare import plain, points
 from neural_sim.report.figures import CLASS_COLOURS, GRID, INK
 from neural_sim.report.intervals import Estimate, over_seeds_and_images
 from neural_sim.types import LabelledImages
@@ -142,7 +141,7 @@ def report_side_by_side(
     text = "\n\n".join([part for part in (table(found, heading), text) if part])
     (folder / f"{name}.md").write_text(text + "\n")
     document = {**dataclasses.asdict(found), **(extra or {})}
-    (folder / f"{name}.json").write_text(json.dumps(_plain(document), indent=1, allow_nan=False))
+    (folder / f"{name}.json").write_text(json.dumps(plain(document), indent=1, allow_nan=False))
     figures.save(ap_figure(found, heading), folder / "figures" / "ap.png")
     for called, drawn in (more_figures or {}).items():
         figures.save(drawn, folder / "figures" / f"{called}.png")
@@ -161,12 +160,3 @@ def report_side_by_side(
     return tracking.log_run(
         uri, name, f"seed {seed}", {"seed": seed}, tracking.flatten(config), metrics, {}, folder, begun
     )
-
-
-def _plain(tree: Any) -> Any:
-    """NaN as None, so that the file is JSON by the standard."""
-    if isinstance(tree, Mapping):
-        return {key: _plain(value) for key, value in tree.items()}
-    if isinstance(tree, (list, tuple)):
-        return [_plain(value) for value in tree]
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
