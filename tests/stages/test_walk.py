@@ -100,6 +100,26 @@ def test_what_no_asked_stage_makes_must_be_in_the_store(folder, returned, tmp_pa
     }
 
 
+@pytest.mark.parametrize(
+    ("stages", "missing", "named"),
+    [
+        ("target_sets,warm_start", "field of pitcher", "field"),
+        ("views,target_sets,psi", "detector trained on the uniform distribution", "warm_start"),
+        ("views,field,target_sets,evaluate", "psi loop", "psi"),
+    ],
+)
+def test_a_missing_stage_is_refused_before_any_work(stages, missing, named, tmp_path):
+    """Such as a field that is missed only after minutes of rendering a target."""
+    context, steps = _context(tmp_path, f"stages=[{stages}]", "baseline=neural_sim")
+    with pytest.raises(ValueError, match=rf"stages: {missing} is not in .*; add stage {named} to \["):
+        walk(context, steps)
+    assert not (tmp_path / "store").exists() and not context.account.seconds
+
+
+def test_a_method_that_keeps_its_distribution_needs_no_detector(tmp_path):
+    assert walk(*_context(tmp_path, "stages=[psi]")) is None
+
+
 def test_val_and_test_share_no_image(folder, returned):
     rendered = _targets(_context(folder)[0])
     assert not _pixels(rendered.val) & _pixels(rendered.test)

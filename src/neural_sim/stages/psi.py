@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -71,6 +71,10 @@ class PsiStage(Stage[LearnedPsi]):
     @property
     def title(self) -> str:
         return "psi loop"
+
+    @property
+    def needed(self) -> Iterator[Stage[Any]]:
+        return iter(()) if isinstance(self.method, Fixed) else self.inputs
 
     @property
     def draws(self) -> Draws:

@@ -83,6 +83,11 @@ class Stage(ABC, Generic[T]):
             return [{"stage": item.key} if isinstance(item, Stage) else describe(item) for item in value]
         return describe(value)
 
+    @property
+    def needed(self) -> Iterator[Stage[Any]]:
+        """The inputs whose results :meth:`make` reads: all of them, unless a stage says otherwise."""
+        return self.inputs
+
     @cached_property
     def key(self) -> str:
         """Of the result in the store."""
@@ -103,6 +108,7 @@ class Results:
     ) -> None:
         self._store, self._asked, self._reused = store, tuple(asked), reused
         self._kept: dict[str, Any] = {}
+        self._checked: set[str] = set()
 
     def __call__(self, stage: Stage[T]) -> T:
         """The stage's result.
@@ -115,10 +121,7 @@ class Results:
             return self._kept[name]
 
         def make() -> Any:
-            if stage.name not in self._asked:
-                raise ValueError(
-                    f"stages: {stage.title} is not in {self._store.root}; add stage {stage.name} to {list(self._asked)}"
-                )
+            self._refuse_unasked(stage)
             return stage.pack(stage.make(self))
 
         if not stage.stored:
@@ -131,3 +134,26 @@ class Results:
         if stage.keep:
             self._kept[name] = value
         return value
+
+    def check(self, stage: Stage[Any]) -> None:
+        """Refuse now what evaluating the stage would refuse, perhaps after minutes of work on other results.
+
+        Raises:
+            ValueError: as evaluating it.
+        """
+        name = f"{stage.kind} {stage.key}"
+        if name in self._kept or name in self._checked:
+            return
+        if stage.stored:
+            if self._store.has(stage.kind, stage.key):
+                return
+            self._refuse_unasked(stage)
+        for needed in stage.needed:
+            self.check(needed)
+        self._checked.add(name)
+
+    def _refuse_unasked(self, stage: Stage[Any]) -> None:
+        if stage.name not in self._asked:
+            raise ValueError(
+                f"stages: {stage.title} is not in {self._store.root}; add stage {stage.name} to {list(self._asked)}"
+            )

@@ -47,7 +47,7 @@ class Store:
         with ``weights_only``, so that a shared store cannot run code. An unreadable entry is computed again, with
         a warning.
         """
-        path = self.root / kind / f"{key}.pt"
+        path = self._path(kind, key)
         entry = _read(path)
         if entry is not None:
             return entry
@@ -63,6 +63,13 @@ class Store:
             _write(path.with_suffix(".json"), lambda name: Path(name).write_text(text))
             _write(path, lambda name: torch.save({"value": value, "seconds": seconds}, name))
         return Entry(value, seconds, reused=False)
+
+    def has(self, kind: str, key: str) -> bool:
+        """Whether there is a file of the result; it is not read."""
+        return self._path(kind, key).is_file()
+
+    def _path(self, kind: str, key: str) -> Path:
+        return self.root / kind / f"{key}.pt"
 
 
 @contextmanager

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from neural_sim.stages.context import Context, Step
+from neural_sim.stages.graph import Graph
 from neural_sim.stages.plan import plan
 from neural_sim.stages.report import write_report
+from neural_sim.stages.stage import Stage
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +54,16 @@ def evaluate(context: Context) -> None:
     context.returned = results(graph.scores(learned.last, "learned", "val")).ap.mean
 
 
+_MADE: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
+    "views": lambda graph: graph.views,
+    "field": lambda graph: graph.fields,
+    "target_sets": lambda graph: [graph.targets],
+    "warm_start": lambda graph: [graph.warm_start],
+    "psi": lambda graph: [graph.learned],
+    "evaluate": lambda graph: [graph.learned, graph.scores(graph.psi("initial"), "ns")],
+}
+"""What steps make that is known before any runs."""
+
 STEPS: Mapping[str, Callable[[Context], None]] = {
     "views": views,
     "field": fields,
@@ -77,6 +90,9 @@ def walk(context: Context, others: Mapping[str, Step]) -> float | None:
         if not context.graph.renders_target:
             # Photographs that cannot be used are refused before fields are fitted.
             asked.sort(key=lambda name: name != "target_sets")
+        for name in asked:
+            for stage in _MADE[name](context.graph) if name in _MADE else ():
+                context.results.check(stage)
     for omission in context.account.left_out:
         fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
         _log.info("left out: %s%s: %s", omission.what, fraction, omission.why)
