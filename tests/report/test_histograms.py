@@ -43,3 +43,15 @@ def test_bars_are_the_probabilities():
         and initial == pytest.approx(dominant(4))
     )
     assert [tick.get_text() for tick in axes.get_xticklabels()] == [str(b) for b in range(1, 9)]
+
+
+@pytest.mark.parametrize(
+    ("seeds", "learned"), [((0, 1, 2), dominant(1)), ((0, 1, 2, 3, 4), [0.23, *[0.11] * 7])]
+)
+def test_seeds_that_agree_have_bars_without_a_spread(seeds, learned):
+    """The mean of equal numbers can differ from them by a rounding error, which is no length of a bar."""
+    figure = histogram_figure(list(histograms([setting(seeds=seeds, learned=learned)])))
+    (bars,) = (each for each in figure.axes[0].containers if getattr(each, "errorbar", None) is not None)
+    assert [bar.get_height() for bar in bars.patches] == pytest.approx(learned)
+    for segment in bars.errorbar.lines[2][0].get_segments():
+        assert segment[0, 1] == pytest.approx(segment[1, 1], abs=1e-6)

@@ -81,9 +81,9 @@ def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
         for i, (which, colour) in enumerate(colours.items()):
             p = each.p[which]
             mean = p.mean(0)
-            spread = (
-                np.stack([mean - p.min(0), p.max(0) - mean]) if which == "learned" and len(p) > 1 else None
-            )
+            spread = None
+            if which == "learned" and len(p) > 1:  # the mean of equal numbers may round past them
+                spread = np.stack([mean - p.min(0), p.max(0) - mean]).clip(min=0.0)
             bars = axes.bar(x + 0.28 * (i - 1), mean, 0.26, yerr=spread, color=colour, capsize=2,
                             error_kw={"linewidth": 0.8, "ecolor": figures.INK})  # fmt: skip
             handles.append(bars)
