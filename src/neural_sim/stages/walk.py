@@ -61,6 +61,7 @@ _MADE: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
     "warm_start": lambda graph: [graph.warm_start],
     "psi": lambda graph: [graph.learned],
     "evaluate": lambda graph: [graph.learned, graph.scores(graph.psi("initial"), "ns")],
+    "report": lambda graph: (),  # reads what depends on the learned psi
 }
 """What steps make that is known before any runs."""
 
@@ -91,7 +92,7 @@ def walk(context: Context, others: Mapping[str, Step]) -> float | None:
             # Photographs that cannot be used are refused before fields are fitted.
             asked.sort(key=lambda name: name != "target_sets")
         for name in asked:
-            for stage in _MADE[name](context.graph) if name in _MADE else ():
+            for stage in _MADE[name](context.graph):
                 context.results.check(stage)
     for omission in context.account.left_out:
         fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
