@@ -27,7 +27,8 @@ from neural_sim.stages.context import Context
 @dataclass
 class Setting:
     """The probes of every bin that a step scores, and L_val; one derivative by p, its variance by images and its
-    seconds for each training."""
+    seconds for each training.
+    """
 
     probes: int
     part: str

@@ -50,7 +50,8 @@ def measured(
     context: Context, psi: Float[Tensor, "objects K"], seed: int, first_order: AdjointSolver
 ) -> Measured:
     """By ``response`` and each of ``WAYS``: the rise of an object's score, or of L_val with the other sign, by the
-    part of its images that moves to each bin."""
+    part of its images that moves to each bin.
+    """
     stage = replace(context.graph.learned, initial=psi, seed=seed)
     loop = stage.loop(context.results)
     if not isinstance(loop, SimulatorModule):
@@ -76,7 +77,8 @@ def measured(
 
 def correlations(repeats: list[Measured], label: int) -> dict[str, float]:
     """Over one object's bins: of the response and of the unrolled derivative under two seeds, and of each way with the
-    response of its own seed."""
+    response of its own seed.
+    """
     rows = [{way: values[label] for way, values in held.items()} for held in repeats]
 
     def between_seeds(way: str) -> float:

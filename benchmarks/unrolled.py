@@ -155,7 +155,8 @@ def clock(work: Callable[[], Any]) -> float:
 
 def costs(world: World, repeats: int, brief: bool = False) -> dict[str, float]:
     """Medians of a training's seconds, and of everything else in trainings beside it; megabytes of what is kept, and
-    numbers that are trained. ``brief``: the default way alone."""
+    numbers that are trained. ``brief``: the default way alone.
+    """
     rows, found, none = world.rows(0), [], torch.Generator()
     data = world.pool.select(rows)
     examples = Examples(data.inputs, data.losses_from)

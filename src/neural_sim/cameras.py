@@ -78,7 +78,8 @@ def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
     """The camera of images of another size that show, centred and in the same proportions, all that this one's do: in
-    their direction of more room they show more."""
+    their direction of more room they show more.
+    """
     scale = min(width / camera.width, height / camera.height)
     fy = scale * focal_length(camera)
     x, y = principal_point(camera)
@@ -98,7 +99,8 @@ def turned(
     camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], shift: tuple[float, float]
 ) -> Float[Tensor, "4 4"]:
     """The pose turned about its own place by the smallest angle after which what projected to the principal point does
-    so ``shift`` pixels (right, down) of it. The direction from the object to the camera stays."""
+    so ``shift`` pixels (right, down) of it. The direction from the object to the camera stays.
+    """
     fx, fy = focal_lengths(camera)
     ahead = camera_to_world.new_tensor([0.0, 0.0, -1.0])
     aim = camera_to_world.new_tensor([shift[0] / fx, -shift[1] / fy, -1.0])
@@ -125,7 +127,8 @@ def cameras_of(
     camera: PinholeCamera, magnification: Float[Tensor, "n"] | None
 ) -> list[tuple[PinholeCamera, slice]]:
     """Cameras and the images of each: one camera for all images, or one for each focal length (``magnification``, in
-    units of the camera's)."""
+    units of the camera's).
+    """
     if magnification is None:
         return [(camera, slice(None))]
     return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(magnification.tolist())]

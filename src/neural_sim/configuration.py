@@ -31,7 +31,8 @@ LONGEST = 150
 
 def job_folder(number: int | str, overrides: str) -> str:
     """Name of the folder of a sweep's job: its number and its overrides, cut where they are long. They are all in
-    ``.hydra/overrides.yaml`` of the folder."""
+    ``.hydra/overrides.yaml`` of the folder.
+    """
     return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
 
 

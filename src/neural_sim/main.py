@@ -242,7 +242,8 @@ class RefuseStudies(Callback):
     """Stops a study whose data is missing or whose settings are wrong before its first job.
 
     A study is an experiment that sweeps by itself, by ``hydra.sweeper.params``. Each of its jobs would fail in the same
-    way."""
+    way.
+    """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         if not config.hydra.sweeper.get("params"):
@@ -256,7 +257,8 @@ class RefuseStudies(Callback):
 
 class OwnFolder(Callback):
     """A folder of its own for each of the runs, or sweeps, of an experiment that begin in the same second, by which
-    folders are named. A folder that the command line names is taken as it is."""
+    folders are named. A folder that the command line names is taken as it is.
+    """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._take(config, "run")

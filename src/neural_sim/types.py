@@ -117,7 +117,8 @@ class LabelledImages:
     @staticmethod
     def concatenate(parts: list[LabelledImages]) -> LabelledImages:
         """Join sets of equal image size; boxes are padded to the longest list among them. Where one set has a bin for
-        each box all have, those of an image that has one for all its boxes being equal."""
+        each box all have, those of an image that has one for all its boxes being equal.
+        """
         if not parts:
             raise ValueError("concatenate: got no image sets, want at least one")
         most, each = max(part.boxes.shape[1] for part in parts), any(part.bins.ndim == 2 for part in parts)

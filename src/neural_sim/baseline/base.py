@@ -73,7 +73,8 @@ class HypergradientLoop:
 @dataclass(frozen=True)
 class Response:
     """psi moves by the measured response of training, without a derivative: a training for each bin, in which ``part``
-    of every object's images moves to it (:mod:`outer.response`)."""
+    of every object's images moves to it (:mod:`outer.response`).
+    """
 
     name: str
     part: float = 0.15

@@ -35,7 +35,8 @@ def cached_features(
 @dataclass(frozen=True)
 class CachedSet:
     """Features of n images under the frozen backbone, one tensor [n, ...] for each level, and the targets of their
-    anchors: the inputs of the predictor's loss."""
+    anchors: the inputs of the predictor's loss.
+    """
 
     detector: Detector
     features: tuple[Tensor, ...]
@@ -60,7 +61,8 @@ class CachedSet:
         detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
     ) -> CachedSet:
         """As of one set of all images, in the same batches, with no more images in memory than one of ``sets`` and a
-        batch. Raises ``ValueError`` for no set."""
+        batch. Raises ``ValueError`` for no set.
+        """
         parts: list[CachedSet] = []
         waiting: list[LabelledImages] = []
         for images in sets:

@@ -24,7 +24,8 @@ from neural_sim.detector.targets import Targets, assign_points
 class FcosHead(nn.Module):
     """torchvision's two branches; the code is the distances to the left, upper, right and lower side of the box in
     strides, and the centre-ness logit. Distances are positive by softplus, where torchvision's ReLU has no curvature
-    and at negative values no gradient; ``activation`` relu keeps that."""
+    and at negative values no gradient; ``activation`` relu keeps that.
+    """
 
     def __init__(self, settings: Head, num_classes: int, activation: str) -> None:
         super().__init__()
@@ -100,7 +101,8 @@ class Fcos(PyramidDetector):
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
         """Focal loss, loss of the generalised intersection over union (Rezatofighi et al. 2019) and centre-ness loss of
-        each image, each a sum over points by the number of foreground points."""
+        each image, each a sum over points by the number of foreground points.
+        """
         (logits, code), labels = outputs, targets.labels
         wanted = (labels[..., None] == torch.arange(self.num_classes, device=labels.device)).to(logits.dtype)
         foreground = (labels >= 0).to(logits.dtype)

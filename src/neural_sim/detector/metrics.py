@@ -19,7 +19,8 @@ from neural_sim.types import LabelledImages
 @dataclass(frozen=True)
 class AveragePrecision:
     """``ap`` is the mean over overlaps 0.50 to 0.95 and classes, ``ap50`` that at an overlap of 0.50; both by class
-    name, too. A class without a box is nan and stays out of the means."""
+    name, too. A class without a box is nan and stays out of the means.
+    """
 
     ap: float
     ap50: float
@@ -35,7 +36,8 @@ class AveragePrecision:
 @dataclass(frozen=True)
 class Accuracy:
     """``accuracy`` is the mean over classes of the fraction of a class's images whose best class is right; by class
-    name, too. A class without an image is nan and stays out of the mean."""
+    name, too. A class without an image is nan and stays out of the mean.
+    """
 
     accuracy: float
     per_class: dict[str, float]

@@ -36,7 +36,8 @@ def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
 
 class CoarserLevels(ExtraFPNBlock):
     """Levels past the backbone's last map C5: P6 a convolution of stride 2 on C5, P7 one on the activated P6, and so on
-    (Lin et al. 2017, Sec. 4). A level is never smaller than one pixel."""
+    (Lin et al. 2017, Sec. 4). A level is never smaller than one pixel.
+    """
 
     def __init__(self, in_channels: int, channels: int, count: int, activation: str) -> None:
         super().__init__()

@@ -34,7 +34,8 @@ def check_packages(key: str) -> None:
 
 class Decoded(nn.Module):
     """Images [n, 3, h, w] in [0, 1] to the boxes [n, anchors, 4] of all anchors as (x0, y0, x1, y1) in pixels, and
-    their scores [n, anchors, classes] in [0, 1]."""
+    their scores [n, anchors, classes] in [0, 1].
+    """
 
     def __init__(self, saved: SavedDetector) -> None:
         super().__init__()
@@ -94,7 +95,8 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
 @torch.no_grad()
 def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "n 3 h w"]) -> float:
     """Between torch and onnxruntime on a file without non-maximum suppression: of scores, and of boxes as fractions of
-    the image's longer side."""
+    the image's longer side.
+    """
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

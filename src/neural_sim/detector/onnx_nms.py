@@ -14,7 +14,8 @@ INPUTS = ("anchor_boxes", "anchor_scores")
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
     """``model`` (an ``onnx.ModelProto`` with the outputs ``INPUTS``), continued as :meth:`Detector.predict` goes on:
-    the best candidates of each level, suppression within each class, the best ``limit`` of each image."""
+    the best candidates of each level, suppression within each class, the best ``limit`` of each image.
+    """
     import onnx
 
     text = _graph(saved, model.opset_import[0].version, model.ir_version)

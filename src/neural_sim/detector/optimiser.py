@@ -27,7 +27,8 @@ class Rule(Protocol):
     def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> Self:
         """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``; itself for a
         ``fraction`` of 0, or a rule that divides by nothing. ``sizes`` are the numbers of entries of theta's tensors,
-        in their order."""
+        in their order.
+        """
         ...
 
 

@@ -97,7 +97,8 @@ class Detector(ABC):
         self, code: Float[Tensor, "*n code"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:
         """Boxes (x0, y0, x1, y1) in pixels, within the image: of all anchors, from a code [n, anchors, code], or of
-        those that ``anchor`` lists, from theirs [m, code]. Differentiable in the code."""
+        those that ``anchor`` lists, from theirs [m, code]. Differentiable in the code.
+        """
 
     # --- what follows from it ---
 
@@ -127,7 +128,8 @@ class Detector(ABC):
         self, trainable: Parameters, features: Sequence[Tensor], targets: Targets
     ) -> Float[Tensor, "n"]:
         """:meth:`losses_of` the :meth:`outputs`. A jvp along v gives every image's score <dl_i / dtheta, v> in one
-        pass."""
+        pass.
+        """
         return self.losses_of(self.outputs(trainable, features), targets)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
@@ -136,7 +138,8 @@ class Detector(ABC):
 
     def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
         """At most ``per_class`` detections of each class in each image, of its ``candidates`` best logits after
-        non-maximum suppression. No score is too low: a box that is missed today should be able to rise."""
+        non-maximum suppression. No score is too low: a box that is missed today should be able to rise.
+        """
         logits, code = self.ranking(outputs), outputs[1]
         top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
         image = torch.arange(len(top), device=top.device)[:, None].expand_as(index).flatten()
@@ -154,7 +157,8 @@ class Detector(ABC):
         self, params: Parameters, images: Float[Tensor, "n 3 h w"], batch_size: int = 64
     ) -> list[dict[str, Tensor]]:
         """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
-        :class:`Detections`."""
+        :class:`Detections`.
+        """
         backbone, trainable = self.split(params)
         detections, device = [], next(iter(trainable.values())).device
         for chunk in images.split(batch_size) if len(images) else ():

@@ -107,7 +107,8 @@ class Real:
 
     def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
         """Those that train: a random subset, the first of an order that depends on ``seed`` alone. Raises as ``number``
-        does."""
+        does.
+        """
         available = 0 if photographs is None else len(photographs)
         count = self.number(available)
         generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 3)
@@ -167,7 +168,8 @@ def shuffled_passes(
     size: int, per_batch: int, generator: torch.Generator
 ) -> Iterator[Int[Tensor, "per_batch"]]:
     """``per_batch`` of the numbers below ``size`` at a time from shuffled passes over all: each is equally likely in
-    every batch."""
+    every batch.
+    """
     remaining = torch.zeros(0, dtype=torch.long)
     while True:
         while len(remaining) < per_batch:

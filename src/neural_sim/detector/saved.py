@@ -1,5 +1,6 @@
 """A trained detector as two files: ``model.safetensors``, its parameters, and ``model.json``, all else that it needs to
-be built again and used: its class and settings, class names, image size, normalisation, camera."""
+be built again and used: its class and settings, class names, image size, normalisation, camera.
+"""
 
 from __future__ import annotations
 

@@ -184,7 +184,8 @@ class Losses:
 @dataclass(frozen=True)
 class Detections:
     """Which predictions are detections: per level, the ``candidates`` best scores above ``score_threshold``; then
-    non-maximum suppression within each class at ``nms_iou``, and the best ``limit`` are kept."""
+    non-maximum suppression within each class at ``nms_iou``, and the best ``limit`` are kept.
+    """
 
     score_threshold: float = 0.05
     nms_iou: float = 0.5

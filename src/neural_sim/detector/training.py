@@ -65,7 +65,8 @@ class Training:
 @dataclass(frozen=True)
 class TrainingHistory:
     """``losses``: mean training loss of each epoch, as met by the steps; ``steps``: optimiser steps done;
-    ``trajectory``: the steps themselves, where they were to be recorded."""
+    ``trajectory``: the steps themselves, where they were to be recorded.
+    """
 
     losses: tuple[float, ...]
     steps: int

@@ -69,7 +69,8 @@ class Surface:
         optical: Float[Tensor, "k"],
     ) -> None:
         """Look at samples of rays ``ray``: the distances of their middles, the lengths that they stand for, the optical
-        depth before each, and its own."""
+        depth before each, and its own.
+        """
         here = ((before < HALF) & (before + optical >= HALF)).nonzero()[:, 0]
         fraction = (HALF - before.index_select(0, here)) / optical.index_select(0, here)
         length = width.index_select(0, here) if isinstance(width, Tensor) else width

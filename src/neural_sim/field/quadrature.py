@@ -35,7 +35,8 @@ def sum_rays(
 
 def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
     """Running sums over the samples, channel by channel where it is not the CPU that adds: CUDA walks the rows of a
-    matrix one by one, a single row in parallel."""
+    matrix one by one, a single row in parallel.
+    """
     if values.device.type == "cpu":
         return values.cumsum(0)
     return torch.stack([channel.cumsum(0) for channel in values.unbind(-1)], -1)

@@ -68,7 +68,8 @@ def least_alpha(views: PosedViews, points: Float[Tensor, "p 3"]) -> Float[Tensor
 
 def vertex_colours(mesh: trimesh.Trimesh, views: PosedViews) -> Float[np.ndarray, "v 3"]:
     """Mean colour in [0, 1] over the views that see each vertex, weighted towards those that face it; vertices that no
-    view sees have the mean colour of the others."""
+    view sees have the mean colour of the others.
+    """
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     points = torch.from_numpy(vertices.copy()).to(views.camera_to_world)
     total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))

@@ -77,6 +77,7 @@ def uncertain_error(
     penalty: float,
 ) -> Float[Tensor, ""]:
     """|C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, and ``penalty`` times the mean optical depth of the
-    transients' samples (NeRF in the Wild, Sec. 4.2). The square error is expected over backgrounds."""
+    transients' samples (NeRF in the Wild, Sec. 4.2). The square error is expected over backgrounds.
+    """
     errors = expected_errors(rendering, pixels).sum(-1)
     return (0.5 * errors / beta.square() + beta.log()).mean() + penalty * depths.mean()

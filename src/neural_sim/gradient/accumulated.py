@@ -197,7 +197,8 @@ class _Scoring:
 
 def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
     """Each step's weight, from the last step to the first: the block's length for one random step of each block, 0 for
-    others. Blocks are 1 to ``2 every - 1`` steps long, longer the later in the training, where scores scatter less."""
+    others. Blocks are 1 to ``2 every - 1`` steps long, longer the later in the training, where scores scatter less.
+    """
     left = steps
     while left:
         block = min(left, 1 + (2 * every - 1) * (left - 1) // steps)

@@ -91,7 +91,8 @@ class StratifiedEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """See :class:`Estimator`. Null hypothesis of its p-values: a factor's bins, or lights, have equal mean scores,
-        so that the derivative is zero."""
+        so that the derivative is zero.
+        """
         scored = losses.probes
         if scored is None:
             raise ValueError("stratified: wants losses of probes, got none")
@@ -153,7 +154,8 @@ class ReinforceEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """See :class:`Estimator`. Null hypothesis of its p-values: scores do not depend on the bins, or lights, that a
-        factor drew."""
+        factor drew.
+        """
         return self._by_score_function(
             scores(losses.cached, params, vector, images.index, self.chunk_size), images
         )

@@ -67,7 +67,8 @@ class InnerProblem:
         self, subset: Int[Tensor, "n"] | None = None, subset_weights: Float[Tensor, "n"] | None = None
     ) -> list[Term]:
         """The loss as a sum over chunks (and the proximal term), of all rows or of a subset that stands for them, see
-        ``subset``."""
+        ``subset``.
+        """
         index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
         weights = self.weights[index] if subset_weights is None else subset_weights
         if subset is not None and subset_weights is None:

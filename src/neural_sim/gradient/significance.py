@@ -105,14 +105,16 @@ def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "*d k"]) -> F
 
 def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
     """Values without their mean, in a unit of their own. The first value is subtracted beforehand: equal values give
-    exactly 0, not a rounding error."""
+    exactly 0, not a rounding error.
+    """
     apart = values - values[:1]
     return _scaled(apart - apart.mean(0))
 
 
 def _scaled(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
     """Each component over its largest absolute value, so that no square over- or underflows; zeros where a value is not
-    finite."""
+    finite.
+    """
     if not bool(values.isfinite().all()):
         return torch.zeros_like(values)
     largest = values.abs().amax(0, keepdim=True)

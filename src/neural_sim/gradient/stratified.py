@@ -60,7 +60,8 @@ def by_strata(
     scores: Float[Tensor, "n"], factor: Factor, psi: Float[Tensor, "k"], weight: float = 1.0
 ) -> MixedDerivative:
     """The derivative by one factor's psi from the scores of its probes, stratum after stratum, by :func:`stratified`;
-    for lights :func:`across_lights` instead."""
+    for lights :func:`across_lights` instead.
+    """
     table = scores.view(factor.size, -1)
     if isinstance(factor, BinnedFactor):
         return stratified(table, psi, factor.log_probabilities, weight)

@@ -221,7 +221,8 @@ def _from_one_side(
 
 def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     """A vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device. For a = 0 all
-    differences are zero."""
+    differences are zero.
+    """
     size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
     length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
     return (along.double() / size).to(theta) * length.to(theta), (size / length).to(theta)

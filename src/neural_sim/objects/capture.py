@@ -126,7 +126,8 @@ def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class Frame:
     """One photograph. ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and
-    unit. ``mask`` is a separate image file; ``test`` frames are the capture's own test set."""
+    unit. ``mask`` is a separate image file; ``test`` frames are the capture's own test set.
+    """
 
     image: Path
     camera_to_world: Float[np.ndarray, "4 4"]
@@ -138,7 +139,8 @@ class Frame:
 @dataclass(frozen=True)
 class Capture:
     """The photographs of an object. ``source`` is the file or folder with their cameras, ``files`` are all files that
-    were read, ``up`` is the world's up direction in the capture's frame, None if the source does not give it."""
+    were read, ``up`` is the world's up direction in the capture's frame, None if the source does not give it.
+    """
 
     name: str
     frames: tuple[Frame, ...]

@@ -36,7 +36,8 @@ SEEN_BY = 0.5
 @dataclass(frozen=True)
 class Placement:
     """``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere about the origin.
-    ``radius`` is that sphere's radius in the capture's unit."""
+    ``radius`` is that sphere's radius in the capture's unit.
+    """
 
     to_object: Float[np.ndarray, "4 4"]
     radius: float
@@ -137,7 +138,8 @@ def sphere_of(
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
     """The point nearest to the rays through the silhouettes' centres (least squares), and half the side of a cube about
-    the object."""
+    the object.
+    """
     normal, right = np.zeros((3, 3)), np.zeros(3)
     spans = []
     for frame, mask in shown:

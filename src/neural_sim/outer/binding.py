@@ -72,7 +72,8 @@ def object_images(
     scene: Scene, rendered: RenderedImages, psi: Tensor, weights: Tensor
 ) -> dict[str, ObjectImages]:
     """The images in which each object shows, by its name, with their rows in the training set; a path where draws are
-    relaxed. ``weights`` are those of all images in the training loss."""
+    relaxed. ``weights`` are those of all images in the training loss.
+    """
     pixels = rendered.images.images
     bound = {}
     for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):

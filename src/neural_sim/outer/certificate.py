@@ -141,7 +141,8 @@ def _by_signal(
     on_untrusted: OnUntrusted,
 ) -> Actions:
     """Keep the steps of significant derivatives. An object at its optimum has none, and is no reason to stop the
-    others: ``stop`` skips its step, and ends the loop where no step is left."""
+    others: ``stop`` skips its step, and ends the loop where no step is left.
+    """
     otherwise: Action = "skipped" if on_untrusted == "stop" else _ACTIONS[on_untrusted]
     limit = math.inf if level is None else level
     actions: Actions = {
@@ -205,7 +206,8 @@ def _adjoint(c: Certificate) -> list[str]:
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Counts over recorded iterations: steps (one for each object and factor), trusted ones that waited, untrusted
     ones, what happened to these and why (failed conditions, or ``signal``: no significance), objects' steps that were
-    judged, and those that were rejected; and every measured cosine."""
+    judged, and those that were rejected; and every measured cosine.
+    """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
         (action, certificate["doubts"] or ["signal"])

@@ -90,7 +90,8 @@ class CheckedSteps:
     @property
     def _of_trainings(self) -> float:
         """Variance of a gain between trainings: what objects at rest gained or lost beyond the errors of images, the
-        median judgment's, because after large steps they really gain by the better images of others."""
+        median judgment's, because after large steps they really gain by the better images of others.
+        """
         return max(median(self._at_rest), 0.0) if self._at_rest else 0.0
 
     def judge(
@@ -101,7 +102,8 @@ class CheckedSteps:
         ``errors``: a derivative may differ from zero with certainty and yet promise next to nothing. The gain's error
         is that of the images' paired differences and of trainings, which the scores of objects that did not move show.
         Where the mean over all classes fell by more than its own error, though all steps would be accepted, all are
-        rejected."""
+        rejected.
+        """
         change = after.double() - before.double()
         gains, images = change.sum(1), _of_sums(change)
         total, pending = gains.nansum(), self._pending
@@ -176,7 +178,8 @@ class CheckedSteps:
     @property
     def _significance(self) -> Float[Tensor, "objects"]:
         """That of the derivatives by the factors that move, in standard deviations; of several, the most significant
-        one counts, its p-value times their number (Bonferroni)."""
+        one counts, its p-value times their number (Bonferroni).
+        """
         moves = torch.stack([*self._moved.values()])
         p_values = torch.stack([self._averages[name].p_values for name in self._moved])
         p_value = p_values.where(moves, 1.0).amin(0) * moves.sum(0)

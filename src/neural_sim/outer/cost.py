@@ -8,7 +8,8 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Cost:
     """Labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time and processor seconds
-    over all cores."""
+    over all cores.
+    """
 
     images: int = 0
     detector_steps: int = 0

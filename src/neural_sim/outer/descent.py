@@ -91,7 +91,8 @@ class GradientLoop(OuterLoop, ABC):
         self, seconds: dict[str, float], whole: bool
     ) -> tuple[RenderedImages, Hypergradient, float]:
         """Images at psi, the derivative of a training on them, and its loss. ``whole``: of L_val on all images, as the
-        reference of a certificate is."""
+        reference of a certificate is.
+        """
         with timed(seconds, "probes", self.inner.device):
             self._prepare()
         rendered, cached, training_loss = self._trained(seconds, self._recording)

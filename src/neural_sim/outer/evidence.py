@@ -54,7 +54,8 @@ class Average:
         beyond that of their images. What the median object's ratio of the two would give counts as one more pair of
         derivatives of each: a ratio, because objects' derivatives differ in size, and the median, so that one object
         whose derivatives scatter wildly does not hide those of others. 0 where no object has two derivatives at one
-        psi."""
+        psi.
+        """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):
             return torch.zeros_like(excess)
@@ -70,7 +71,8 @@ class Average:
     @property
     def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
         """The squares of derivatives' differences from their mean at one psi, beyond what their images explain, and the
-        degrees of freedom."""
+        degrees of freedom.
+        """
         known = self.variances.isfinite().all(2)
         excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
         freedom = torch.zeros_like(excess)
@@ -111,7 +113,8 @@ class Average:
     @property
     def p_values(self) -> Float[Tensor, "objects"]:
         """Of the null that all components of the mean are equal: a chi-square test with k - 1 degrees of freedom, each
-        component over its own variance. 1 without observations, 0 without noise."""
+        component over its own variance. 1 without observations, 0 without noise.
+        """
         value, variance = self.value, self.variance
         exact = (variance == 0.0).all(1)
         weights = 1.0 / torch.where(variance > 0.0, variance, 1.0)

@@ -28,7 +28,8 @@ from neural_sim.types import LabelledImages
 @dataclass(frozen=True)
 class FrozenLoop:
     """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta,
-    ``solve`` describes that solve."""
+    ``solve`` describes that solve.
+    """
 
     scene: Scene
     detector: Detector
@@ -49,7 +50,7 @@ class FrozenLoop:
         solver: AdjointSolver,
         generator: torch.Generator,
     ) -> FrozenLoop:
-        """v for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
+        """V for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
         backbone, trainable = detector.split(theta)
         cached = CachedSet.of(detector, backbone, images)
         dtype = next(iter(trainable.values())).dtype

@@ -201,7 +201,7 @@ class InnerLoop:
 
     @torch.no_grad()
     def _on_validation(self) -> Outputs:
-        """theta's outputs on the validation images, cached until theta changes."""
+        """Theta's outputs on the validation images, cached until theta changes."""
         theta, outputs = self._evaluated
         if theta is not self.theta:
             outputs = self.objective.outputs(self.trainable)

@@ -17,7 +17,8 @@ from neural_sim.types import LabelledImages
 @dataclass(frozen=True)
 class Labelled:
     """``fall``: how far L_val falls when so many ``photographs`` train beside the images of the initial distribution,
-    with its standard error over trainings (None: of one)."""
+    with its standard error over trainings (None: of one).
+    """
 
     photographs: int
     fall: float

@@ -108,7 +108,8 @@ def learn_psi(
     module: OuterLoop, progress: bool, on_record: Callable[[IterationRecord], object] | None = None
 ) -> LearnedPsi:
     """Run the loop to its end by a Lightning Trainer that writes nothing. ``on_record`` is called with the record of
-    each iteration when it ends."""
+    each iteration when it ends.
+    """
     if on_record is not None:
         module.on_record = on_record
     with warnings.catch_warnings():

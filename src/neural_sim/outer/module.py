@@ -112,7 +112,8 @@ class SimulatorModule(GradientLoop):
 
     def _cosine(self, result: Hypergradient) -> float:
         """Cosine with the response of training, averaged over objects and factors; or, for one object and factor in
-        turn, with finite differences of the retrained problem."""
+        turn, with finite differences of the retrained problem.
+        """
         if self.settings.certify == "response":
             return agreement(self.inner, self.psi, result, self._learned)
         return self._retrained(result) if self.scene.distribution.binned else math.nan
@@ -149,7 +150,8 @@ def curvature_rows(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Rows of the training set for Hessian products, and their weights in them: ``wanted`` random ones (0: all), of the
     first ``drawn``, which were drawn from p_psi, and of the others, which are photographs, in proportion to the weight
-    of each part, which its rows keep."""
+    of each part, which its rows keep.
+    """
     count, parts = len(weights), []
     if not 0 < wanted < count:
         return torch.arange(count), weights

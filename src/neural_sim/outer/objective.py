@@ -34,7 +34,8 @@ class Objective:
 
     def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
         """L_val on ``count`` disjoint random parts of the validation images (at most one for each), which have the same
-        number of images of every class (that of an image's first box), give or take one."""
+        number of images of every class (that of an image's first box), give or take one.
+        """
         shuffled = torch.randperm(len(self.images), generator=generator)
         ordered = shuffled[self.images.labels.cpu()[shuffled, 0].argsort(stable=True)]
         count = min(count, len(ordered))

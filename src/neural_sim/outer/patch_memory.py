@@ -108,7 +108,8 @@ class PatchMemory:
 @dataclass(frozen=True)
 class _Image:
     """One image of one object with the loss's cotangent of its maps. ``names`` are the numbers of the draw that depend
-    on psi; each rendering repeats the draw from the seed."""
+    on psi; each rendering repeats the draw from the seed.
+    """
 
     loop: FrozenLoop
     label: int

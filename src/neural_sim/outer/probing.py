@@ -40,7 +40,8 @@ class ProbeSet:
         source: Source | None = None,
     ) -> ProbeSet:
         """Probes of some ``objects``, rendered by ``source`` (None: the scene); all factors but the stratified one are
-        drawn from p_psi."""
+        drawn from p_psi.
+        """
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
 
         def drawn() -> Iterator[LabelledImages]:

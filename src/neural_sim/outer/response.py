@@ -35,7 +35,8 @@ SPACING = 3
 @dataclass(frozen=True)
 class Response:
     """``value``: the gain of each object's score when a fraction of its images moves to each bin (or of its weights to
-    each light), divided by that fraction. ``trainings`` counts the trainings that were run."""
+    each light), divided by that fraction. ``trainings`` counts the trainings that were run.
+    """
 
     value: Float[Tensor, "objects K"]
     trainings: int
@@ -80,7 +81,8 @@ def agreement(
     inner: InnerLoop, psi: Float[Tensor, "objects K"], result: Hypergradient, learned: Sequence[int]
 ) -> float:
     """Cosine of the derivatives ``result`` with the response at ``psi``, in centred derivatives by p, averaged over
-    objects and factors; nan where one of them vanishes."""
+    objects and factors; nan where one of them vanishes.
+    """
     distribution = inner.scene.distribution
     truth = distribution.split(response(inner, psi).slopes(inner, psi))
     cosines = []

@@ -197,7 +197,8 @@ def contrasts(k: int) -> Float[Tensor, "k-1 k"]:
 
 def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
     """Cosine of two gradients after subtracting their means (a constant added to logits does not change softmax); nan
-    where either vanishes."""
+    where either vanishes.
+    """
     left, right = (g.double() - g.double().mean() for g in (left, right))
     size = float(left.norm() * right.norm())
     return float(left @ right) / size if size > 0.0 else math.nan

@@ -42,16 +42,18 @@ class Steps(Protocol):
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> dict[str, Verdict]:
         """Accept or reject the last step by trainings before and after it. The scores are each validation image's
-        contributions to the score of each class, more is better."""
+        contributions to the score of each class, more is better.
+        """
         ...
 
     def observe(self, result: Hypergradient) -> PValues:
         """Add a derivative at ``reported``, after :meth:`judge` where a step was pending; p-values of the null that the
-        derivative which steps follow is zero."""
+        derivative which steps follow is zero.
+        """
         ...
 
     def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """psi after the next step."""
+        """Psi after the next step."""
         ...
 
     @property
@@ -66,7 +68,7 @@ class Steps(Protocol):
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        """psi of the loop's result if it ends now."""
+        """Psi of the loop's result if it ends now."""
         ...
 
 

@@ -26,9 +26,10 @@ def within(
     radius: Float[Tensor, "objects"],
     keep: float,
 ) -> Float[Tensor, "objects k"]:
-    """psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
+    """Psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
     reaches ``radius``, or as far as it goes within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p; by
-    bisection."""
+    bisection.
+    """
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
     longest = direction * (FARTHEST / torch.where(size > 0.0, size, 1.0))

@@ -71,7 +71,8 @@ def through_training(
 
 def inputs_of(loop: InnerLoop, cached: CachedSet, labels: Int[Tensor, "images boxes"]) -> InputsOf:
     """The function that computes a cached set's inputs from drawn images, and from their boxes where those are given
-    too."""
+    too.
+    """
 
     def inputs(leaves: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
         pixels, *boxes = leaves

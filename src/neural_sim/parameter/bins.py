@@ -18,7 +18,7 @@ LOWEST = 0.25
 
 
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
+    """Log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
     The floor keeps every bin within reach of a draw and every log p finite, whatever psi is.
 
@@ -33,14 +33,16 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 
 
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """log w, for which the derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)): w = p - ``floor``, computed
-    without cancellation. Divided by p in its place, derivatives of bins at the floor would vanish."""
+    """Log w, for which the derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)): w = p - ``floor``, computed
+    without cancellation. Divided by p in its place, derivatives of bins at the floor would vanish.
+    """
     return torch.log_softmax(psi, -1) + math.log1p(-psi.shape[-1] * floor)
 
 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """psi with no logit further below the largest than log(1 / (``LOWEST`` ``floor``)). There a bin's p is within a
-    quarter of the floor; further down p hardly changes, yet a step of some logits would not bring the bin back."""
+    """Psi with no logit further below the largest than log(1 / (``LOWEST`` ``floor``)). There a bin's p is within a
+    quarter of the floor; further down p hardly changes, yet a step of some logits would not bring the bin back.
+    """
     if floor == 0.0:
         return psi
     return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(1.0 / (LOWEST * floor)))
@@ -50,7 +52,8 @@ def nearest(
     values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | float = 0.0
 ) -> Float[Tensor, "*n k"]:
     """The nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1, nor below the p of a
-    logit that :func:`bounded` has raised, if the largest p is 1."""
+    logit that :func:`bounded` has raised, if the largest p is 1.
+    """
     bins = values.shape[-1]
     lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
     rest = 1.0 - lowest.sum(-1, keepdim=True)
@@ -141,7 +144,7 @@ def conditional_gumbel(
 def gumbel_softmax(
     log_p: Float[Tensor, "*n k"], noise: Float[Tensor, "*n k"], temperature: float
 ) -> Float[Tensor, "*n k"]:
-    """y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
+    """Y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
 
     Raises:
         ValueError: unless the temperature is positive.

@@ -179,11 +179,11 @@ class BinnedFactor:
         return self.log_probabilities(psi).exp()
 
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """log p over the bins, floored."""
+        """Log p over the bins, floored."""
         return binned.log_probabilities(psi, self.floor)
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """log (p - floor)."""
+        """Log (p - floor)."""
         return binned.log_slopes(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -194,7 +194,8 @@ class BinnedFactor:
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
         """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be, nor than
-        the fraction ``keep`` of what it was."""
+        the fraction ``keep`` of what it was.
+        """
         p = self.p_of(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p), self.floor)
 
@@ -208,7 +209,8 @@ class BinnedFactor:
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
         """Exact samples of the bins by the Gumbel-max trick, balanced where the noise has an offset; no derivative
-        reaches psi."""
+        reaches psi.
+        """
         log_p = self.log_probabilities(psi.detach())
         if noise.offset is None:
             return (log_p + noise.gumbel).argmax(-1)

@@ -121,7 +121,7 @@ class Illumination:
         return p
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """psi itself."""
+        """Psi itself."""
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -136,7 +136,8 @@ class Illumination:
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
         """The nearest weights to psi + ``change`` that meet the constraint. ``keep``, of bins, does not bound them: a
-        weight is no number of images."""
+        weight is no number of images.
+        """
         return self.project(psi + change)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
@@ -159,7 +160,7 @@ class Illumination:
         return GaussianDraw(unprojected, self.project(unprojected))
 
     def log_prob(self, psi: Float[Tensor, "k"], unprojected: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
-        """log density of Gaussian draws before their projection; its gradient is (u - psi) / deviation^2."""
+        """Log density of Gaussian draws before their projection; its gradient is (u - psi) / deviation^2."""
         scaled = (unprojected.detach() - psi) / self.deviation
         constant = self.anchors * (math.log(self.deviation) + 0.5 * math.log(2.0 * math.pi))
         return -0.5 * scaled.square().sum(-1) - constant

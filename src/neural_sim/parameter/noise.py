@@ -13,7 +13,8 @@ from torch import Tensor
 class BinNoise:
     """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponential noise, for
     further Gumbel noise that selects the same bins. ``offset``: uniform in [0, 1), for exact draws that are balanced
-    over the bins, see :func:`~neural_sim.parameter.bins.balanced`; None: independent draws."""
+    over the bins, see :func:`~neural_sim.parameter.bins.balanced`; None: independent draws.
+    """
 
     gumbel: Float[Tensor, "n k"]
     exponential: Float[Tensor, "n draws k"] | None = None

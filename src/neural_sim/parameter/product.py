@@ -142,7 +142,7 @@ class SceneDistribution:
         return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
     def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
-        """psi with every factor's part projected onto its constraint."""
+        """Psi with every factor's part projected onto its constraint."""
         parts = self.split(psi)
         return self.join({f.name: f.project(parts[f.name]) for f in self.factors})
 
@@ -228,7 +228,8 @@ class SceneDistribution:
         self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
     ) -> SceneDraw:
         """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi and the same in all
-        strata."""
+        strata.
+        """
         size, lights = self.factor(name).size, self.factor(name).lights
         strata = torch.arange(size).repeat_interleave(each)
         noise = self.draw_noise(each, generator, dtype).select(torch.arange(each).repeat(size))
@@ -245,7 +246,7 @@ class SceneDistribution:
         return self.lit(self.at_bins({**others, name: bins}, noise), psi.detach())
 
     def log_prob(self, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "n"]:
-        """log p of drawn bins and explored lights (for REINFORCE).
+        """Log p of drawn bins and explored lights (for REINFORCE).
 
         Raises:
             ValueError: a light that was not explored, which has no density.
@@ -260,7 +261,8 @@ class SceneDistribution:
 
     def statistics(self, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
         """Sufficient statistics of each factor's psi: the drawn bin, one-hot; or the drawn light before its projection,
-        centred. A light that was not drawn has none."""
+        centred. A light that was not drawn has none.
+        """
         statistics = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
         if self._light is not None and draw.explored is not None:
             statistics[self._light.name] = draw.explored - draw.explored.mean(-1, keepdim=True)

@@ -66,7 +66,7 @@ def _accept(
     second: Float[Tensor, "objects k"],
     noise: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
-    """psi and the state after the step, or before it where the result is not finite: NaN would stay in the moments.
+    """Psi and the state after the step, or before it where the result is not finite: NaN would stay in the moments.
 
     An infinite noise variance (an unknown standard error) keeps the old one for the same reason.
     """
@@ -95,7 +95,7 @@ class SGD:
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """psi after one step, and the state to pass to the next."""
+        """Psi after one step, and the state to pass to the next."""
         velocity = self.momentum * state.first + gradient
         step = -self.learning_rate * velocity
         moved = psi + (step if self.max_step is None else bound(step, self.max_step))
@@ -117,7 +117,7 @@ class Adam:
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """psi after one step, and the state to pass to the next."""
+        """Psi after one step, and the state to pass to the next."""
         beta1, beta2 = self.betas
         steps = state.steps + 1
         first = beta1 * state.first + (1 - beta1) * gradient
@@ -153,7 +153,7 @@ class Mirror:
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """psi after one step, and the state to pass to the next."""
+        """Psi after one step, and the state to pass to the next."""
         steps, rest = state.steps + 1, 1 - self.momentum
         p = log_p.exp()
         direction = gradient / p

@@ -75,7 +75,7 @@ def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.n
 
 
 def temperature_colour(kelvin: float) -> Vector:
-    """sRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
+    """SRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
 
     Raises ``ValueError`` outside [1500, 40000] kelvin; colder bodies are outside sRGB's gamut.
     """

@@ -22,7 +22,8 @@ Quality = Literal["draft", "normal", "final"]
 @dataclass(frozen=True)
 class Omissions:
     """The approximations of a quality: samples behind a transmittance of ``termination`` are skipped, and ``step``
-    multiplies the field's step."""
+    multiplies the field's step.
+    """
 
     termination: float
     step: float
@@ -108,7 +109,8 @@ class NerfRenderer:
         Float[Tensor, "views height width"],
     ]:
         """What ``render`` gives, and the depth along the view axis, in object radii, at which a pixel's ray has lost
-        half of its light; 0 where it loses less, as opacities below 1/2 do."""
+        half of its light; 0 where it loses less, as opacities below 1/2 do.
+        """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
             self.cull, self.skip_empty, surfaces=True,

@@ -120,7 +120,8 @@ def _checked(
     field: RadianceField, weights: Float[Tensor, "n k"] | None, count: int
 ) -> tuple[AppearanceField, Float[Tensor, "n k"]]:
     """The field, which must have appearance codes, and weights [count, k] in its type, on their own device: draws are
-    on the CPU."""
+    on the CPU.
+    """
     if not isinstance(field, AppearanceField):
         raise ValueError(
             f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"

@@ -120,7 +120,8 @@ class PoseRefinement:
 
 def reduce_views(views: PosedViews, size: int) -> PosedViews:
     """The views with a longer side of at most ``size`` pixels, by the mean over each pixel's area. A reduced pixel is
-    known where all of its area is."""
+    known where all of its area is.
+    """
     camera = views.camera
     factor = size / max(camera.width, camera.height)
     if factor >= 1.0:
@@ -175,7 +176,8 @@ def gauss_newton_step(
     jacobian: Float[Tensor, "views n 6"], residual: Float[Tensor, "views n"]
 ) -> Float[Tensor, "views 6"]:
     """Minimises the weighted squares of residual - jacobian step; the weights are those of Fair's loss (iteratively
-    reweighted least squares). Zero for a camera whose image no motion changes."""
+    reweighted least squares). Zero for a camera whose image no motion changes.
+    """
     weighted = jacobian / (1.0 + residual.abs() / FAIR)[..., None]
     normal = weighted.transpose(1, 2) @ jacobian
     size = normal.diagonal(dim1=1, dim2=2)
@@ -239,7 +241,8 @@ def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Fl
 
 def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -> Float[Tensor, "views 4 4"]:
     """The poses under the similarity of least squares (Umeyama 1991) that takes their cameras to the given ones:
-    places, and points at one radius along each camera's axes, so that two cameras determine it."""
+    places, and points at one radius along each camera's axes, so that two cameras determine it.
+    """
     matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
     similarity = torch.from_numpy(matrix).to(poses)
     scale = torch.linalg.det(similarity[:3, :3]) ** (1.0 / 3.0)

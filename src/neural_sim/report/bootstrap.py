@@ -50,7 +50,8 @@ def match(
     predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
 ) -> Outcomes:
     """What a ``score`` of one class is computed from. For AP by COCO's rules: an image's best detection first, each to
-    the free box it overlaps most."""
+    the free box it overlaps most.
+    """
     if score == "accuracy":
         own = (images.labels == label).any(1).cpu().numpy().astype(int)
         return Hits((best_classes(predictions) == label).numpy(), own)

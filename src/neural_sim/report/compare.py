@@ -144,7 +144,8 @@ def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
 
 def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
     """The table of one setting, its differences, the distances of the learned distributions, and costs. ``heading`` is
-    how these runs differ from others of the setting."""
+    how these runs differ from others of the setting.
+    """
     c = comparison
     unit = "seconds" if c.clock == "seconds" else "CPU seconds"
     lines = [

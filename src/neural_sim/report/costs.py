@@ -30,7 +30,8 @@ NOTE = (
 class Costs:
     """Of one method. ``seconds``, by column of ``HEAD``, and ``images`` are means over runs, ``memory`` is the largest
     of any run in MB (None: not recorded), ``error`` the median standard error of a gradient relative to its length
-    (None: the method has no gradient, or its error is not known)."""
+    (None: the method has no gradient, or its error is not known).
+    """
 
     seconds: Mapping[str, float]
     images: float
@@ -71,7 +72,8 @@ def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
 
 def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
     """Of every object's gradient in every iteration; a gradient that is zero, or of unknown error, has none, nor
-    has one of a run from before errors were recorded."""
+    has one of a run from before errors were recorded.
+    """
     pairs = [
         pair
         for record in records

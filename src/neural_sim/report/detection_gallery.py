@@ -27,7 +27,8 @@ Detections = Mapping[str, Tensor]
 @dataclass(frozen=True)
 class Judged:
     """Detections of one image, best first: ``kept`` are those that count, ``right`` which of them lie on a box of their
-    class, ``missed`` which true boxes have none."""
+    class, ``missed`` which true boxes have none.
+    """
 
     kept: Int[Tensor, "d"]
     right: Bool[Tensor, "d"]
@@ -47,7 +48,8 @@ def judge(
     found: Detections, boxes: Float[Tensor, "b 4"], labels: Int[Tensor, "b"], above: float, overlap: float
 ) -> Judged:
     """The best detection first, each takes the free box of its class that it overlaps most, by ``overlap`` or more; a
-    second detection of a box is wrong."""
+    second detection of a box is wrong.
+    """
     order = found["scores"].argsort(descending=True, stable=True)
     kept = order[found["scores"][order] >= above]
     ious = box_iou(found["boxes"][kept].float(), boxes.float())
@@ -164,7 +166,8 @@ def report_detections(
     begun: float,
 ) -> tracking.Run:
     """The figure, detection_gallery.md and detection_gallery.json in ``folder``, and a run in MLflow that began at
-    ``begun`` (seconds since 1970)."""
+    ``begun`` (seconds since 1970).
+    """
     folder.mkdir(parents=True, exist_ok=True)
     verdicts = {method: judged(every, test, above, overlap) for method, every in found.items()}
     counts = {method: count(every) for method, every in verdicts.items()}

@@ -32,7 +32,8 @@ def merged(kept: Sequence[Entry], new: Sequence[Entry], experiments: Sequence[st
 
 def table(entries: Sequence[Entry]) -> str:
     """Markdown, with the columns of all entries, in the order of the entry that has most; cells that an entry lacks are
-    empty."""
+    empty.
+    """
     most = max((entry.cells for entry in entries), key=len)
     columns = list(dict.fromkeys([*most, *(column for entry in entries for column in entry.cells)]))
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]

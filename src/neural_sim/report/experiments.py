@@ -120,7 +120,8 @@ class Experiments:
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
         """experiments.md, experiments.json and figures in ``folder``, and the page where it is asked for; returns the
         page's text. Only runs with the ``budget`` of ``config`` count. A page keeps what it said of experiments, and of
-        settings in a table of settings, without runs here, from the file beside it."""
+        settings in a table of settings, without runs here, from the file beside it.
+        """
         budget = config["budget"]
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
         rows = {name: Row(**arguments) for name, arguments in self.rows.items()}

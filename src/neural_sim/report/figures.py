@@ -51,7 +51,7 @@ def psi_figure(
     factor: str,
     groups: Mapping[str, Sequence[Sequence[int]]] | None = None,
 ) -> Figure:
-    """p over the bins at every iteration, stacked, with the target distribution as a bar beside it.
+    """P over the bins at every iteration, stacked, with the target distribution as a bar beside it.
 
     ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them (None: not known).
     ``factor`` names what the bins are of; only a pose's colours close the circle. ``groups`` are an object's bins (from
@@ -92,7 +92,8 @@ def psi_panel(
     colours: Any,
 ) -> None:
     """One object's probabilities, stacked, by iteration, and its target's beside them; arguments as in
-    :func:`psi_figure`."""
+    :func:`psi_figure`.
+    """
     p = merged(torch.tensor(history), groups).numpy()
     shades = [colours[group[0] - 1] for group in groups]
     steps = np.arange(len(p))

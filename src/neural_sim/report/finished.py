@@ -62,7 +62,8 @@ class Candidate(Recorded):
 @dataclass(frozen=True)
 class FinishedRun(Recorded):
     """One run's results.json, and the matches of its biased objects for each of its detectors: ns, learned, matched,
-    and where photographs trained too, synthetic_only, real_only and views_only."""
+    and where photographs trained too, synthetic_only, real_only and views_only.
+    """
 
     results: Mapping[str, Any]
     matches: Mapping[str, Sequence[Outcomes]]

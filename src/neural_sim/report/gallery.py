@@ -19,7 +19,8 @@ from neural_sim.types import LabelledImages
 @dataclass(frozen=True)
 class Samples:
     """One object: images by method, test images, and by method the total variation of each factor's learned
-    distribution to the target's, None where the target's is unknown."""
+    distribution to the target's, None where the target's is unknown.
+    """
 
     object: str
     images: Mapping[str, LabelledImages]
@@ -90,7 +91,8 @@ def report_samples(
     begun: float,
 ) -> tracking.Run:
     """A figure for each object, samples_gallery.md and samples_gallery.json in ``folder``, and a run in MLflow that
-    began at ``begun`` (seconds since 1970)."""
+    began at ``begun`` (seconds since 1970).
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for each in samples:
         figures.save(samples_figure(each, columns), folder / "figures" / f"{each.object}.png")

@@ -1,5 +1,6 @@
 """Learned beside target distributions (the paper's Fig. 7) and total variation over seeds. Bins that look the same are
-one."""
+one.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class Histogram:
     """One factor of one object at one start.
 
     ``groups`` are its bins, from 1, that look the same. ``p`` maps initial, target and learned to [seeds, groups],
-    ``distance`` initial and learned to the mean total variation to the target."""
+    ``distance`` initial and learned to the mean total variation to the target.
+    """
 
     experiment: str
     name: str

@@ -55,7 +55,8 @@ def identity(
 
 def at_scale(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Whether a run's budget says what today's says, of every key that the run's has. One that came later had no part
-    in the run. Values are compared as text, as MLflow has them."""
+    in the run. Values are compared as text, as MLflow has them.
+    """
     had, have = ({key: str(value) for key, value in flatten(budget).items()} for budget in (then, now))
     return bool(had) and had.items() <= have.items()
 

@@ -120,7 +120,8 @@ def report_interpolation(
     begun: float,
 ) -> tracking.Run:
     """The figure, interpolation.md and interpolation.json in ``folder``, and a run in MLflow that began at ``begun``
-    (seconds since 1970)."""
+    (seconds since 1970).
+    """
     figures.save(interpolation_figure(views, title), folder / "figures" / "interpolation.png")
     changes = {name: own.opacity_change for name, own in views.items()}
     (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))

@@ -21,7 +21,8 @@ from neural_sim.report.settings import Setting
 @dataclass(frozen=True)
 class Shown:
     """``lines`` are for the table of all experiments, ``text`` is Markdown below it, ``figures`` are by file name.
-    ``entries`` have lines and the rows of a table above the text."""
+    ``entries`` have lines and the rows of a table above the text.
+    """
 
     lines: Sequence[str] = ()
     text: str = ""

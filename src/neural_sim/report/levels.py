@@ -1,5 +1,6 @@
 """Each biased object's score over settings: over how far its start is from the target (the paper's Fig. 5), or over
-targets (Fig. 6)."""
+targets (Fig. 6).
+"""
 
 from __future__ import annotations
 
@@ -92,7 +93,8 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
 
 def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
     """One method's line, ``aside`` of the ticks so that intervals do not hide each other; settings that it was not run
-    on are gaps in it. Matched has a dash at every setting, which shows where there is only one."""
+    on are gaps in it. Matched has a dash at every setting, which shows where there is only one.
+    """
     found = [setting.scores.ap.get(method, {}).get(name) for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
     low, high = (
@@ -110,7 +112,8 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: fl
 
 def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
     """The score of every object at every setting, a column a method, in points with 95 % intervals. Lines have NSO's
-    score and its lead; over ``gap`` those of the disjoint start alone."""
+    score and its lead; over ``gap`` those of the disjoint start alone.
+    """
     made = []
     for (experiment, start, name), panel in _panels(settings, axis).items():
         for label, setting in panel.items():

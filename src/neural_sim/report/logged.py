@@ -14,7 +14,8 @@ from neural_sim.report.tracking import COMMIT, UNKNOWN, connect, quiet, where
 @dataclass(frozen=True)
 class LoggedRun:
     """A run in the tracking store. ``files`` are the names of its artifacts, which ``fetch`` brings here one by one;
-    ``parameters`` is its configuration as MLflow keeps it, flat and as text."""
+    ``parameters`` is its configuration as MLflow keeps it, flat and as text.
+    """
 
     run_id: str
     name: str

@@ -17,7 +17,8 @@ from neural_sim.report.identity import at_scale
 @dataclass(frozen=True)
 class Measured:
     """``lines`` for the page's table, ``text`` in Markdown below it, and the ``commits`` of the runs' code. ``entries``
-    bring lines and commits of their own, and stand in a table above the text."""
+    bring lines and commits of their own, and stand in a table above the text.
+    """
 
     lines: Sequence[str]
     text: str

@@ -32,7 +32,8 @@ class ObjectScores:
     """``ap`` and ``ahead`` map a method, then an object or ``MEAN``, to an estimate in [0, 1]: the AP (0.50 to 0.95) on
     the test set, and the reference's AP minus the method's. ``methods`` begin with ns and end with matched, the
     detectors trained on the initial and on the target's distribution, if that is known. Where photographs train too,
-    ``ap`` also has ``WITHOUT``, of the reference's runs."""
+    ``ap`` also has ``WITHOUT``, of the reference's runs.
+    """
 
     reference: str
     methods: tuple[str, ...]
@@ -86,7 +87,8 @@ def _matches(
     table: Mapping[tuple[str, int], FinishedRun], reference: str, method: str, seed: int
 ) -> Sequence[Outcomes]:
     """Of a method's detector at a seed. The reference's run stands for ns and matched, which all methods share, and for
-    ``WITHOUT``."""
+    ``WITHOUT``.
+    """
     if method in BOUNDS or method in WITHOUT:
         return table[reference, seed].matches[method]
     return table[method, seed].matches["learned"]

@@ -23,7 +23,8 @@ def report_patch_memory(
     begun: float,
 ) -> tracking.Run:
     """patch_memory.md and patch_memory.json in ``folder``, and a run in MLflow that began at ``begun`` (seconds since
-    1970); ``setting`` is the table's heading."""
+    1970); ``setting`` is the table's heading.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     document = {"setting": setting, "rows": [dataclasses.asdict(row) for row in rows]}
     (folder / "patch_memory.json").write_text(json.dumps(document, indent=1))

@@ -1,5 +1,6 @@
 """AP by how many photographs train and how (the paper's Table 2): rows are ways of training, columns numbers of
-photographs."""
+photographs.
+"""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ def draw(
     truth: Tensor | None = None,
 ) -> Image.Image:
     """A copy of an RGB photograph with the boxes of detections that score ``above`` that or more, the best on top, each
-    with its class and score; true boxes, (x0, y0, x1, y1) in pixels, are thin and white."""
+    with its class and score; true boxes, (x0, y0, x1, y1) in pixels, are thin and white.
+    """
     drawn = photo.copy()
     pen, side = ImageDraw.Draw(drawn), max(photo.size)
     for box in [] if truth is None else truth.tolist():
@@ -61,7 +62,8 @@ def result_rows(
     found: Mapping[str, Tensor], image_id: Any, category_ids: Mapping[int, Any]
 ) -> list[dict[str, Any]]:
     """COCO's result rows of one image, bbox as (x, y, width, height) in pixels. Nothing is rounded, so that the rows
-    score what the detections do. Classes without a category have no rows."""
+    score what the detections do. Classes without a category have no rows.
+    """
     rows = zip(*(found[key].tolist() for key in ("boxes", "labels", "scores")), strict=True)
     return [
         {

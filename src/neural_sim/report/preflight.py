@@ -19,7 +19,8 @@ class Preflight:
     of them. ``bins``: the ``score`` of the initial distribution's detector by bin of the validation images.
     ``settings`` would match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None:
     they agree). ``labelled``: what numbers of labelled photographs in training are worth; empty where none are for
-    training."""
+    training.
+    """
 
     experiment: str
     names: tuple[str, ...]

@@ -19,7 +19,8 @@ COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")
 
 class PhotographDetector(PythonModel):
     """RGB photographs of one size, uint8 [n, h, w, 3], to a table with a row a detection, image by image and the best
-    first: the image's number from 0, the class's name, the score, the box in the photograph's pixels."""
+    first: the image's number from 0, the class's name, the score, the box in the photograph's pixels.
+    """
 
     def load_context(self, context: Any) -> None:
         self.saved = SavedDetector.load(Path(context.artifacts["weights"]).parent)

@@ -16,7 +16,8 @@ from neural_sim.report.figures import INK
 @dataclass(frozen=True)
 class HeldOut:
     """One object: the first held-out view, as it is (``view``) and by each source, over white; and each source's
-    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` on all of them."""
+    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` on all of them.
+    """
 
     object: str
     images: Mapping[str, Float[Tensor, "h w 3"]]

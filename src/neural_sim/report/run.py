@@ -114,7 +114,8 @@ class RunResults:
 
     def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
         """Distance of the initial and the learned distribution from the target, by object and factor, over groups;
-        empty for every object where the target is not known."""
+        empty for every object where the target is not known.
+        """
         distances: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
         if "target" not in self.probabilities:
             return distances

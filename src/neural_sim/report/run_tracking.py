@@ -145,7 +145,8 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:
     """The score of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by
-    side."""
+    side.
+    """
     series: dict[str, dict[int, float]] = {}
     for point in results.curve:
         scores = {_key(results): mean_of(point["ap"])}

@@ -75,7 +75,8 @@ class Settings:
 
     def read(self, experiments: Sequence[str]) -> tuple[list[Setting], list[LeftOut]]:
         """The settings of ``experiments`` in their order, those of each as they were run first; and runs that are left
-        out. An experiment without runs has no settings."""
+        out. An experiment without runs has no settings.
+        """
         groups, left_out = self.groups(experiments)
         settings = []
         for group in sorted(groups, key=lambda g: experiments.index(g.runs[0].experiment)):
@@ -86,7 +87,8 @@ class Settings:
 
     def groups(self, experiments: Sequence[str]) -> tuple[list[Group], list[LeftOut]]:
         """Runs to compare, as :class:`Selection` has them; where an experiment was scored in several ways, those of the
-        newest."""
+        newest.
+        """
         known = logged.experiments(self.uri)
         found = candidates(self.uri, [name for name in experiments if name in known])
         right = [run for run in found if run.unusable or self._at_scale(run)]

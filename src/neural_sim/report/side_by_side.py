@@ -24,7 +24,8 @@ from neural_sim.types import LabelledImages
 class SideBySide:
     """By test set: ``ap`` of every source, the mean over classes and seeds; ``ahead``, by how much the first source
     exceeds each other one; ``per_class``, each source's AP by class, the mean over seeds. ``images`` is the number of
-    test images, of all seeds together."""
+    test images, of all seeds together.
+    """
 
     sources: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -136,7 +137,8 @@ def report_side_by_side(
 ) -> tracking.Run:
     """``<name>.md``, ``<name>.json`` and figures in ``folder``, and a run in MLflow that began at ``begun`` (seconds
     since 1970). ``shown`` are training images of every source, source by source; ``extra``, ``text`` and
-    ``more_figures`` are added to the document, the table and the figures."""
+    ``more_figures`` are added to the document, the table and the figures.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     text = "\n\n".join([part for part in (table(found, heading), text) if part])
     (folder / f"{name}.md").write_text(text + "\n")

@@ -31,7 +31,8 @@ def report_temperatures(
     begun: float,
 ) -> tracking.Run:
     """Figure, temperatures.md and temperatures.json in ``folder``, and a run in MLflow that began at ``begun`` (seconds
-    since 1970)."""
+    since 1970).
+    """
     folder.mkdir(parents=True, exist_ok=True)
     document = {
         key: [dataclasses.asdict(x) for x in entries] for key, entries in (("rows", rows), ("truths", truths))

@@ -91,7 +91,8 @@ class Run:
     @contextmanager
     def fluent(self) -> Iterator[Any]:
         """The module ``mlflow`` with this run's store and experiment as its own, for what a client cannot write, which
-        are models. It keeps the experiment, which nothing else here reads."""
+        are models. It keeps the experiment, which nothing else here reads.
+        """
         with quiet(), _guard(self.uri):
             import mlflow
 
@@ -105,7 +106,8 @@ class Run:
 
     def close(self, status: str, error: BaseException | None = None) -> None:
         """Send what waits and end the run. ``error``, its cause, becomes a tag; then what the store refuses is a
-        warning."""
+        warning.
+        """
         if error is None:
             self._send()
             self._end(status)

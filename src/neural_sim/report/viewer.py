@@ -32,7 +32,8 @@ PER_BIN = 4
 @dataclass(frozen=True)
 class BinCamera:
     """A camera drawn from a bin (from 0) of probability ``p``: its number in the draw and its pose (OpenGL axes, object
-    radii)."""
+    radii).
+    """
 
     bin: int
     p: float
@@ -87,7 +88,8 @@ class Shots:
     @torch.no_grad()
     def cloud(self, label: int, views: int = 12, size: int = 96) -> tuple[np.ndarray, np.ndarray]:
         """Points [n, 3] of the field's surface in object radii, and their colours [n, 3] in [0, 1]: what ``views``
-        renders round the object show, from every height and under equal weights of the lights."""
+        renders round the object show, from every height and under equal weights of the lights.
+        """
         scene, field = self.scene, self.scene.fields[label]
         turn = torch.arange(views) * (math.pi * (3.0 - math.sqrt(5.0)))  # a spiral of the golden angle
         height = torch.acos(1.0 - 2.0 * (torch.arange(views) + 0.5) / views)

@@ -1,5 +1,6 @@
 """What ``+experiment=work_precision`` leaves: work_precision.json and .md, a figure a series, a run in MLflow, sections
-of a documentation page."""
+of a documentation page.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ Row = Mapping[str, Any]
 
 def document(series: Sequence[Series], machine: Mapping[str, Any], notes: Sequence[str]) -> dict[str, Any]:
     """The content of work_precision.json: a row a setting under ``series``, the observed orders, what was measured, and
-    defaults that are not Pareto-optimal. Numbers that do not exist are null."""
+    defaults that are not Pareto-optimal. Numbers that do not exist are null.
+    """
     rows, orders, overtaken = [], [], []
     for each in series:
         for point, best in zip(each.points, each.pareto, strict=True):
@@ -122,7 +124,8 @@ def _overtaken(each: Row) -> str:
 
 def figure(series: Series) -> Figure:
     """Error against run time, both logarithmic: a line joins settings that differ in one number, Pareto-optimal ones
-    are filled, a ring marks the default. Errors of 0 are at the lower edge."""
+    are filled, a ring marks the default. Errors of 0 are at the lower edge.
+    """
     made = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = made.add_subplot()
     shown = [p for p in series.points if math.isfinite(p.error) and p.seconds > 0.0]

@@ -69,7 +69,7 @@ class AdjointSolver:
         x0: Float[Tensor, "n"] | None,
         generator: torch.Generator,
     ) -> Adjoint:
-        """v for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds a random
+        """V for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds a random
         Lanczos start.
         """
         began = time.perf_counter()

@@ -44,7 +44,7 @@ class Damping(abc.ABC):
 
     @abc.abstractmethod
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        """lambda for ``matvec`` and the right-hand side ``b``."""
+        """Lambda for ``matvec`` and the right-hand side ``b``."""
 
     def raised(self, damped: Damped, lowest: float) -> Damped | None:
         """A larger lambda after a solve met the curvature ``lowest`` < -lambda, or None: lambda is fixed."""

@@ -107,7 +107,7 @@ class HessianOperator:
 
 
 def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
-    """h of the central difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
+    """H of the central difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
 
     Truncation (h |vector|)^2 and rounding eps / (h |vector|) balance at eps^(1/3), relative to the point's own size.
     """

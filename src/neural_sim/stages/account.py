@@ -12,7 +12,8 @@ from neural_sim.stages.store import Entry
 @dataclass(frozen=True)
 class Omission:
     """Work that a run leaves out, and why. ``fraction`` is relative to all work of that kind, ``seconds`` what it would
-    take, where they are known."""
+    take, where they are known.
+    """
 
     stage: str
     what: str

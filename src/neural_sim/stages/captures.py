@@ -39,7 +39,8 @@ class Captures(Objects):
 class PhotoViewsStage(ViewsStage):
     """Photographs of one object as views of one camera. ``content`` is the digest of their files; of ``settings`` only
     the counts and the image size apply. ``masks`` computes the object's masks, None: photographs bring them; ``poses``
-    is the source's."""
+    is the source's.
+    """
 
     masks: MasksStage | None = None
     poses: PoseCorrector | None = None

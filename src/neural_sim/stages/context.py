@@ -33,7 +33,8 @@ class StageFailure(RuntimeError):
 
 class Step(Protocol):
     """An entry of ``stages``: computes or reads results, writes to the run's folder. One that needs stages from objects
-    to a report names them in ``needs``; they run before it."""
+    to a report names them in ``needs``; they run before it.
+    """
 
     def run(self, context: Context) -> None: ...
 

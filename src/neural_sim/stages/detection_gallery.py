@@ -1,5 +1,6 @@
 """Stage ``detection_gallery``: detections of several methods on the same photographs, as
-conf/experiment/detection_gallery.yaml says."""
+conf/experiment/detection_gallery.yaml says.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Stages ``warm_start`` and ``evaluate``: detectors trained on images of one distribution, with or without photographs,
-or on photographs."""
+or on photographs.
+"""
 
 from __future__ import annotations
 

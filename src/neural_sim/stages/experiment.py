@@ -30,7 +30,8 @@ SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
 @dataclass(frozen=True)
 class Run:
     """What a run is called and where it works. ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is
-    one of :data:`SCORES`."""
+    one of :data:`SCORES`.
+    """
 
     name: str
     seed: int
@@ -45,7 +46,8 @@ class Run:
 @dataclass(frozen=True)
 class Imaging:
     """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target. ``camera``
-    is that of synthesised and of rendered target images."""
+    is that of synthesised and of rendered target images.
+    """
 
     objects: ObjectSource | Photos
     views: Views

@@ -164,7 +164,8 @@ class Graph:
     @property
     def target_psi(self) -> Psi | None:
         """The target's psi; None where its images are photographs and no configured distribution says what they show:
-        uniform, the default, would then be nobody's statement."""
+        uniform, the default, would then be nobody's statement.
+        """
         known = self.renders_target or self.experiment.imaging.distribution.states_target
         return self.psi("target") if known else None
 
@@ -185,7 +186,8 @@ class Graph:
     @cached_property
     def warm_start(self) -> DetectorStage:
         """The detector whose backbone the psi loop trains on, and that some methods begin with. Of the initial
-        distribution, with equal epochs, and unless scored detectors are fine-tuned, it is also scored as ``ns``."""
+        distribution, with equal epochs, and unless scored detectors are fine-tuned, it is also scored as ``ns``.
+        """
         x = self.experiment
         if x.training.warm_start == "initial":
             return self.of_initial
@@ -204,7 +206,8 @@ class Graph:
     @cached_property
     def _training(self) -> Training:
         """As in the keys of detectors, which say by psi what they are trained on, whatever the warm start is of, and
-        how many photographs train, whatever was asked for, where the target knows how many it has."""
+        how many photographs train, whatever was asked for, where the target knows how many it has.
+        """
         x, real = self.experiment, self.experiment.training.real
         count = getattr(x.imaging.target, "training_count", None)
         if real.used and count is not None:
@@ -265,7 +268,8 @@ class Graph:
 
     def trained_on(self, psi: Psi, called: str) -> TrainedStage:
         """The detector that is scored for a distribution, trained or fine-tuned on photographs as ``training.real``
-        says."""
+        says.
+        """
         real = self.experiment.training.real
         if real.used and real.mode == "pretrain":
             return self._on_photographs(self.synthetic(psi, called))
@@ -278,7 +282,8 @@ class Graph:
     def compared(self, learned: LearnedPsi) -> dict[str, ScoresStage]:
         """The scores that a run reports: of the initial distribution (``ns``), the learned one, and the target's own
         (``matched``) where that is known; where photographs train too, also without them (``synthetic_only``, of the
-        learned distribution), on them alone (``real_only``), and on the fields' own views (``views_only``)."""
+        learned distribution), on them alone (``real_only``), and on the fields' own views (``views_only``).
+        """
         psis = {"ns": self.psi("initial"), "learned": learned.last, "matched": self.target_psi}
         rows = {called: self.scores(psi, called) for called, psi in psis.items() if psi is not None}
         if self.experiment.training.real.used:
@@ -288,7 +293,7 @@ class Graph:
         return rows
 
     def on_the_way(self, learned: LearnedPsi) -> dict[int, Psi]:
-        """psi by iterations done: at the start, after the parts of all iterations in ``score_at``, at the end."""
+        """Psi by iterations done: at the start, after the parts of all iterations in ``score_at``, at the end."""
         last = len(learned.trajectory) - 1
         asked = {0, last, *(math.floor(part * last + 0.5) for part in self.experiment.run.score_at)}
         return {iteration: learned.trajectory[iteration] for iteration in sorted(asked)}

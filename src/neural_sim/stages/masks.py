@@ -19,7 +19,8 @@ Computed = tuple[Float[Tensor, "_ _"], ...]
 @dataclass(frozen=True)
 class MasksStage(Stage[Computed]):
     """A mask for each photograph of one object. ``content`` is the digest of the capture's files and options; ``scene``
-    is the source's, with its budget. Not the run's seed, so that runs share masks."""
+    is the source's, with its budget. Not the run's seed, so that runs share masks.
+    """
 
     name: ClassVar[str] = "views"
     kind: ClassVar[str] = "masks"

@@ -1,5 +1,6 @@
 """Stage ``nerf_vs_mesh``: fields against the mesh renderer as a source of training images, as
-conf/experiment/nerf_vs_mesh.yaml says."""
+conf/experiment/nerf_vs_mesh.yaml says.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Detectors trained on images that do not come from the fields: of meshes, of the fields' own views, or of another
-program."""
+program.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ class MeshDetectorStage(DetectorStage):
 @dataclass(frozen=True)
 class ViewsDetectorStage(DetectorStage):
     """A detector trained on the views that the fields are fitted to, on the same backgrounds as images of the fields
-    (the paper's "images to train NeRF", Sec. 4.4 and Table 2); psi has no part in them."""
+    (the paper's "images to train NeRF", Sec. 4.4 and Table 2); psi has no part in them.
+    """
 
     views: tuple[ViewsStage, ...] = field(kw_only=True)
 

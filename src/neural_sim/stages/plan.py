@@ -82,7 +82,8 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
 
 def _pooled(x: Experiment, rounds: int, follows: bool) -> Iterator[Omission]:
     """The fraction of the loop's renders that a pool of every bin saves, if any. An image of several objects needs a
-    render of each. Trainings that judge a step are not counted, since not every iteration has one."""
+    render of each. Trainings that judge a step are not counted, since not every iteration has one.
+    """
     factors, outer = x.imaging.distribution.binned, x.loop.outer
     rendered = math.prod(pool_cells(factors, outer.pool_per_bin))
     trainings, probes = rounds, 0.0

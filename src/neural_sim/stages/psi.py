@@ -93,7 +93,8 @@ class PsiStage(Stage[LearnedPsi]):
 
     def loop(self, results: Results) -> OuterLoop:
         """The method's loop, not yet run, on renders of ``outer.quality``. Raises ``ValueError`` for a method
-        without one."""
+        without one.
+        """
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
             scene = replace(scene, renderer=scene.renderer.at(self.outer.quality))

@@ -49,7 +49,8 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
 @dataclass(frozen=True)
 class ReconstructionDetectorStage(DetectorStage):
     """A detector trained on images of reconstructed meshes at the draws, backgrounds and places of those of the fields.
-    ``subjects`` are the results of ``reconstructions``, with their renderer."""
+    ``subjects`` are the results of ``reconstructions``, with their renderer.
+    """
 
     reconstructions: tuple[ReconstructionStage, ...] = field(kw_only=True)
     subjects: tuple[Subject, ...] = field(kw_only=True, metadata=UNKEYED)

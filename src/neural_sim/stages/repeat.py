@@ -72,7 +72,8 @@ def groups(
     names: Sequence[str], biased: Container[str], shown: Sequence[int]
 ) -> list[tuple[list[str], list[int]]]:
     """Names and labels of the objects that a run is about, of all objects, and of each one, without those that no
-    test image shows."""
+    test image shows.
+    """
     about = [label for label in shown if names[label] in biased]
     found: list[list[int]] = []
     for group in (about or [*shown], [*shown], *([label] for label in shown)):

@@ -80,7 +80,8 @@ def _commands(context: Context, detector: bool) -> dict[str, str]:
 
 def _write_model(context: Context, test: LabelledImages) -> None:
     """The detector trained on the learned distribution, which was scored as ``learned``: in the run's folder, and in
-    MLflow where that is asked for. One whose settings have no JSON is left out with a warning."""
+    MLflow where that is asked for. One whose settings have no JSON is left out with a warning.
+    """
     graph, results, wanted = context.graph, context.results, context.experiment.model
     stage = graph.trained_on(results(graph.learned).last, "learned")
     camera = graph.camera

@@ -1,5 +1,6 @@
 """Stage ``samples_gallery``: training images of the psi that methods learned, beside test images, as
-conf/experiment/samples_gallery.yaml says."""
+conf/experiment/samples_gallery.yaml says.
+"""
 
 from __future__ import annotations
 

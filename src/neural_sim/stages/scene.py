@@ -18,7 +18,8 @@ from neural_sim.types import PinholeCamera
 class SceneStage(Stage[Scene]):
     """Of ``distribution`` the key holds what draws of given probabilities depend on (``drawn``): methods that relax
     draws differently use the same results of hard draws. ``radii`` are the objects' in metres, None where distances are
-    in radii."""
+    in radii.
+    """
 
     name: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"

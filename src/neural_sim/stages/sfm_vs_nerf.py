@@ -1,5 +1,6 @@
 """Stage ``sfm_vs_nerf``: fields against meshes reconstructed from the same views, as conf/experiment/sfm_vs_nerf.yaml
-says."""
+says.
+"""
 
 from __future__ import annotations
 

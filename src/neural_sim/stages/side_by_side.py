@@ -69,7 +69,8 @@ def compare_sources(
 
 def pairs(graph: Graph, results: Results, sources: Mapping[str, DetectorStage], count: int) -> LabelledImages:
     """``count`` training images of every source, source by source, spread evenly over those of the first; where
-    the sources share their draws, the same ones."""
+    the sources share their draws, the same ones.
+    """
     parts = []
     for stage in sources.values():
         images = stage.images(results).images.to("cpu")

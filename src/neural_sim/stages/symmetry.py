@@ -16,7 +16,8 @@ from neural_sim.types import PinholeCamera
 @dataclass(frozen=True)
 class SymmetryStage(Stage[list[list[int]]]):
     """Groups of bins, numbered from 1, that look the same; ``content`` is the digest of the object. ``fields`` has the
-    field of an object that there is no mesh of."""
+    field of an object that there is no mesh of.
+    """
 
     name: ClassVar[str] = "report"
     kind: ClassVar[str] = "symmetry"

@@ -21,7 +21,8 @@ from neural_sim.types import LabelledImages, PinholeCamera
 @dataclass(frozen=True)
 class TargetSets:
     """``val`` steers psi, ``test`` is scored, ``train`` trains detectors where ``training.real`` asks for it (None:
-    there is no such part); they share no image."""
+    there is no such part); they share no image.
+    """
 
     val: LabelledImages
     test: LabelledImages
@@ -31,7 +32,8 @@ class TargetSets:
 @dataclass(frozen=True)
 class TargetSetsStage(Stage[TargetSets]):
     """The sets of a configured target; ``contents`` are the digests of the objects by name. ``fields`` are those of
-    objects that there are no meshes of, where the target renders them."""
+    objects that there are no meshes of, where the target renders them.
+    """
 
     name: ClassVar[str] = "target_sets"
     kind: ClassVar[str] = "target"

@@ -77,7 +77,8 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
 
 def _text(node: object) -> str:
     """A syntax tree as text, equal in all versions of Python: newer ones add fields, which are empty unless a file uses
-    them (``ast.dump`` of 3.12 has ``type_params`` of every function)."""
+    them (``ast.dump`` of 3.12 has ``type_params`` of every function).
+    """
     if isinstance(node, ast.AST):
         fields = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
         return f"{type(node).__name__}({', '.join(f'{name}={_text(value)}' for name, value in fields)})"

@@ -100,7 +100,7 @@ def significance(scope: Scope) -> Checks:
 
 @case
 def one_hot(scope: Scope) -> Checks:
-    """p from uniform to one-hot: the closed form p_i (s_i - sum_j p_j s_j)."""
+    """P from uniform to one-hot: the closed form p_i (s_i - sum_j p_j s_j)."""
     table = scope.normal(BINS, EACH)
     means = table.mean(-1)
     for depth in (0.0, 20.0, 1000.0):

@@ -1,5 +1,6 @@
 """Whole images at the ends of size, distance and precision, by the geometry of the pinhole and rounding of 8
-bits; and boxes of a pixel and of the image, as the detector learns them."""
+bits; and boxes of a pixel and of the image, as the detector learns them.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Inner problems that are far from stationary, flat, indefinite or of any unit, where the implicit derivative
-is known."""
+is known.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +88,7 @@ class Quadratic:
 
 @case
 def far_from_stationary(scope: Scope) -> Checks:
-    """theta = theta* + delta for |delta| from 0 to 1e6: the stationarity is |H delta|, and the implicit
+    """Theta = theta* + delta for |delta| from 0 to 1e6: the stationarity is |H delta|, and the implicit
     gradient is off by D^T A H^-1 B^T B delta / N, both closed forms. The quantity states by how much it
     misses dL_val/dpsi at theta*.
 

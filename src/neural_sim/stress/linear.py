@@ -104,7 +104,7 @@ def ended(quantity: str, value: float, tolerance: float, solution: Solution, *wa
 
 @case
 def condition_numbers(scope: Scope) -> Checks:
-    """k from 1 to 1e12 in float64 and float32, asked for the residual of a backward stable solver.
+    """K from 1 to 1e12 in float64 and float32, asked for the residual of a backward stable solver.
 
     ``|x - x*| / |x*| <= k (rtol |b| / (|A| |x*|) + n^2 eps)``: the residual asked for, and the rounding of
     ``A x*`` and of the recomputed residual, n eps each. The rounding of MINRES' short recurrences reaches the
@@ -226,7 +226,7 @@ def singular(scope: Scope) -> Checks:
 
 @case
 def units(scope: Scope) -> Checks:
-    """b = 0 gives exactly 0. b or the operator times a power of two changes no digit of the solution, out to where
+    """B = 0 gives exactly 0. b or the operator times a power of two changes no digit of the solution, out to where
     squares of the operator's entries leave the range of the arithmetic. Neumann's rate is LAPACK's eigenvalue, which
     scales by factors of its own: known to n eps, which each of the steps takes up.
     """

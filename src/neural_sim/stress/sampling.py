@@ -39,7 +39,7 @@ def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
 
 @case
 def one_hot(scope: Scope) -> Checks:
-    """psi = 1000 on one bin without a floor: p is 1 there to the last bit, log p elsewhere is -1000 to a few
+    """Psi = 1000 on one bin without a floor: p is 1 there to the last bit, log p elsewhere is -1000 to a few
     roundings, every draw is of that bin (Gumbel noise spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000)
     underflows to 0.
     """
@@ -67,7 +67,7 @@ def one_hot(scope: Scope) -> Checks:
 
 @case
 def floor(scope: Scope) -> Checks:
-    """psi far below: p = (1 - k f) softmax(psi) + f, with its derivative (1 - k f) s_i (1 - s_i) / p_i of log
+    """Psi far below: p = (1 - k f) softmax(psi) + f, with its derivative (1 - k f) s_i (1 - s_i) / p_i of log
     p_i.
 
     Rounding: log_softmax of entries of size up to |psi| costs eps |psi| in the exponent, the sum in logaddexp
@@ -94,7 +94,7 @@ def floor(scope: Scope) -> Checks:
 
 @case
 def temperatures(scope: Scope) -> Checks:
-    """tau from 1e-4 to 1e3 over the same draws.
+    """Tau from 1e-4 to 1e3 over the same draws.
 
     Against the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, 2 eps
     |z| in the exponent each way: y to exp(4 eps max|z|) - 1 relatively. As tau falls 1 - max y <= (k - 1)
@@ -160,7 +160,7 @@ def gumbel_max(scope: Scope) -> Checks:
 
 @case
 def bin_counts(scope: Scope) -> Checks:
-    """k of 1, 2 and 64: hard draws lie in their bin, also at its very edges.
+    """K of 1, 2 and 64: hard draws lie in their bin, also at its very edges.
 
     An angle at an edge belongs to the bin within the rounding of the angle, 4 eps 2 pi; a miss is by that at
     most.

@@ -63,7 +63,8 @@ class RenderedImages:
 
     def without_maps(self) -> RenderedImages:
         """The same without what composes the images again, which takes more memory than they do. Of the objects' maps
-        none is left, clones of nothing, since a view of nothing would hold all."""
+        none is left, clones of nothing, since a view of nothing would hold all.
+        """
         objects = tuple(
             replace(part, rgb=part.rgb[:0].clone(), opacity=part.opacity[:0].clone()) for part in self.objects
         )

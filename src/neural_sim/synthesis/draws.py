@@ -52,7 +52,8 @@ class RelaxedDraws:
 @dataclass(frozen=True)
 class HardDraws:
     """Exact samples of p_psi, balanced over the bins. ``explore``: independent ones, and lights around psi's, for
-    estimators that need the density of the draws together."""
+    estimators that need the density of the draws together.
+    """
 
     explore: bool = False
 

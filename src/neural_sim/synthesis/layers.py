@@ -18,7 +18,8 @@ def stacked(
     background: Float[Tensor, "n 3 h w"],
 ) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n layers h w"]]:
     """Images of layers, the nearest first, over a background, and how much of each layer's opacity is visible:
-    ``T_l o_l`` with ``T_l`` the product of ``1 - o`` of the layers before. ``rgb`` is premultiplied by ``opacity``."""
+    ``T_l o_l`` with ``T_l`` the product of ``1 - o`` of the layers before. ``rgb`` is premultiplied by ``opacity``.
+    """
     clear = torch.ones_like(opacity[:, :1])
     before = torch.cat([clear, (1.0 - opacity).cumprod(1)], 1)
     in_front, through = before[:, :-1], before[:, -1]
@@ -42,7 +43,8 @@ def visible_boxes(
     min_visibility: float,
 ) -> tuple[Float[Tensor, "n layers 4"], Bool[Tensor, "n layers"]]:
     """The box round each layer's visible pixels, and whether it has one: fewer than ``minimum_area`` visible pixels, or
-    a smaller part than ``min_visibility`` of those that the image would show of the object alone, have none."""
+    a smaller part than ``min_visibility`` of those that the image would show of the object alone, have none.
+    """
     n, layers = opacity.shape[:2]
     boxes, present = boxes_from_opacity(visible.flatten(0, 1), threshold, minimum_area)
     alone, left = ((part > threshold).sum((-1, -2)) for part in (opacity, visible))

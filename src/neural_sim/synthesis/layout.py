@@ -38,7 +38,8 @@ class ObjectCount:
 
     def draw(self, n: int, generator: torch.Generator, present: bool = False) -> Int[Tensor, "n"]:
         """Of n images; or, if ``present``, of n images in which one given class is. It is in an image of c objects with
-        a probability in proportion to c, so that such images have c objects in proportion to c."""
+        a probability in proportion to c, so that such images have c objects in proportion to c.
+        """
         numbers = torch.arange(self.fewest, self.most + 1)
         weights = numbers.double() if present else torch.ones(len(numbers), dtype=torch.float64)
         return numbers[torch.multinomial(weights, n, replacement=True, generator=generator)]
@@ -47,7 +48,8 @@ class ObjectCount:
 @dataclass(frozen=True)
 class Layout:
     """Of n images. ``labels`` are the classes in each, -1 for none; in column 0 the image's own class. ``order`` in
-    [0, 1) says which lies in front among objects at equal distances: the smaller."""
+    [0, 1) says which lies in front among objects at equal distances: the smaller.
+    """
 
     labels: Int[Tensor, "n most"]
     order: Float[Tensor, "n most"]

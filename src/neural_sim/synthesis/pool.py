@@ -90,7 +90,8 @@ class ImagePool:
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
         """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; all else from p_psi
-        and the same in all bins."""
+        and the same in all bins.
+        """
         distribution = self.scene.distribution
         size = distribution.factor(factor).size
         bins, scenes = torch.arange(size).repeat_interleave(per_bin), torch.arange(per_bin).repeat(size)

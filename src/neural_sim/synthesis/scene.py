@@ -39,7 +39,8 @@ class Source(Protocol):
 @dataclass(frozen=True)
 class Scene:
     """The objects' fields, in the order of their class labels, and how their images are made. ``radii`` are the
-    objects' in metres, where distances are."""
+    objects' in metres, where distances are.
+    """
 
     names: tuple[str, ...]
     fields: tuple[RadianceField, ...]
@@ -108,7 +109,8 @@ class Scene:
         self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
     ) -> RenderedObject:
         """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; all else from p_psi
-        and the same in all bins. For an illumination the bins are the anchor lights."""
+        and the same in all bins. For an illumination the bins are the anchor lights.
+        """
         dtype = self.dtype(label)
         draw = self.distribution.probes(factor, per_bin, psi.detach().to(dtype), generator, dtype)
         return self.render(label, draw)

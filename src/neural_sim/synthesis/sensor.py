@@ -13,7 +13,8 @@ from torch import Tensor
 @dataclass(frozen=True)
 class SensorDraw:
     """Of n images: ``blur``, the standard deviation of a Gaussian in pixels, and ``grain``, what is added to sRGB
-    values; either is None where there is none."""
+    values; either is None where there is none.
+    """
 
     blur: Float[Tensor, "n"] | None
     grain: Float[Tensor, "n 3 h w"] | None

@@ -27,7 +27,8 @@ _log = logging.getLogger(__name__)
 class Nuisance:
     """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU, one for each
     object in an image; ``sensor`` is what the camera does to it (None: nothing); ``front`` is what hides the objects
-    (None: nothing)."""
+    (None: nothing).
+    """
 
     backgrounds: Float[Tensor, "n 3 h w"]
     shifts: Int[Tensor, "n *objects 2"]
@@ -119,7 +120,8 @@ class Synthesizer:
         objects: int | None = None,
     ) -> Nuisance:
         """Backgrounds, on ``device``, and shifts of n images; independent of the scene parameters. ``objects`` is the
-        number of shifts of each image, None for one shift without that axis."""
+        number of shifts of each image, None for one shift without that axis.
+        """
         height, width = camera.height, camera.width
         backgrounds = self.background.draw(n, height, width, generator, device)
         shifts = draw_shift(n * (objects or 1), self.shift, height, width, generator)

@@ -80,7 +80,8 @@ def apportioned(
     p: Sequence[float], total: int, available: Sequence[int], generator: torch.Generator
 ) -> list[int] | None:
     """``total`` photographs split among bins by largest remainders, each ``total * p`` rounded up or down; None where a
-    bin has too few. Of bins with equal remainders those that have enough are rounded up, at random."""
+    bin has too few. Of bins with equal remainders those that have enough are rounded up, at random.
+    """
     quotas = [total * value for value in p]
     counts = [math.floor(quota + 1e-9) for quota in quotas]
     rest = [round(quota - count, 9) for quota, count in zip(quotas, counts, strict=True)]

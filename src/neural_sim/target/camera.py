@@ -15,7 +15,8 @@ class CameraSource(Protocol):
 
     def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
         """``image_size`` (pixels) is the side of a square image where no size is given, ``field_of_view_deg`` what is
-        taken where neither a field of view nor a focal length is; ``target`` is the run's target."""
+        taken where neither a field of view nor a focal length is; ``target`` is the run's target.
+        """
         ...
 
 

@@ -180,7 +180,8 @@ class CocoTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val``, ``test`` and any ``train``, with the objects' names as classes; takes the arguments of every target
-        set."""
+        set.
+        """
         first = next(iter(distribution.binned), None)
         if self._bins is not None and first is not None and max(self._bins) >= first.bins:
             raise ValueError(

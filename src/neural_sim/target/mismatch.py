@@ -92,7 +92,8 @@ def luma_of(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
 def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
     """Standard deviation of white noise, by Immerkaer's difference of two Laplacians (Fast Noise Variance Estimation,
     1996), which does not see edges that are straight over three pixels. The median replaces the mean, so that texture
-    counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has the norm 6."""
+    counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has the norm 6.
+    """
     mask = luma.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
     filtered = torch.nn.functional.conv2d(luma[:, None], mask[None, None])
     return filtered.abs().flatten(1).median(1).values / (0.6745 * 6.0)
@@ -137,7 +138,8 @@ def matching_settings(
 
 def distance_factor(found: list[Mismatch]) -> float | None:
     """By what the distances of the camera would have to be multiplied for boxes of the target's size; None where sizes
-    agree. Sizes are inversely proportional to distance where objects are small against it."""
+    agree. Sizes are inversely proportional to distance where objects are small against it.
+    """
     size: Mapping[str, Mismatch] = {m.name: m for m in found}
     if "box size" not in size or not size["box size"].counts:
         return None
@@ -146,7 +148,8 @@ def distance_factor(found: list[Mismatch]) -> float | None:
 
 def _blur_to(wanted: Tensor, synthesised: LabelledImages, largest: float, level: float) -> float:
     """The blur at which the synthesised images' median sharpness is ``wanted``, on a grid up to ``largest``. Noise of
-    the target's ``level``, which adds to the steps between pixels, is added after each."""
+    the target's ``level``, which adds to the steps between pixels, is added after each.
+    """
     deviations, images = torch.linspace(0.0, largest, _BLURS), synthesised.images
     grain = level * torch.randn(images.shape, generator=torch.Generator().manual_seed(0)).to(images)
     reached = []

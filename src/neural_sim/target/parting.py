@@ -21,7 +21,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Looks:
     """What says which photographs belong together. ``name`` is one's own, for messages, ``group`` what the split keeps
-    together, ``image`` its letterboxed pixels, ``thumbnail`` that of :func:`near_duplicates.thumbnail`."""
+    together, ``image`` its letterboxed pixels, ``thumbnail`` that of :func:`near_duplicates.thumbnail`.
+    """
 
     name: str
     group: Hashable
@@ -44,7 +45,8 @@ class Parting:
     def parts(self, photos: Sequence[Looks], generator: torch.Generator) -> dict[str, list[int]]:
         """Rows of ``val``, ``test`` and any ``train``, see :func:`split.split`. Without ``split_by``, warns of
         near-duplicates in two parts: where one frame of a video trained a detector or steered psi, the score on the
-        next frame says little."""
+        next frame says little.
+        """
         pixels = [hashlib.sha256(photo.image.numpy().tobytes()).digest() for photo in photos]
         groups = joined([photo.group for photo in photos], pixels)  # a photograph that is there twice is one
         val, test = (part.tolist() for part in split(groups, self.val_fraction, generator))

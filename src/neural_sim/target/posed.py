@@ -206,7 +206,8 @@ class PosedTarget(ABC):
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val``, ``test`` and any ``train``, with the objects' names as classes; takes the arguments of every target
-        set."""
+        set.
+        """
         radii = {name: item.radius for name, item in objects.items()}
         size, names, made = (camera.height, camera.width), list(objects), {}
         for part, frames in self.parts(seed).items():

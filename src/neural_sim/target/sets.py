@@ -51,7 +51,8 @@ class RenderedTarget:
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """``val``, ``test`` and any ``train``, drawn from generators of their own: no pose, background or image is
-        shared."""
+        shared.
+        """
         biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
         radii = distribution.radii({name: item.radius for name, item in objects.items()})
         parts = {}

@@ -49,7 +49,8 @@ class Case:
 
     def rays(self, moved: Float[Tensor, "m"], pixels: Tensor) -> Rays:
         """Rays of ``pixels`` where the camera has moved by these numbers. Most of the moved matrices are no rotations;
-        directions stay of unit length."""
+        directions stay of unit length.
+        """
         pose = self.pose + torch.einsum("m,mnij->nij", moved, self.rates)
         rays = cameras.pixel_rays(self.camera, pose, pixels)
         return Rays(rays.origins, torch.nn.functional.normalize(rays.directions, dim=-1))
@@ -79,7 +80,8 @@ def forward(of: Case) -> Float[Tensor, "m"]:
 
 def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
     """By reverse mode, ``patch`` rays at a time, after a pass that renders (``gradient.pathwise.draw_cotangents``, for
-    a camera that moves linearly in any number of numbers)."""
+    a camera that moves linearly in any number of numbers).
+    """
     of.renderer.render(of.field, of.camera, of.pose)
     rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
     total = of.pose.new_zeros(len(of.rates))

@@ -142,7 +142,8 @@ class Estimators:
 
     def _pathwise(self, loop: FrozenLoop, name: str, timing: Timing, seed: int) -> Result:
         """Equal seeds: variants that draw alike see the same images. Images are independent, so that estimates from
-        more of them are means of those from the fewest."""
+        more of them are means of those from the fewest.
+        """
         variant, unit = PATHWISE[name], self.images[0]
         # Reverse mode's numbers are those of the row "linear", but for rounding: one repeat shows its seconds.
         repeats = 1 if variant.estimator.mode == "reverse" else self.repeats

@@ -47,7 +47,8 @@ def small_scene() -> Scene:
 
 def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[BinnedProblem, list[Term]]:
     """The detector after a training on ``images`` of each object, on one image of every bin and object; and L_val. Both
-    in float64. ``anchor`` has the trained parameters."""
+    in float64. ``anchor`` has the trained parameters.
+    """
     generator, scene = torch.Generator().manual_seed(0), small_scene()
     detector = make(num_classes=2, image_size=SIZE)
     drawn = scene.training_set(PSI, images, generator).images

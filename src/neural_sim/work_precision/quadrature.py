@@ -58,7 +58,8 @@ def _blob(distance: Along, offset: Along) -> Along:
 
 def box(thickness: float, offset: Along) -> tuple[Along, Along]:
     """Where a box of about this thickness begins and ends on each ray. Both ends vary by themselves: with one
-    thickness for all rays the errors at its two jumps would cancel for some steps and add up for others."""
+    thickness for all rays the errors at its two jumps would cancel for some steps and add up for others.
+    """
     begin = 0.6 + 0.2 * offset
     return begin, begin + thickness * (0.75 + 0.5 * torch.frac(37.0 * offset))
 
@@ -88,7 +89,8 @@ def rendered(
     density: Density, offset: Float[Tensor, "rays"], samples: int, generator: torch.Generator | None
 ) -> Float[Tensor, "rays 4"]:
     """Colour and opacity of the rays by the project's quadrature; samples at the middle of their intervals, or at
-    random in them with a generator."""
+    random in them with a generator.
+    """
     rays, step = len(offset), SPAN / samples
     inside = offset.new_full((rays, samples), 0.5)
     if generator is not None:

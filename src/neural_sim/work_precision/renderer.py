@@ -26,7 +26,8 @@ FIELD_OF_VIEW = math.radians(40.0)
 @dataclass(frozen=True)
 class Left:
     """What a renderer left out of an image of one object, and what that changed: mean error of opacity over the pixels
-    that show the object, root mean square error of premultiplied colour over all."""
+    that show the object, root mean square error of premultiplied colour over all.
+    """
 
     opacity: float
     colour: float

@@ -92,7 +92,8 @@ class Series:
 
     def overtaken(self) -> Iterator[tuple[Point, Point]]:
         """Every default that another setting beats beyond the noise of timings, beside the fastest one of these: of at
-        most its error, in at most ``CLEARLY`` of its time."""
+        most its error, in at most ``CLEARLY`` of its time.
+        """
         for mine in self.points:
             ahead = [o for o in self.points if o.error <= mine.error and o.seconds <= CLEARLY * mine.seconds]
             if mine.default and ahead:

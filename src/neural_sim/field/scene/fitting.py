@@ -34,7 +34,8 @@ MARK_EVERY = 16
 @dataclass(frozen=True)
 class ScenePixels:
     """Pixels of all photographs with their rays in the capture's frame; ``photo`` numbers each pixel's photograph.
-    ``detail`` is how much the photograph changes there, a pixel on: the depth of what has none is not known well."""
+    ``detail`` is how much the photograph changes there, a pixel on: the depth of what has none is not known well.
+    """
 
     origins: Float[Tensor, "pixels 3"]
     directions: Float[Tensor, "pixels 3"]
@@ -53,7 +54,8 @@ class ScenePixels:
 @dataclass(frozen=True)
 class Visible:
     """The samples of rays that may count. ``samples.distance`` in [0, 1] is the place along its ray, in parts of the
-    ray's lattice, ``samples.width`` a contracted length."""
+    ray's lattice, ``samples.width`` a contracted length.
+    """
 
     samples: PackedSamples
     positions: Float[Tensor, "samples 3"]
@@ -103,7 +105,8 @@ def loss_of(
 @dataclass(frozen=True)
 class Budget:
     """Of one fit: ``steps`` of ``batch_rays`` rays; cells a side at the end, which double after a third of the
-    steps."""
+    steps.
+    """
 
     steps: int
     batch_rays: int

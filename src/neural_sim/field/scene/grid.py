@@ -22,7 +22,8 @@ EMPTY = 1e-3
 
 class SceneGrid:
     """Trilinear over ``resolution``^3 cells of [-2, 2]^3: sigma = softplus(GAIN raw) per cell edge of contracted
-    length, and colour, the sigmoid of three more channels. ``table`` has a row for each vertex, x slowest."""
+    length, and colour, the sigmoid of three more channels. ``table`` has a row for each vertex, x slowest.
+    """
 
     def __init__(self, resolution: int, table: Float[Tensor, "vertices 4"] | None = None) -> None:
         self.resolution = resolution
@@ -73,7 +74,8 @@ class SceneGrid:
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:
         """The total variation of the absorbed fraction of a cell's edge: the mean length of its differences to the next
-        vertex along each axis. Of all surfaces that explain the photographs it is least for the smoothest."""
+        vertex along each axis. Of all surfaces that explain the photographs it is least for the smoothest.
+        """
         side = self.resolution + 1
         last = len(self.table) - 1
         ends = [(vertices + step).clamp_max(last) for step in (side * side, side, 1)]

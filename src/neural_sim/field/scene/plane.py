@@ -121,7 +121,8 @@ def _fitted(
     plane: Plane, points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], tolerance: float
 ) -> Plane | None:
     """By least squares of the points within the tolerance of a plane, of which those below weigh ``BELOW``; None with
-    fewer than three."""
+    fewer than three.
+    """
     height = plane.height(points)
     near = height.abs() < tolerance
     on = points[near]

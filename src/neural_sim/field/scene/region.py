@@ -74,7 +74,8 @@ def connected_region(
     within: Bool[Tensor, "cells"] | None = None,
 ) -> Region | None:
     """What is connected and nearest to the origin, None where nothing is. ``largest`` is the cells' contribution;
-    ``within``, where it is given, holds the object and little else: all that is solid there is taken."""
+    ``within``, where it is given, holds the object and little else: all that is solid there is taken.
+    """
     solid = (largest > SHOWS) & _allowed(grid, plane, APART)
     if within is not None:
         solid &= within

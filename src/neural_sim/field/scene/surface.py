@@ -20,7 +20,8 @@ def seen_surface(
     grid: SceneGrid, pixels: ScenePixels, index: Int[Tensor, "some"], frame: Frame
 ) -> tuple[Float[Tensor, "hits 3"], Float[Tensor, "cells"]]:
     """Points in the normalised frame at which half of a ray's light has ended, and the largest contribution of each of
-    the grid's cells to any of these pixels."""
+    the grid's cells to any of these pixels.
+    """
     points, largest = [], torch.zeros(grid.resolution**3)
     for part in index.split(AT_ONCE):
         seen = visible(grid, pixels.rays(part, frame), torch.full((len(part),), 0.5), grid.samples)

@@ -35,7 +35,8 @@ def psi_chart(
     factor: str,
 ) -> str:
     """One object's probabilities over the iterations, the target's beside them; arguments as in
-    :func:`figures.psi_panel`."""
+    :func:`figures.psi_panel`.
+    """
     figure = Figure(figsize=(3.4, 2.1), layout="constrained")
     figures.psi_panel(
         figure.add_subplot(), history, target, groups, figures.bin_colours(factor, len(history[0]))
@@ -50,7 +51,8 @@ def curve_chart(
     score: Score = "AP",
 ) -> str:
     """The mean score of the classes ``names`` against the method's seconds; ``bounds`` are scores of other detectors by
-    name, drawn as lines. Scores as fractions."""
+    name, drawn as lines. Scores as fractions.
+    """
     figure = Figure(figsize=(6.2, 2.9), layout="constrained")
     axes = figure.add_subplot()
     seconds = [point["seconds"] for point in curve]

@@ -20,7 +20,8 @@ FILE = "report.html"
 @dataclass(frozen=True)
 class Section:
     """One setting's comparison: its AP against cost drawn, how its runs differ from others of the setting, and the
-    classes whose AP is compared, and what each method cost."""
+    classes whose AP is compared, and what each method cost.
+    """
 
     comparison: Comparison
     curves: Figure
@@ -69,7 +70,8 @@ class Section:
 
 def verdict(comparison: Comparison) -> str:
     """Whom the reference method is ahead of by AP at the end, with intervals; methods whose interval includes 0 are
-    named as not told apart. Of one seed it says that intervals leave out how much trainings differ."""
+    named as not told apart. Of one seed it says that intervals leave out how much trainings differ.
+    """
     c = comparison
     reached = c.ap[c.reference]
     head = f"{c.reference} reaches {100 * reached.value:.1f} {POINTS[c.score]} ({interval(reached)})"

@@ -65,7 +65,8 @@ def detected(
 def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor, score: Score = "AP") -> bool:
     """Whether an image's best detections, as many as it has objects, are these objects: each of the right class, with
     an overlap of ``OVERLAP``, or for accuracy of the right class alone. Without objects, whether nothing scores
-    ``SHOWN``."""
+    ``SHOWN``.
+    """
     best = _best(detections, len(boxes))
     if not len(boxes):
         return not len(best["scores"])

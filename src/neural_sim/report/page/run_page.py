@@ -31,7 +31,8 @@ EXAMPLES = 8
 class Shown:
     """Images for the page. ``before`` and ``after`` are training images from the initial and the learned distribution,
     drawn with the same random numbers, an equal number of every object in the order of their labels. ``detections``
-    are those of ns, learned and, where it is known, matched on ``test``; empty without scores."""
+    are those of ns, learned and, where it is known, matched on ``test``; empty without scores.
+    """
 
     before: LabelledImages
     after: LabelledImages
@@ -42,7 +43,8 @@ class Shown:
 @dataclass(frozen=True)
 class PsiChart:
     """One object's distribution of a factor: the chart, and the distances of ``initial`` and ``learned`` from the
-    target, empty where that is not known."""
+    target, empty where that is not known.
+    """
 
     name: str
     chart: str

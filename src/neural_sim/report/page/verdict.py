@@ -85,7 +85,8 @@ class Resampled:
 
     def gain(self, names: Sequence[str], labels: Sequence[int], same_target: bool) -> Gain:
         """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
-        the target's distribution is the initial one."""
+        the target's distribution is the initial one.
+        """
         point, spread = (mean_of_known(part[..., list(labels)]) for part in (self.point, self.spread))
         gain, *room = (
             over_images(float(point[i] - point[0]), spread[:, i] - spread[:, 0]) for i in range(1, len(point))

@@ -52,7 +52,8 @@ def bin_scores(
     score: Score = "AP",
 ) -> list[BinScore]:
     """Every object's bins with ``at_least`` images or more, by the detections of each detector. Images of unknown bins
-    are left out."""
+    are left out.
+    """
     scores = []
     for label, name in enumerate(names):
         matches = {which: match(found, test, label, score) for which, found in detections.items()}

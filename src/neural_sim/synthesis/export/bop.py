@@ -36,7 +36,8 @@ LARGEST = 65535
 @dataclass(frozen=True, eq=False)
 class Model:
     """An object as BOP knows it. ``millimetres`` is the radius of its bounding sphere, ``to_model`` maps the object's
-    normalised frame to its model's, in millimetres; ``mesh`` is in that frame, None where there is none."""
+    normalised frame to its model's, in millimetres; ``mesh`` is in that frame, None where there is none.
+    """
 
     name: str
     millimetres: float
@@ -45,7 +46,8 @@ class Model:
 
     def info(self) -> dict[str, float]:
         """The entry of ``models_info.json``: the bounding box and the largest distance of two points, of the bounding
-        sphere where there is no mesh."""
+        sphere where there is no mesh.
+        """
         if self.mesh is None:
             low, size = self.to_model[:3, 3] - self.millimetres, np.full(3, 2.0 * self.millimetres)
             diameter = 2.0 * self.millimetres

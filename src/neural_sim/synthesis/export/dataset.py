@@ -32,7 +32,8 @@ FORMATS: tuple[Format, ...] = get_args(Format)
 @dataclass(frozen=True)
 class ImageWriter:
     """Writes an image with all files that are its own, and gives its record; ``scene_size`` and ``scale`` are those of
-    BOP, None where it is not asked for. The image itself comes last."""
+    BOP, None where it is not asked for. The image itself comes last.
+    """
 
     source: ImageSource
     root: Path

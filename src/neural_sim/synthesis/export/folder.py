@@ -50,7 +50,8 @@ class ExportFolder:
 
     def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
         """The manifest with every image: its file and hash, and its objects' parameters and poses. The records get in
-        order, which they are not where an image was made again."""
+        order, which they are not where an image was made again.
+        """
         write_whole(self.root / FILE, "".join(line_of(record) for record in records))
         images = [
             {

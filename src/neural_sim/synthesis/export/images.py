@@ -47,7 +47,8 @@ class DrawnObject:
 class ShownObject:
     """An object in an image. ``full`` are the pixels of its silhouette within the image, ``visible`` those that no
     other object hides; ``pixels`` is the number of its silhouette's, with those beyond the image, and ``box`` (x0, y0,
-    x1, y1) is round them, None where there are none. ``labelled``: enough of it is visible for a label."""
+    x1, y1) is round them, None where there are none. ``labelled``: enough of it is visible for a label.
+    """
 
     placed: DrawnObject
     full: Bool[np.ndarray, "height width"]
@@ -60,7 +61,8 @@ class ShownObject:
 @dataclass(frozen=True, eq=False)
 class ExportImage:
     """An image, sRGB in 8 bits, with the depth along the view axis of what is visible (millimetres, 0 where no object
-    is) and its objects, the layout's first one first."""
+    is) and its objects, the layout's first one first.
+    """
 
     pixels: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]

@@ -74,7 +74,8 @@ def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "co
 
 def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 2"]:
     """One closed polygon whose inside, by the even-odd rule, is the mask: its outlines, each reached from the first
-    one's first corner and left back to it, so that these ways cancel. Empty for an empty mask."""
+    one's first corner and left back to it, so that these ways cancel. Empty for an empty mask.
+    """
     loops = outlines(mask)
     if not loops:
         return np.zeros((0, 2), dtype=np.int64)
@@ -86,7 +87,8 @@ def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 
 
 def _closes(ways: list[int], before: int) -> bool:
     """Whether a walk that arrives at its first corner is done though another edge begins there: it would not turn right
-    into it."""
+    into it.
+    """
     return (before + 1) % 4 not in ways
 
 

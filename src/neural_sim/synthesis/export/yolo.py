@@ -20,7 +20,8 @@ SEGMENT = "segment"
 
 def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: Sequence[str]) -> None:
     """``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``; below ``segment`` the same images with the
-    visible masks as polygons. Images without objects have empty files, as YOLO has them."""
+    visible masks as polygons. Images without objects have empty files, as YOLO has them.
+    """
     for record in records:
         name = Path(record["file"])
         for place, line in ((folder, box_line), (folder / SEGMENT, polygon_line)):

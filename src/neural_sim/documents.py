@@ -1,0 +1,59 @@
+"""What studies, reports and exports write: JSON by the standard, and Markdown tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def finite(tree: Any) -> Any:
+    """Replace NaN and infinities by None, which JSON by the standard can hold; tuples become lists."""
+    if isinstance(tree, Mapping):
+        return {key: finite(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
+    """Write a document as standard JSON in UTF-8, and make its folder; numbers that are not finite become null.
+
+    Args:
+        path: the file.
+        document: mappings, sequences, strings, numbers, booleans and None.
+        indent: spaces of indentation a level; None writes one line.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        TypeError: for a value that JSON cannot hold.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(finite(document), indent=indent, allow_nan=False), encoding="utf-8")
+    return path
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a Markdown table; bars in cells are escaped.
+
+    Args:
+        head: titles of the columns.
+        rows: cells of each row, as many as ``head`` has.
+
+    Raises:
+        ValueError: for a row of another length.
+    """
+    lines = [_line(head), "|" + "---|" * len(head)]
+    for row in rows:
+        if len(row) != len(head):
+            raise ValueError(f"markdown_table: want {len(head)} cells as in {list(head)}, got {list(row)}")
+        lines.append(_line(row))
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[object]) -> str:
+    return "| " + " | ".join(str(cell).replace("|", r"\|") for cell in cells) + " |"

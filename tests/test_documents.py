@@ -1,0 +1,29 @@
+"""Standard JSON and Markdown tables."""
+
+import json
+import math
+
+import pytest
+
+from neural_sim.documents import finite, markdown_table, write_json
+
+
+def test_numbers_that_are_not_finite_become_null_at_every_depth(tmp_path):
+    document = {"a": [1.0, math.nan, (math.inf, {"b": -math.inf})], "c": "nan", "d": True, "e": 3}
+    path = write_json(tmp_path / "new" / "file.json", document)
+    read = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda name: pytest.fail(name))
+    assert read == {"a": [1.0, None, [None, {"b": None}]], "c": "nan", "d": True, "e": 3}
+    assert finite(math.nan) is None
+
+
+def test_what_json_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "file.json", {"a": object()})
+
+
+def test_a_table_has_its_head_its_rule_and_escaped_cells():
+    assert markdown_table(["a", "b"], [[1, "x|y"], [None, 2.5]]) == (
+        "| a | b |\n|---|---|\n| 1 | x\\|y |\n| None | 2.5 |"
+    )
+    with pytest.raises(ValueError, match=r"want 2 cells .* got \[1\]"):
+        markdown_table(["a", "b"], [[1]])
