@@ -41,7 +41,7 @@ def experiment(*overrides):
 def test_every_baseline_takes_every_parameter(baseline, parameter):
     lights = ["renderer=nerf_w"] if "illumination" in parameter else []
     made = experiment(f"baseline={baseline}", f"parameter={parameter}", *lights)
-    assert made.loop.method.name == ("neural_sim" if baseline == "none" else baseline)
+    assert made.loop.method.name == baseline
     assert ",".join(made.imaging.distribution.names) == parameter.strip("[]")
 
 
@@ -110,12 +110,6 @@ def test_estimators_are_compared_in_one_loop(pair, scale):
     for made, name in ((one, pair[0]), (other, pair[1])):
         wanted = {"paper": PathwiseEstimator, "pathwise": PathwiseEstimator, "reinforce": ReinforceEstimator}
         assert isinstance(made.loop.gradient, wanted.get(name.rsplit("_", 1)[1], StratifiedEstimator))
-
-
-def test_none_is_the_old_name_of_neural_sim():
-    assert (
-        experiment("baseline=none").config == experiment("baseline=neural_sim").config == experiment().config
-    )
 
 
 @pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,71 @@ def own_folder(wanted: Path) -> Path:
         except FileExistsError:
             number += 1
             folder = wanted.with_name(f"{wanted.name}_{number}")
+
+
+GONE: dict[str, str] = {
+    "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
+}
+"""What to say of keys and choices (``key=value``) that no longer exist. A key stands for all keys below it, too."""
+
+MOVED: dict[str, str] = {}
+"""Today's names of keys and choices (``key=value``) that have moved.
+
+A key stands for all keys below it, too, unless it has become a group, whose name has a slash:
+``"outer.trust": "outer.adjoint.trust"`` moves ``outer.trust.level``, while ``"outer.adjoint": "outer/adjoint"`` leaves
+``outer.adjoint.rtol`` alone.
+"""
+
+
+def updated(
+    words: Sequence[str], gone: Mapping[str, str] = GONE, moved: Mapping[str, str] = MOVED
+) -> tuple[list[str], list[str]]:
+    """Translate the words of a command line to today's names.
+
+    Returns:
+        The words, those of moved keys and choices replaced, and a line for each that was.
+
+    Raises:
+        UserError: a key or choice that no longer exists.
+    """
+    current, notes = [], []
+    for word in words:
+        override = word.lstrip("+~")
+        prefix = word[: len(word) - len(override)]
+        key, equals, value = override.partition("=")
+        for choice in (f"{key}={one}" for one in re.findall(r"[\w.]+", value)):
+            if choice in gone:
+                raise UserError(f"{choice} is gone: {gone[choice]}")
+        for parent in _with_parents(key):
+            if parent in gone:
+                raise UserError(f"{parent} is gone: {gone[parent]}")
+        renamed = _renamed(key, value, moved)
+        if renamed is not None:
+            name, translated = renamed
+            # Hydra takes a group that is in the defaults list without a prefix only.
+            override = ("" if "/" in name else prefix) + name + equals + translated
+            notes.append(f"{word} is {override} now")
+            word = override
+        current.append(word)
+    return current, notes
+
+
+def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] | None:
+    """Today's key and value, of a sweep value by value; None for what has not moved."""
+    choices = [moved.get(f"{key}={one}", "").partition("=") for one in value.split(",")]
+    names = {name for name, _, _ in choices}
+    if len(names) == 1 and "" not in names:
+        return names.pop(), ",".join(one for _, _, one in choices)
+    for parent in _with_parents(key):
+        if parent in moved and (parent == key or "/" not in moved[parent]):
+            return moved[parent] + key[len(parent) :], value
+    return None
+
+
+def _with_parents(key: str) -> list[str]:
+    """A dotted key and the keys above it, the longest first."""
+    parts = key.split(".")
+    return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
 
 
 def check_top(plain: Mapping[str, Any]) -> None:

@@ -34,6 +34,7 @@ from neural_sim.configuration import (
     first_line,
     job_folder,
     own_folder,
+    updated,
 )
 
 if TYPE_CHECKING:
@@ -286,6 +287,12 @@ def _refuse(error: Exception) -> NoReturn:
 
 def main() -> None:
     """Entry point of ``neural-sim`` and ``python -m src.main``."""
+    try:
+        sys.argv[1:], notes = updated(sys.argv[1:])
+    except UserError as error:
+        _refuse(error)
+    for note in notes:
+        print(f"neural-sim: {note}", file=sys.stderr)
     _task()
 
 
