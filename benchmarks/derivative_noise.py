@@ -21,7 +21,7 @@ from neural_sim.main import build, conf_directory
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.steps import by_p, stacked
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 
 @dataclass

@@ -29,7 +29,7 @@ from neural_sim.outer.retrained import centred_cosine
 from neural_sim.report.machine import machine
 from neural_sim.report.section import replace_section
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 Measured = dict[str, Float[Tensor, "objects K"]]
 

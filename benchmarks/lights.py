@@ -24,7 +24,7 @@ from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.report.machine import machine
 from neural_sim.report.section import replace_section
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 WAY = (0.0, 0.2, 0.4, 0.7, 1.0)
 

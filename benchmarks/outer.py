@@ -28,8 +28,8 @@ from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.report.machine import gpu, machine
-from neural_sim.stages.context import Context
 from neural_sim.synthesis.scene import Scene
+from neural_sim.tasks.context import Context
 
 SMALL_FIELDS = [
     "scale=quick", "progress=false", "views.count=40", "budget.grid.steps=90", "budget.grid.refine_steps=[30]",

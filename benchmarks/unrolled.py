@@ -35,8 +35,8 @@ from neural_sim.main import build, conf_directory
 from neural_sim.report.machine import machine
 from neural_sim.report.section import replace_section
 from neural_sim.solver.hvp import gradient
-from neural_sim.stages.context import Context
 from neural_sim.synthesis.pool import ImagePool
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 START = ("+experiment=pose_gap", "gap=uniform")

@@ -6,8 +6,8 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.stages.context import Context
 from neural_sim.stages.temperatures import frozen_loop
+from neural_sim.tasks.context import Context
 
 SMALL = [
     "scale=quick", "progress=false", "training.image_size=64", "views.count=68",

@@ -11,6 +11,12 @@ ORDER = (
     "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer",
     "stress", "work_precision", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
+TASKS_IN_STAGES = {
+    "walk", "report", "export", "predict", "preflight", "repeat", "viewer", "methods", "side_by_side", "compare",
+    "experiments", "stress", "work_precision", "temperatures", "patch_memory", "interpolation", "samples_gallery",
+    "detection_gallery", "nerf_vs_mesh", "sfm_vs_nerf",
+}  # fmt: skip
+"""Tasks and studies that still stand among the stages; the set only shrinks."""
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -35,6 +41,8 @@ def test_rooms_import_from_earlier_rooms_only():
         if module.startswith("neural_sim.") and package != "__init__":
             other = module.split(".")[1]
             assert other in ORDER, f"{path} imports {module}, which has no place in the order"
+            if package == "stages" and other == "tasks" and path.stem in TASKS_IN_STAGES:
+                continue
             assert ORDER.index(other) <= ORDER.index(package), f"{path} imports {module}, a later package"
 
 

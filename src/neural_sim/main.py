@@ -38,8 +38,8 @@ from neural_sim.configuration import (
 )
 
 if TYPE_CHECKING:
-    from neural_sim.stages.context import Context, Step
     from neural_sim.stages.experiment import Experiment
+    from neural_sim.tasks.context import Context, Task
 
 # Read when torch is imported. OpenMP threads that spin starve each other where processes share cores (sweeps, tests);
 # threads that sleep at once are woken for each of many short operations, which makes an outer iteration a third
@@ -96,7 +96,7 @@ Recompose = Callable[[Sequence[str]], DictConfig]
 
 def context_of(
     config: DictConfig, folder: Path, recompose: Recompose | None = None
-) -> tuple[Context, dict[str, Step]]:
+) -> tuple[Context, dict[str, Task]]:
     """A run in ``folder``, and those of its stages that are none from objects to a report, by name.
 
     The experiment is built at once if a stage needs it, so that bad settings are refused before any stage runs. With
@@ -106,10 +106,10 @@ def context_of(
         UserError: as :func:`build`, and for an unknown stage.
     """
     plain = _plain(config)
-    from neural_sim.stages.context import Context
     from neural_sim.stages.walk import STEPS
+    from neural_sim.tasks.context import Context
 
-    others: dict[str, Step] = {}
+    others: dict[str, Task] = {}
     for name in plain["stages"]:
         if name in STEPS:
             continue
@@ -232,9 +232,9 @@ def _task(config: DictConfig) -> float | None:
             raise
         _refuse(error)
     except RuntimeError as error:
-        from neural_sim.stages.context import StageFailure
+        from neural_sim.tasks.context import TaskFailure
 
-        if runtime.mode == RunMode.MULTIRUN or not isinstance(error, StageFailure):
+        if runtime.mode == RunMode.MULTIRUN or not isinstance(error, TaskFailure):
             raise
         sys.exit(1)
 

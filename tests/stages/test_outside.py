@@ -28,9 +28,9 @@ class Count:
 
 class Fail:
     def run(self, context):
-        from neural_sim.stages.context import StageFailure
+        from neural_sim.tasks.context import TaskFailure
 
-        raise StageFailure("two checks failed")
+        raise TaskFailure("two checks failed")
 '''
 
 

@@ -17,10 +17,10 @@ from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.report import stress as report
 from neural_sim.report.stress import failures, markdown, table, track, write
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.stages.context import StageFailure
 from neural_sim.stages.walk import walk
 from neural_sim.stress import cases, linear, rendering, sampling, simplex
 from neural_sim.stress.cases import FAMILIES, Check, Scope, Suite, run_case
+from neural_sim.tasks.context import TaskFailure
 
 ROOT = Path(__file__).parents[2]
 
@@ -175,7 +175,7 @@ def test_what_failed_is_counted_and_written(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "track", lambda *arguments: SimpleNamespace(where="not logged"))
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         config = compose("config", ["+experiment=stress", "stress.families=[simplex]", "progress=false"])
-    with pytest.raises(StageFailure) as caught:
+    with pytest.raises(TaskFailure) as caught:
         walk(*context_of(config, tmp_path))
     held = json.loads((tmp_path / "stress.json").read_text())
     failed = sum(not row["passed"] for row in held)

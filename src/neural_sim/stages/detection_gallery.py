@@ -12,9 +12,9 @@ import torch
 
 from neural_sim.checks import at_least
 from neural_sim.report.detection_gallery import report_detections
-from neural_sim.stages.context import Context
 from neural_sim.stages.methods import check_methods, graphs_of_methods
 from neural_sim.stages.side_by_side import results_of_study
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

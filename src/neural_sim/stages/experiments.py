@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from neural_sim.report.experiments import Experiments
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

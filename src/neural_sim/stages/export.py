@@ -16,7 +16,6 @@ from torch import Tensor
 from neural_sim.cameras import reframed
 from neural_sim.checks import at_least
 from neural_sim.renderer.nerf import Quality
-from neural_sim.stages.context import Context
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
 from neural_sim.stages.meshes import Meshes, Objects
@@ -32,6 +31,7 @@ from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.synthesis.export.records import opencv_entry
 from neural_sim.synthesis.scene import Scene
+from neural_sim.tasks.context import Context
 
 _log = logging.getLogger(__name__)
 

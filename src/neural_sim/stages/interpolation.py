@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 
 from neural_sim.report.interpolation import Interpolation, report_interpolation
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from neural_sim.stages.context import Context
 from neural_sim.stages.graph import Graph
+from neural_sim.tasks.context import Context
 
 
 def graphs_of_methods(context: Context, methods: Sequence[str], key: str) -> dict[str, Graph]:

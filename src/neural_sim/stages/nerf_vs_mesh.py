@@ -13,7 +13,6 @@ from pathlib import Path
 from neural_sim.checks import at_least
 from neural_sim.report.run import write_training_set
 from neural_sim.report.side_by_side import report_side_by_side
-from neural_sim.stages.context import Context
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.meshes import Meshes
@@ -26,6 +25,7 @@ from neural_sim.stages.side_by_side import (
     sets_of_kinds,
 )
 from neural_sim.target.coco import CocoTarget
+from neural_sim.tasks.context import Context
 
 ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 """Where BlenderProc's ``write_coco_annotations`` writes, in its output folder."""

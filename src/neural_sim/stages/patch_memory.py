@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.patch_memory import PatchMemory
 from neural_sim.report.patch_memory import report_patch_memory
-from neural_sim.stages.context import Context
 from neural_sim.stages.temperatures import frozen_loop
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

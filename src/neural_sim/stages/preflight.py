@@ -15,8 +15,8 @@ from neural_sim.outer.labelled import labelled_gains
 from neural_sim.report.page.preflight_page import write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
 from neural_sim.report.preflight import Preflight
-from neural_sim.stages.context import Context
 from neural_sim.target.mismatch import distance_factor, matching_settings, mismatches
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any
 from neural_sim.checks import at_least
 from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.repeat import Repeated, repeated, sentence, table
-from neural_sim.stages.context import Context
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
+from neural_sim.tasks.context import Context
 
 APART = 1_000
 """Between the seeds of trainings, so that a sweep over seeds 0, 1, 2 shares none of them."""

@@ -20,9 +20,9 @@ from neural_sim.report.run import (
     write_results,
     write_training_set,
 )
-from neural_sim.stages.context import Context
 from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.graph import Psi
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)

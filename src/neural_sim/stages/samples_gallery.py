@@ -13,11 +13,11 @@ import torch
 from neural_sim.checks import at_least
 from neural_sim.parameter.distributions import total_variation
 from neural_sim.report.gallery import Samples, report_samples
-from neural_sim.stages.context import Context
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.methods import check_methods, graphs_of_methods
 from neural_sim.stages.side_by_side import results_of_study
 from neural_sim.stages.stage import Results
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 

@@ -21,13 +21,13 @@ from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.report.reconstruction import HeldOut, held_out_figure, held_out_table
 from neural_sim.report.side_by_side import report_side_by_side
-from neural_sim.stages.context import Context
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.other_images import trained_on
 from neural_sim.stages.reconstruction import ReconstructionDetectorStage, ReconstructionStage
 from neural_sim.stages.side_by_side import compare_sources, graphs_of_seeds, pairs, results_of_study
 from neural_sim.stages.stage import Results
+from neural_sim.tasks.context import Context
 from neural_sim.types import PosedViews
 
 UNLIT = Lighting(lights=(), ambient=1.0)

@@ -9,7 +9,6 @@ import torch
 
 from neural_sim.report.bootstrap import match
 from neural_sim.report.side_by_side import SideBySide, side_by_side
-from neural_sim.stages.context import Context
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.graph import Graph
@@ -17,6 +16,7 @@ from neural_sim.stages.stage import Results
 from neural_sim.stages.store import Store
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.stages.walk import STEPS
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 

@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass
 
 from neural_sim.report.stress import report
-from neural_sim.stages.context import Context, StageFailure
 from neural_sim.stress.cases import Suite
+from neural_sim.tasks.context import Context, TaskFailure
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,10 @@ class StressStep(Suite):
         """Every check to the run's folder and to MLflow.
 
         Raises:
-            StageFailure: where a check failed, when all is written.
+            TaskFailure: where a check failed, when all is written.
         """
         config, begun = context.config, time.time()
         failed = report(self.run_all(config["seed"], config["progress"]), config, context.folder, begun)
         if failed:
-            raise StageFailure(f"stress: {failed} checks failed")
+            raise TaskFailure(f"stress: {failed} checks failed")
         context.returned = 0.0

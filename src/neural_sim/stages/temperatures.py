@@ -11,7 +11,7 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.temperatures import Temperatures
 from neural_sim.report.temperatures import report_temperatures
-from neural_sim.stages.context import Context
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

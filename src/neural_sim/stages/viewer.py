@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neural_sim.report.viewer import Shots, Viewer
-from neural_sim.stages.context import Context
 from neural_sim.stages.psi_file import psi_of_file
 from neural_sim.stages.stage import Results
 from neural_sim.stages.store import Store
+from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from neural_sim.stages.context import Context, Step
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.plan import plan
 from neural_sim.stages.report import write_report
 from neural_sim.stages.stage import Stage
+from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ STEPS: Mapping[str, Callable[[Context], None]] = {
 """The stages of a run from objects to a report, in their order; a target of photographs comes first."""
 
 
-def walk(context: Context, others: Mapping[str, Step]) -> float | None:
+def walk(context: Context, others: Mapping[str, Task]) -> float | None:
     """Run the context's stages: those of ``STEPS`` in its order, then ``others`` in theirs.
 
     Returns what a sweep may maximise: the AP on validation images of the detector trained on the learned distribution.

@@ -19,9 +19,9 @@ from neural_sim.report.machine import machine
 from neural_sim.report.work_precision import document, track, write, write_docs
 from neural_sim.report.work_precision_loop import Loops
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.stages.context import Context
 from neural_sim.stages.report import run_results
 from neural_sim.stages.temperatures import frozen_loop
+from neural_sim.tasks.context import Context
 from neural_sim.types import PosedViews
 from neural_sim.work_precision.derivative import Derivative
 from neural_sim.work_precision.estimator import Estimators

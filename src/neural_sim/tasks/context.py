@@ -1,0 +1,173 @@
+"""What a task runs in: the command's configuration, results of stages, a folder and MLflow."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
+
+from neural_sim.documents import write_json
+from neural_sim.outer.records import IterationRecord
+from neural_sim.report import figures as drawing
+from neural_sim.report.figures import Figure
+from neural_sim.report.run_tracking import LiveRun, live_run
+from neural_sim.report.tracking import Run, flatten, log_run, tracking_uri
+from neural_sim.stages.account import Account
+from neural_sim.stages.experiment import Experiment
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Results
+from neural_sim.stages.store import Store
+
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class TaskFailure(RuntimeError):
+    """A task has written its results, which include a failure: the program's exit status is 1."""
+
+
+class Task(Protocol):
+    """An entry of ``stages`` that is no stage: it reads results of stages and writes to the run's folder.
+
+    A task that needs stages from objects to a report names them in ``needs``; they run before it.
+    """
+
+    def run(self, context: Context) -> None:
+        """Do the work."""
+
+
+@dataclass
+class Context:
+    """One command: its configuration, the stages' results, its folder and its MLflow store.
+
+    Args:
+        config: the whole configuration as plain values.
+        folder: where tasks write.
+        build: makes the experiment when it is first asked for; studies of finished runs need none.
+        stages: what the command asks for.
+        account: seconds and what was left out, for the report.
+        live: the command's run in MLflow while it is open.
+        returned: what the run returns to a sweep.
+        of_method: makes the experiment of the same command with another method (``baseline=...``), where the program
+            can compose it.
+        begun: when the task that runs began, in seconds since 1970.
+    """
+
+    config: dict[str, Any]
+    folder: Path
+    build: Callable[[], Experiment]
+    stages: Sequence[str]
+    account: Account = field(default_factory=Account)
+    live: LiveRun | None = None
+    returned: float | None = None
+    of_method: Callable[[str], Experiment] | None = None
+    begun: float = field(default_factory=time.time)
+
+    @staticmethod
+    def of(experiment: Experiment, folder: Path | None = None) -> Context:
+        """Return the context of an experiment that is built already, with the stages of its configuration."""
+        config = experiment.config
+        return Context(config, folder or Path(), lambda: experiment, tuple(config["stages"]))
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """The parts of the configuration, built once."""
+        return self.build()
+
+    @cached_property
+    def graph(self) -> Graph:
+        """The experiment's stages."""
+        return Graph(self.experiment, self._iteration)
+
+    @cached_property
+    def results(self) -> Results:
+        """Results of stages, read from the store or computed."""
+        return Results(Store(self.experiment.run.store), self.stages, self.account.reused)
+
+    @property
+    def uri(self) -> str:
+        """The MLflow store's address."""
+        return tracking_uri(self.config["paths"]["mlflow"])
+
+    def _iteration(self, record: IterationRecord) -> None:
+        if self.live:
+            self.live.iteration(dataclasses.asdict(record))
+
+    def shown(self, items: Iterable[T], name: str) -> Iterable[T]:
+        """Return ``items`` behind a progress bar, if the run shows any."""
+        return tqdm(list(items), desc=name, disable=not self.config["progress"], leave=False)
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Count the seconds of a stage or a task."""
+        self.begun, begun = time.time(), time.perf_counter()
+        yield
+        spent = self.account.seconds[name] = time.perf_counter() - begun
+        _log.info("%-11s %8.1f s", name, spent)
+        if self.live:
+            self.live.stage(name, spent)
+
+    @contextmanager
+    def tracked(self) -> Iterator[None]:
+        """Open an MLflow run for what is inside, if the report is asked for."""
+        if "report" not in self.stages:
+            with nullcontext():
+                yield
+            return
+        x, names = self.experiment, self.graph.names
+        biased, method = x.imaging.distribution.biased, x.loop.method.name
+        with live_run(self.uri, x.run.name, method, x.run.seed, names, biased, x.config) as self.live:
+            _log.info("to watch this run:\n%s", self.live.where)
+            yield
+
+    def publish(
+        self,
+        name: str,
+        document: Any,
+        text: str | None = None,
+        figures: Mapping[str, Figure] | None = None,
+        metrics: Mapping[str, float | Sequence[float] | None] | None = None,
+        tags: Mapping[str, str] | None = None,
+        title: str | None = None,
+    ) -> Run:
+        """Write what a task found to the folder and, as a finished run, to MLflow; print the text and where it all is.
+
+        The run belongs to the experiment that the command's ``name`` names, begins when the task began, and has
+        the whole folder as its artifacts, so also what the task wrote there before. Its parameters are the whole
+        configuration, or where no experiment was built the task's own settings and the seed.
+
+        Args:
+            name: of the files, ``<name>.json`` and ``<name>.md``, and of the task's node in the configuration.
+            document: the content of ``<name>.json``; numbers that are not finite become null.
+            text: the content of ``<name>.md``, which is printed too; None: neither.
+            figures: written as ``figures/<key>.png``.
+            metrics: final numbers, and sequences with one value a step; None and what is not finite is left out.
+            tags: of the run in MLflow, beside the seed.
+            title: of the run in MLflow; None: its seed.
+        """
+        write_json(self.folder / f"{name}.json", document)
+        if text is not None:
+            (self.folder / f"{name}.md").write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+            print(text.rstrip("\n"))
+        for key, figure in (figures or {}).items():
+            drawing.save(figure, self.folder / "figures" / f"{key}.png")
+        seed = str(self.config["seed"])
+        known = {key: value for key, value in (metrics or {}).items() if value is not None}
+        series = {key: value for key, value in known.items() if isinstance(value, Sequence)}
+        numbers = {key: value for key, value in known.items() if not isinstance(value, Sequence)}
+        whole = "experiment" in self.__dict__  # built, so that the task depends on all of it
+        parameters = self.config if whole else {name: self.config.get(name, {}), "seed": self.config["seed"]}
+        run = log_run(
+            self.uri, self.config["name"], title or f"seed {seed}", {"seed": seed, **(tags or {})},
+            flatten(parameters), numbers, series, self.folder, self.begun,
+        )  # fmt: skip
+        print(f"results: {self.folder}\n{run.where}")
+        return run
