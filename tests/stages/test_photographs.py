@@ -11,6 +11,7 @@ from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import train_detector
 from neural_sim.main import build, conf_directory, context_of
+from neural_sim.randomness import stream
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.walk import walk
 from neural_sim.target.sets import RenderedTarget
@@ -132,7 +133,7 @@ def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
 
     # real_only by hand: four epochs of as many batches as the 32 synthetic images have.
     training, detector = context.experiment.training, graph.warm_start.build()
-    generator = torch.Generator().manual_seed(1_000_003 + 4)
+    generator = stream(0, "fine-tuning")
     photographs = training.real.chosen(targets.train, 0)
     params, history = train_detector(
         detector,
@@ -179,7 +180,7 @@ def test_fine_tuning_goes_on_from_the_detector_of_synthetic_images(folder):
     assert before.cost.detector_steps == 16 and after.cost.detector_steps == 16 + round(0.3 * 16)
     training, detector = context.experiment.training, graph.warm_start.build()
     photographs = training.real.chosen(made(graph.targets).train, 0)
-    generator = torch.Generator().manual_seed(1_000_003 + 4)
+    generator = stream(0, "fine-tuning")
     how = training.of(1)
     how = type(how)(1, how.batch_size, training.real.finetune_learning_rate, how.weight_decay)
     params, _ = train_detector(

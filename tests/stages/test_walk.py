@@ -15,6 +15,7 @@ from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.training import train_detector
 from neural_sim.main import conf_directory, context_of
+from neural_sim.randomness import stream
 from neural_sim.report import logged
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
@@ -59,7 +60,7 @@ def _pixels(images):
 def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distribution(folder, returned):
     context, _ = _context(folder)
     graph, training, targets = context.graph, context.experiment.training, _targets(context)
-    generator, detector = torch.Generator().manual_seed(1_000_003 + 1), graph.warm_start.build()
+    generator, detector = stream(0, "detector"), graph.warm_start.build()
     scene = context.results(graph.scene)
     drawn = scene.training_set(graph.psi("initial"), training.images_per_object, generator).images
     params, _ = train_detector(

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.randomness import stream
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -111,9 +112,8 @@ class Real:
         """
         available = 0 if photographs is None else len(photographs)
         count = self.number(available)
-        generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 3)
         assert photographs is not None  # of which ``number`` found one at least
-        return photographs.select(torch.randperm(available, generator=generator)[:count])
+        return photographs.select(torch.randperm(available, generator=stream(seed, "photographs"))[:count])
 
     def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:
         """How batches are drawn of the ``synthetic`` images and the ``photographs`` after them; None: all alike."""

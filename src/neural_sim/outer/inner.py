@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from neural_sim.devices import placed, synchronise
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
 from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.draws import HARD, Draws, HardDraws
 from neural_sim.synthesis.pool import ImagePool
@@ -113,7 +115,7 @@ class InnerLoop:
     def draw(self, psi: Float[Tensor, "objects K"]) -> RenderedImages:
         """An iteration's training images, without maps where no derivative goes through them."""
         rendered = self.scene.training_set(
-            psi, self.settings.images_per_object, self._common(0), self.draws, self.pool
+            psi, self.settings.images_per_object, self._common("images"), self.draws, self.pool
         )
         self.images += len(rendered)
         return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
@@ -138,12 +140,11 @@ class InnerLoop:
         real, batch_size = self.training.real, self.training.batch_size
         return real.sampling(self.drawn(images), len(self.photographs), batch_size)
 
-    def _common(self, purpose: int) -> torch.Generator:
+    def _common(self, purpose: Literal["images", "training"]) -> torch.Generator:
         """A generator of the same random numbers until :meth:`renew`, or of new ones without ``common_numbers``."""
         if not self.common_numbers:
             return self.generator
-        seed = self.generator.initial_seed() + 2_000_003 * (1 + self._numbers) + purpose
-        return torch.Generator().manual_seed(seed)
+        return stream(self._numbers, f"common {purpose}", self.generator)
 
     def renew(self) -> None:
         """Change the common random numbers."""
@@ -167,7 +168,7 @@ class InnerLoop:
             self.detector,
             start,
             images,
-            self._common(1),
+            self._common("training"),
             how,
             self.warm_start,
             recording,

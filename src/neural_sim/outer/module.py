@@ -21,6 +21,7 @@ from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.response import agreement
 from neural_sim.outer.retrained import as_double, binned_problem, retrained_cosine
 from neural_sim.outer.unrolling import through_training
+from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.assembly import RenderedImages
 
@@ -36,7 +37,7 @@ class SimulatorModule(GradientLoop):
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
         # A generator of its own, so that certifying does not change a run.
-        self._check_generator = torch.Generator().manual_seed(inner.generator.initial_seed() + 1)
+        self._check_generator = stream(0, "certificate", inner.generator)
         if self.settings.adjoint == "unrolled":
             self._recording = self.settings.unrolled.recording
 

@@ -20,6 +20,7 @@ from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.cost import Cost
+from neural_sim.randomness import stream
 from neural_sim.stages.scene import SceneStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
@@ -118,7 +119,7 @@ class DetectorStage(TrainedStage):
 
     def generator(self) -> torch.Generator:
         """Of images, new parameters and the order of training."""
-        return torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 1)
+        return stream(self.seed, "detector")
 
     def make(self, results: Results) -> TrainedDetector:
         results(self.scene)  # so that fields are not charged
@@ -184,7 +185,7 @@ class PhotographsStage(TrainedStage):
 
     def make(self, results: Results) -> TrainedDetector:
         detector, training = self.build(), self.training
-        generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 4)
+        generator = stream(self.seed, "fine-tuning")
         photographs = training.real.chosen(results(self.targets).train, self.seed).to(self.device)
         begun, cpu_begun = time.perf_counter(), time.process_time()
         start = (

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,6 +21,7 @@ from neural_sim.outer.response import ResponseLoop
 from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
@@ -98,10 +98,9 @@ class PsiStage(Stage[LearnedPsi]):
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
             scene = replace(scene, renderer=scene.renderer.at(self.outer.quality))
-        generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + 2)
         inner = InnerLoop(
             scene, self.warm_start.build(), results(self.warm_start).params, results(self.targets).val, self.outer,
-            training, generator, self.draws, self.warm_start.photographs(results),
+            training, stream(self.seed, "psi"), self.draws, self.warm_start.photographs(results),
         )  # fmt: skip
         if self.parts is not None:
             return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import torch
-
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.layout import draw_layout, own_labels
@@ -56,8 +55,8 @@ class RenderedTarget:
         biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
         radii = distribution.radii({name: item.radius for name, item in objects.items()})
         parts = {}
-        for part, name in enumerate(("val", "test", "train") if self.trains else ("val", "test")):
-            generator = torch.Generator().manual_seed(2_000_003 * (seed + 1) + part)
+        for name in ("val", "test", "train") if self.trains else ("val", "test"):
+            generator = stream(seed, f"target {name}")
             counts = [self._count(name, item.name in biased) for item in objects.values()]
             layout = None
             if synthesizer.several:
