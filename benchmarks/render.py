@@ -23,8 +23,8 @@ from neural_sim.field.base import RadianceField
 from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.report.machine import machine
+from neural_sim.studies.work_precision.renderer import left_out
 from neural_sim.types import PinholeCamera, PosedViews
-from neural_sim.work_precision.renderer import left_out
 
 
 def variants(qualities: list[Quality], undo: bool) -> dict[str, NerfRenderer]:

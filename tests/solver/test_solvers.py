@@ -1,5 +1,5 @@
 """What each linear solver does beside solving: reports, warm starts, references of other libraries. Condition numbers,
-indefinite, singular and extreme systems are the stress suite's (``neural_sim/stress/linear.py``)."""
+indefinite, singular and extreme systems are the stress suite's (``neural_sim/studies/stress/linear.py``)."""
 
 from __future__ import annotations
 

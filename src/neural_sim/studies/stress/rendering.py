@@ -1,0 +1,245 @@
+"""Rendering at the ends of density, size and distance. The truth is always Beer and Lambert's law along a
+closed-form chord.
+
+Constant density s over a ray's length L gives the opacity 1 - exp(-s L). The grid takes one sample a step h
+of a fixed lattice, so that it sees N h with |N h - L| <= h for every interval that the ray spends inside: the
+opacity lies between those of L - h and L + h, and N h = L where the interval's ends are h apart on the
+lattice. Rounding: a table entry r (log of the density where that is small) is known to eps |r|, a sum of N
+terms to N eps, relatively in the optical depth and hence at most as much in the opacity. The running sum over
+all rays' samples is known to N eps of float64 times the sum of their optical depths, of which one counts for
+50 at most.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neural_sim.field.base import PackedSamples
+from neural_sim.field.grid import EMPTY_DENSITY, GridField
+from neural_sim.field.mlp import MLPField
+from neural_sim.field.quadrature import composite
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, short, worst
+from neural_sim.types import Rays
+
+DENSITIES = (0.0, 1e-6, 1e-3, 1.0, 1e3, 1e8)
+EXACT = NerfRenderer(termination=0.0)
+
+
+def raw_density(sigma: float, cell: float) -> float:
+    """The table entry whose softplus over the cell's edge is ``sigma``."""
+    depth = sigma * cell
+    return depth + math.log(-math.expm1(-depth)) if depth > 0.0 else EMPTY_DENSITY
+
+
+def block(
+    sigma: float, dtype: torch.dtype = SINGLE, half: float = 1.0, cells: int = 8, step_cells: float = 1.0,
+    colour: float = 0.0, hollow: bool = False,
+) -> GridField:  # fmt: skip
+    """A cube of constant density round the origin; ``hollow`` leaves only its outermost cells."""
+    field = GridField(step_cells=step_cells, density_gain=1.0).to(dtype)
+    occupied = torch.ones(cells, cells, cells, dtype=torch.bool)
+    if hollow:
+        occupied[1:-1, 1:-1, 1:-1] = False
+    cell = 2.0 * half / cells
+    field.reset(occupied, torch.full((3,), -half, dtype=dtype), cell)
+    with torch.no_grad():
+        field.table[:-1, 0] = raw_density(sigma, cell)
+        field.table[:-1, 1:] = colour
+    return field.eval().requires_grad_(False)
+
+
+def ball(sigma: float, dtype: torch.dtype = SINGLE) -> MLPField:
+    """The network with all weights zero: constant density in the unit sphere."""
+    scale = 1.0 if sigma == 0.0 else sigma
+    field = MLPField(
+        width=4, depth=2, position_frequencies=1, direction_frequencies=1, density_scale=scale
+    ).to(dtype)
+    with torch.no_grad():
+        for name, value in field.named_parameters():
+            value.zero_()
+            if name.endswith("sigma.bias"):
+                value.fill_(EMPTY_DENSITY if sigma == 0.0 else math.log(math.expm1(1.0)))
+    return field.eval().requires_grad_(False)
+
+
+def chord(rays: Rays, half: float) -> Tensor:
+    """Length of each ray inside the cube [-half, half]^3, by its six planes, in float64."""
+    origins, directions = rays.origins.double(), rays.directions.double()
+    inside = origins.abs() < half
+    with torch.no_grad():
+        low, high = (-half - origins) / directions, (half - origins) / directions
+        near, far = torch.minimum(low, high), torch.maximum(low, high)
+        parallel = directions == 0.0
+        near = torch.where(parallel, torch.where(inside, -math.inf, math.inf), near)
+        far = torch.where(parallel, torch.where(inside, math.inf, -math.inf), far)
+    return (far.amin(-1) - near.amax(-1).clamp_min(0.0)).clamp_min(0.0)
+
+
+def opacity_of(depth: Tensor | float) -> Tensor:
+    return -torch.expm1(-torch.as_tensor(depth, dtype=DOUBLE).clamp_min(0.0))
+
+
+def outside(opacity: Tensor, sigma: float, shortest: Tensor, longest: Tensor) -> float:
+    """How far opacities lie outside those of lengths from ``shortest`` to ``longest``."""
+    low, high = opacity_of(sigma * shortest), opacity_of(sigma * longest)
+    return float(torch.maximum(low - opacity.double(), opacity.double() - high).clamp_min(0.0).max())
+
+
+def rounding_of(sigma: float, dtype: torch.dtype, cell: float = 0.25) -> float:
+    """What the table's entry and a ray's sum of samples may round an opacity by."""
+    return (abs(raw_density(sigma, cell)) + 32) * eps(dtype) if sigma else 0.0
+
+
+def running_sum(samples: int, depth: float) -> float:
+    """What the running sum over a pack may lose, for the sum of optical depths of all its samples."""
+    return samples * eps(DOUBLE) * (min(depth, 50.0 * samples) + samples)
+
+
+def along_x(*offsets: tuple[float, float], dtype: torch.dtype = SINGLE, start: float = 3.0) -> Rays:
+    origins = torch.tensor([[start, y, z] for y, z in offsets], dtype=dtype)
+    directions = torch.tensor([[-1.0, 0.0, 0.0]], dtype=dtype).expand(len(offsets), 3)
+    return Rays(origins, directions.contiguous())
+
+
+@case
+def slab_opacity(scope: Scope) -> Checks:
+    """Densities from 0 to 1e8 through a cube of edge 2 on the lattice: 1 - exp(-2 s), relatively."""
+    for dtype in (DOUBLE, SINGLE):
+        for sigma in DENSITIES:
+            rgb, opacity = EXACT.render_rays(block(sigma, dtype), along_x((0.1, 0.2), dtype=dtype))
+            truth = float(opacity_of(2.0 * sigma))
+            error = abs(float(opacity) - truth) / truth if truth else float(opacity)
+            label = f"density {sigma:g}, {short(dtype)}"
+            yield Check(f"opacity: {label}", error, rounding_of(sigma, dtype))
+            # A raw colour of 0 is 1/2 exactly.
+            yield Check(f"colour: {label}", worst(rgb - 0.5 * opacity[:, None]), 2 * eps(dtype))
+
+
+@case
+def ball_opacity(scope: Scope) -> Checks:
+    """The network's samples partition a ray's chord of the unit sphere: their widths add up to it, whatever the
+    density.
+
+    Rays from outside, from inside and almost tangent. Rounding: the near and far ends to a few eps of the
+    distance, which half a chord of 1e-3 takes up 1e3-fold through the square root, and 192 widths; and the
+    running sum's.
+    """
+    distances = torch.tensor([0.0, 0.5, 0.999, 1.0 - 5e-7, 1.001], dtype=DOUBLE)
+    half = (1.0 - distances.square()).clamp_min(0.0).sqrt()
+    for dtype in (DOUBLE, SINGLE):
+        slack = 3.0 * (192 + 1e3) * eps(dtype)
+        for sigma in DENSITIES:
+            for where, start, length in (("outside", 3.0, 2.0 * half), ("inside", 0.0, half)):
+                rays = along_x(*[(float(d), 0.0) for d in distances], dtype=dtype, start=start)
+                _, opacity = EXACT.render_rays(ball(sigma, dtype), rays)
+                excess = outside(opacity, sigma, length - slack, length + slack)
+                lost = running_sum(5 * 192, sigma * float(length.sum()))
+                label = f"density {sigma:g} from {where}, {short(dtype)}"
+                bound = 400 * eps(dtype) * min(1.0, 2 * sigma) + lost
+                yield Check(f"opacity beyond rounding: {label}", excess, bound)
+
+
+@case
+def mixed_densities(scope: Scope) -> Checks:
+    """A faint ray behind a thousand opaque ones in the same pack: 1 - exp(-0.5) for each density of the
+    others, to the rounding of the running sum and of the ray's own 20 samples.
+    """
+    rays, each, width = 1001, 20, 0.05
+    for dtype in (DOUBLE, SINGLE):
+        number = torch.arange(rays).repeat_interleave(each)
+        widths = torch.full((rays * each,), width, dtype=dtype)
+        starts = torch.arange(0, rays * each + 1, each)
+        samples = PackedSamples(number, torch.zeros_like(widths), widths, starts)
+        for sigma in (0.0, 1.0, 1e4, 1e8):
+            sigmas = torch.full((rays, each), sigma, dtype=dtype)
+            sigmas[-1] = 0.5
+            _, opacity = composite(sigmas.flatten(), torch.zeros(rays * each, 3, dtype=dtype), samples)
+            error = abs(float(opacity[-1]) - float(opacity_of(0.5 * each * float(widths[0]))))
+            bound = running_sum(rays * each, rays * each * min(50.0, sigma * width)) + (each + 8) * eps(dtype)
+            yield Check(f"opacity: behind density {sigma:g}, {short(dtype)}", error, bound)
+
+
+@case
+def thin_shell(scope: Scope) -> Checks:
+    """Walls half as thick as a step. A lattice may miss one, but over 64 equally spaced phases of the lattice
+    the mean of N h is that of a lattice 64 times as fine: within h / 64 of each wall's length. At one phase
+    it is within h of each, and at the default step, one cell, no wall that a ray crosses fully is missed.
+    """
+    half, cells, phases = 1.0, 8, 64
+    targets = 0.7 * (2 * torch.rand(300, 3, generator=scope.generator(), dtype=DOUBLE) - 1.0)
+    origins = 3.0 * torch.nn.functional.normalize(scope.normal(300, 3), dim=-1)
+    rays = Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
+    length = chord(rays, half) - chord(rays, half - 2.0 * half / cells)
+    field = block(1.0, DOUBLE, half, cells, step_cells=2.0, hollow=True)
+    step, rounding = field.step, 64 * eps(DOUBLE)
+    seen = torch.stack(
+        [field.sample_cells(rays, 0.0, phase / phases)[0].starts.diff() * step for phase in range(phases)]
+    )
+    error = worst(seen.mean(0) - length)
+    yield Check("mean length over 64 phases, step of 2 cells", error, 2 * step / phases + rounding)
+    yield Check("length at any phase, step of 2 cells", worst(seen - length), 2 * step + rounding)
+    for sigma in (1.0, 1e8):
+        _, opacity = EXACT.render_rays(block(sigma, DOUBLE, half, cells, 2.0, hollow=True), rays)
+        excess = outside(opacity, sigma, length - 2 * step, length + 2 * step)
+        yield Check(f"opacity beyond its bounds: density {sigma:g}", excess, rounding)
+    samples = block(1.0, DOUBLE, half, cells, hollow=True).sample(rays, 0.0)
+    missed = float((samples.starts.diff() < 2).sum())
+    yield Check("rays that miss a wall, step of 1 cell", missed, 0.0)
+
+
+@case
+def camera_inside(scope: Scope) -> Checks:
+    """From within the cube: the length to its wall, within a step; the default early end errs by 1e-3 at most."""
+    for dtype in (DOUBLE, SINGLE):
+        origins = (1.8 * torch.rand(500, 3, generator=scope.generator(), dtype=DOUBLE) - 0.9).to(dtype)
+        rays = Rays(origins, torch.nn.functional.normalize(scope.normal(500, 3).to(dtype), dim=-1))
+        length = chord(rays, 1.0)
+        for sigma in DENSITIES:
+            field, rounding = block(sigma, dtype), rounding_of(sigma, dtype)
+            _, opacity = EXACT.render_rays(field, rays)
+            label = f"density {sigma:g}, {short(dtype)}"
+            excess = outside(opacity, sigma, length - field.step, length + field.step)
+            yield Check(f"opacity beyond a step: {label}", excess, rounding)
+            _, early = NerfRenderer().render_rays(field, rays)
+            yield Check(f"early end: {label}", worst(early - opacity), 1e-3 + rounding)
+
+
+@case
+def grazing_rays(scope: Scope) -> Checks:
+    """Rays almost in the plane of a face, by closed form and a step; on planes between cells no cell counts
+    twice or not at all; in the very plane of a face either side is right. Rays past the object and away from it see
+    exactly 0, with derivatives that are exactly 0.
+    """
+    slopes = (0.0, 1e-12, -1e-12, 1e-9, -1e-9, 1e-6, -1e-6, 1e-3, -1e-3)
+    pairs = [(gap, slope) for gap in (1e-3, 1e-2, -1e-3) for slope in slopes]
+    target = torch.tensor([(0.0, 1.0 - gap, 0.1) for gap, _ in pairs], dtype=DOUBLE)
+    tilt = torch.tensor([[-1.0, slope, 0.0] for _, slope in pairs], dtype=DOUBLE)
+    directions = torch.nn.functional.normalize(tilt, dim=-1)
+    between = [(y, z) for y in (0.0, 0.25, -0.75) for z in (0.0, 0.5)]
+    for dtype in (DOUBLE, SINGLE):
+        rays = Rays((target - 3.0 * directions).to(dtype), directions.to(dtype))
+        for sigma in (0.3, 1e8):
+            field = block(sigma, dtype)
+            _, opacity = EXACT.render_rays(field, rays)
+            length = chord(rays, 1.0)
+            excess = outside(opacity, sigma, length - field.step, length + field.step)
+            label = f"density {sigma:g}, {short(dtype)}"
+            yield Check(f"opacity beyond a step: {label}", excess, rounding_of(sigma, dtype))
+        field, bound = block(0.3, dtype), rounding_of(0.3, dtype)
+        _, opacity = EXACT.render_rays(field, along_x(*between, dtype=dtype))
+        yield Check(f"opacity between cells, {short(dtype)}", worst(opacity - opacity_of(0.6)), bound)
+        _, opacity = EXACT.render_rays(field, along_x((1.0, 0.1), (-1.0, 0.1), (0.1, 1.0), dtype=dtype))
+        either = torch.minimum(opacity.abs(), (opacity - opacity_of(0.6)).abs())
+        yield Check(f"opacity in the plane of a face, {short(dtype)}", worst(either), bound)
+    origins = torch.tensor([[3.0, 1.5, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 3.0], [1e4, 1e4, 0.0]])
+    away = torch.tensor([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    for label, field in (("grid", block(1e8, colour=3.0)), ("network", ball(1e8))):
+        leaves = origins.clone().requires_grad_(), away.clone().requires_grad_()
+        rgb, opacity = EXACT.render_rays(field, Rays(*leaves))
+        total = rgb.sum() + opacity.sum()
+        derivatives = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+        yield Check(f"rays that miss, and their derivatives: {label}", worst(total, *derivatives), 0.0)

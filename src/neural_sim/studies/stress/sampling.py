@@ -1,0 +1,209 @@
+"""Draws from p_psi at the ends of their settings, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neural_sim.parameter import bins as binned
+from neural_sim.parameter.noise import BinNoise, SceneNoise
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.studies.stress.cases import (
+    DOUBLE,
+    FALSE_ALARM,
+    SINGLE,
+    Check,
+    Checks,
+    Scope,
+    case,
+    eps,
+    not_finite,
+    short,
+    worst,
+)  # fmt: skip
+
+CIRCLE = 2.0 * math.pi
+CAP = 0.1
+"""Smallest resultant that ``circular_mean`` divides by in its derivative."""
+
+
+def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
+    """Deviation of a frequency in ``draws`` from p, exceeded with probability ``alarm`` (Bernstein's inequality)."""
+    logarithm = math.log(2.0 / alarm)
+    linear = logarithm / (3.0 * draws)
+    return linear + (linear**2 + 2.0 * p * (1.0 - p) * logarithm / draws).sqrt()
+
+
+@case
+def one_hot(scope: Scope) -> Checks:
+    """Psi = 1000 on one bin without a floor: p is 1 there to the last bit, log p elsewhere is -1000 to a few
+    roundings, every draw is of that bin (Gumbel noise spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000)
+    underflows to 0.
+    """
+    scene = SceneDistribution.of([Pose(floor=0.0)])
+    (pose,) = scene.binned
+    truth = torch.where(torch.arange(8) == 5, 0.0, -1000.0)
+    for dtype in (DOUBLE, SINGLE):
+        psi = truth.to(dtype) + 1000.0
+        yield Check(f"log p, {short(dtype)}", worst(pose.log_probabilities(psi) - truth), 4e3 * eps(dtype))
+        noise = scene.draw_noise(2000, scope.generator(), dtype)
+        hard, relaxed = scene.hard(psi, noise), scene.relaxed(psi, noise)
+        missed = int((hard.bins != 5).sum()) + int((relaxed.bins != 5).sum())
+        yield Check(f"draws of another bin, {short(dtype)}", float(missed), 0.0)
+        # One weight of exactly 1: the circular mean is its centre, through one sine, cosine and arctangent.
+        gap = torch.remainder(relaxed.phi.double() - hard.phi.double() + math.pi, CIRCLE) - math.pi
+        yield Check(f"relaxed against hard angle, {short(dtype)}", worst(gap), 8 * eps(dtype) * CIRCLE)
+        leaf = psi.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(pose.log_probabilities(leaf).exp().square().sum(), leaf)
+        yield Check(f"dp/dpsi, {short(dtype)}", worst(slope), 8 * eps(dtype))
+    wanted = torch.eye(8, dtype=DOUBLE)[2]
+    back = pose.log_probabilities(pose.psi_of(wanted)).exp()
+    # psi_of() clamps zeros to 1e-6, which the normalisation distributes
+    yield Check("logits of a one-hot p", worst(back - wanted), 7.1e-6)
+
+
+@case
+def floor(scope: Scope) -> Checks:
+    """Psi far below: p = (1 - k f) softmax(psi) + f, with its derivative (1 - k f) s_i (1 - s_i) / p_i of log
+    p_i.
+
+    Rounding: log_softmax of entries of size up to |psi| costs eps |psi| in the exponent, the sum in logaddexp
+    a few eps more. At psi = -800 the derivative is 0 and p is f exactly; the sum over k bins is 1 within k
+    roundings.
+    """
+    count, smallest = 8, 0.005
+    for dtype in (DOUBLE, SINGLE):
+        for depth in (0.0, 5.0, 20.0, 800.0, 1e6):
+            leaf = (-depth * torch.eye(count, dtype=dtype)[3]).requires_grad_()
+            softmax = torch.softmax(leaf.detach().double(), -1)
+            truth = (1.0 - count * smallest) * softmax + smallest
+            log_p = binned.log_probabilities(leaf, smallest)
+            p = log_p.detach().double().exp()
+            # An error of psi's rounding in the exponent counts only as far as the softmax part is there.
+            bound = (8.0 + min(depth, 30.0)) * eps(dtype)
+            label = f"psi = -{depth:g}, {short(dtype)}"
+            yield Check(f"p: {label}", worst((p - truth) / truth), bound)
+            yield Check(f"sum of p - 1: {label}", abs(float(p.sum()) - 1.0), count * bound)
+            (slope,) = torch.autograd.grad(log_p[3], leaf)
+            exact = float((1.0 - count * smallest) * softmax[3] * (1.0 - softmax[3]) / truth[3])
+            yield Check(f"d log p / dpsi: {label}", abs(float(slope[3]) - exact), 4.0 * bound)
+
+
+@case
+def temperatures(scope: Scope) -> Checks:
+    """Tau from 1e-4 to 1e3 over the same draws.
+
+    Against the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, 2 eps
+    |z| in the exponent each way: y to exp(4 eps max|z|) - 1 relatively. As tau falls 1 - max y <= (k - 1)
+    exp(-gap / tau); as it rises |y - 1 / k| <= (exp(range / tau) - 1) / k. The derivative (diag y - y y^T) /
+    tau has no entry above 1 / (4 tau).
+    """
+    count, draws = 8, 500
+    log_p = torch.log_softmax(scope.normal(count), -1)
+    noise = binned.gumbel((draws, count), scope.generator(), DOUBLE)
+    ordered = (noise + log_p).sort(-1, descending=True).values
+    largest = worst(ordered)
+    for temperature in (1e-4, 1e-2, 0.1, 1.0, 10.0, 1e3):
+        label = f"tau = {temperature:g}"
+        y = binned.gumbel_softmax(log_p, noise, temperature)
+        slack = math.expm1(8 * eps(DOUBLE) * largest / temperature) + count * eps(DOUBLE)
+        yield Check(f"sum of y - 1: {label}", worst(y.sum(-1) - 1.0), count * eps(DOUBLE))
+        cold = (count - 1) * torch.exp((ordered[:, 1] - ordered[:, 0]) / temperature)
+        yield Check(
+            f"1 - max y beyond the cold limit: {label}", float((1.0 - y.amax(-1) - cold).max()), slack
+        )
+        warm = torch.expm1((ordered[:, 0] - ordered[:, -1]) / temperature) / count
+        excess = float(((y - 1.0 / count).abs().amax(-1) - warm).max())
+        yield Check(f"|y - 1/k| beyond the warm limit: {label}", excess, slack)
+        single = binned.gumbel_softmax(log_p.float(), noise.float(), temperature)
+        same = binned.gumbel_softmax(log_p.float().double(), noise.float().double(), temperature)
+        # y is at most 1, so an error above 1 says nothing; the draw's bin is checked by `gumbel_max`
+        bound = min(1.0, math.expm1(min(700.0, 4 * eps(SINGLE) * largest / temperature))) + count * eps(
+            SINGLE
+        )
+        yield Check(f"float32 against float64: {label}", worst(single - same), bound)
+        leaf = log_p.clone().requires_grad_()
+        row = binned.gumbel_softmax(leaf, noise[:50], temperature)
+        slopes = torch.stack([torch.autograd.grad(row[i, 0], leaf, retain_graph=True)[0] for i in range(50)])
+        exact = y[:50, :1] * (torch.eye(count, dtype=DOUBLE)[0] - y[:50]) / temperature
+        bound = (slack + 8 * eps(DOUBLE)) / temperature
+        yield Check(f"dy/dlog p: {label}", worst(slopes - exact), bound)
+        yield Check(f"dy/dlog p against its largest: {label}", worst(slopes), 0.25 / temperature + bound)
+
+
+@case
+def gumbel_max(scope: Scope) -> Checks:
+    """Frequencies of drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at
+    every tau; the noise is finite where it is drawn for (float64, float32, float16, bfloat16).
+    """
+    draws = 200_000 if scope.full else 20_000
+    for count in (1, 2, 8, 64):
+        (pose,) = Pose(bins=count, floor=0.0 if count == 1 else 0.1 / count).factors
+        psi = 2.0 * scope.normal(count)
+        p = pose.log_probabilities(psi).exp()
+        noise = BinNoise(binned.gumbel((draws, count), scope.generator(), DOUBLE))
+        drawn = {"hard": pose.hard(psi, noise)}
+        for temperature in (1e-4, 1e3):
+            # At tau = 1e3 float64 still tells y apart where the largest two differ by 1e3 eps: ties are below 1e-12.
+            y = binned.gumbel_softmax(p.log(), noise.gumbel, temperature)
+            drawn[f"tau = {temperature:g}"] = y.argmax(-1)
+        for label, bins in drawn.items():
+            over = (bins.bincount(minlength=count) / draws - p) / bernstein(p, draws, FALSE_ALARM / count)
+            yield Check(f"frequencies over their bounds: k = {count}, {label}", worst(over), 1.0)
+    for dtype in (DOUBLE, SINGLE, torch.float16, torch.bfloat16):
+        wrong = not_finite(binned.gumbel((1000, 64), scope.generator(), dtype))
+        yield Check(f"noise not finite: {short(dtype)}", wrong, 0.0)
+
+
+@case
+def bin_counts(scope: Scope) -> Checks:
+    """K of 1, 2 and 64: hard draws lie in their bin, also at its very edges.
+
+    An angle at an edge belongs to the bin within the rounding of the angle, 4 eps 2 pi; a miss is by that at
+    most.
+    """
+    for dtype in (DOUBLE, SINGLE):
+        for count in (1, 2, 64):
+            scene = SceneDistribution.of([Pose(bins=count, floor=0.0)])
+            bins = torch.arange(count).repeat_interleave(4)
+            within = torch.tensor([0.0, 0.5, 1.0 - 0.5 * eps(dtype), 1.0], dtype=dtype).repeat(count)
+            noise = scene.draw_noise(len(bins), scope.generator(), dtype)
+            draw = scene.at_bins({"pose": bins}, SceneNoise(noise.bins, {**noise.uniform, "phi": within}))
+            centre = (bins.double() + 0.5) * CIRCLE / count
+            outside = float(((draw.phi.double() - centre).abs() - 0.5 * CIRCLE / count).max())
+            label = f"k = {count}, {short(dtype)}"
+            yield Check(f"angle beyond its bin: {label}", outside, 4 * eps(dtype) * CIRCLE)
+            step = (scene.bins_of(draw)[:, 0] - bins).remainder(count)
+            wrong = float((step != 0)[within == 0.5].sum())
+            yield Check(f"centres in another bin: {label}", wrong, 0.0)
+            far = float(((step != 0) & (step != 1) & (step != count - 1)).sum())
+            yield Check(f"edges not in a neighbouring bin: {label}", far, 0.0)
+
+
+@case
+def opposite_bins(scope: Scope) -> Checks:
+    """Two opposite bins from 0.5 + d and 0.5 - d, where the circular mean has no derivative at d = 0: R = 2
+    d.
+
+    |d angle / dy_i| = R |sin(B_i - angle)| / max(R, cap)^2: at most 1 / cap, and the closed form to the
+    rounding (k + 8) eps / cap^2.
+    """
+    count = 8
+    angles = (torch.arange(count, dtype=DOUBLE) + 0.5) * CIRCLE / count
+    for dtype in (DOUBLE, SINGLE):
+        centre = binned.centres(count, 0.0, CIRCLE, torch.zeros(1, dtype=dtype))
+        for offset in (0.0, 1e-12, 1e-6, 1e-3, 0.04, 0.06, 0.5):
+            y = torch.zeros(1, count, dtype=dtype)
+            y[0, 1], y[0, 5] = 0.5 + offset, 0.5 - offset
+            length = float(y[0, 1].double() - y[0, 5].double())
+            angle = binned.circular_mean(y.requires_grad_(), centre)
+            slope = torch.autograd.grad(angle.sum(), y)[0][0].double()
+            exact = length * torch.sin(angles - angles[1]) / max(length, CAP) ** 2
+            bound = (count + 8) * eps(dtype) / CAP**2
+            label = f"offset {offset:g}, {short(dtype)}"
+            yield Check(f"d angle / dy: {label}", worst(slope - exact), bound)
+            yield Check(f"|d angle / dy| against 1 / cap: {label}", worst(slope), 1.0 / CAP + bound)
+            yield Check(f"angles not finite: {label}", not_finite(angle), 0.0)

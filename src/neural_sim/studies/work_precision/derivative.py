@@ -1,0 +1,193 @@
+"""The derivative of an image by the numbers of its scene parameters: forward, reverse, by patches, by differences.
+
+Each way ends with the m numbers d<cotangent, image>/dV for a given cotangent, nonzero in every pixel. Reverse renders
+twice and goes back once (the paper's Tool 3), forward renders once.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim import cameras
+from neural_sim.field.base import RadianceField
+from neural_sim.field.rendering import render_samples
+from neural_sim.gradient.pathwise import contract
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.studies.work_precision.series import Point, Series, Timing
+from neural_sim.studies.work_precision.suite import World
+from neural_sim.synthesis.motion import RIGID, pose_rates
+from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
+
+MOST = 12
+"""Entries of a pose, by which its rates differ."""
+Way = Callable[["Case"], Float[Tensor, "m"]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One image, the m directions in which its camera moves, and the cotangent of its maps."""
+
+    field: RadianceField
+    renderer: NerfRenderer
+    camera: PinholeCamera
+    pose: Float[Tensor, "1 4 4"]
+    rates: Float[Tensor, "m 1 4 4"]
+    cotangent: Maps
+
+    def double(self) -> Case:
+        """The same in float64."""
+        maps = Maps(self.cotangent.rgb.double(), self.cotangent.opacity.double())
+        field = copy.deepcopy(self.field).double()
+        return replace(self, field=field, pose=self.pose.double(), rates=self.rates.double(), cotangent=maps)
+
+    def rays(self, moved: Float[Tensor, "m"], pixels: Tensor) -> Rays:
+        """Rays of ``pixels`` where the camera has moved by these numbers. Most of the moved matrices are no rotations;
+        directions stay of unit length.
+        """
+        pose = self.pose + torch.einsum("m,mnij->nij", moved, self.rates)
+        rays = cameras.pixel_rays(self.camera, pose, pixels)
+        return Rays(rays.origins, torch.nn.functional.normalize(rays.directions, dim=-1))
+
+
+def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) -> Case:
+    """The first three numbers are phi, rho and distance, the others random directions of the pose's twelve entries."""
+    generator, device = torch.Generator().manual_seed(0), next(field.parameters()).device
+    camera = PinholeCamera(size, size, math.radians(40.0))
+    draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, dtype=torch.long))
+    rates = torch.randn(MOST, 1, 4, 4, generator=generator) * 0.3
+    rates[:, :, 3] = 0.0
+    rates[:3] = pose_rates(draw, RIGID)
+    cotangent = torch.randn(1, size, size, 4, generator=generator).to(device)
+    pose = cameras.orbit(draw.phi, draw.rho, draw.distance).to(device)
+    maps = Maps(cotangent[..., :3], cotangent[..., 3])
+    return Case(field, renderer, camera, pose, rates[:numbers].to(device), maps)
+
+
+def forward(of: Case) -> Float[Tensor, "m"]:
+    """By forward mode, in the pass that renders."""
+    moved = of.renderer.render_with_tangents(of.field, of.camera, of.pose, of.rates)[1]
+    return torch.cat(
+        list(contract({str(i): tangent for i, tangent in enumerate(moved)}, of.cotangent).values())
+    )
+
+
+def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
+    """By reverse mode, ``patch`` rays at a time, after a pass that renders (``gradient.pathwise.draw_cotangents``, for
+    a camera that moves linearly in any number of numbers).
+    """
+    of.renderer.render(of.field, of.camera, of.pose)
+    rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
+    total = of.pose.new_zeros(len(of.rates))
+    for pixels in torch.arange(len(opacity), device=of.pose.device).split(patch):
+        numbers = torch.zeros_like(total, requires_grad=True)
+        rendered = of.renderer.render_rays(of.field, of.rays(numbers, pixels))
+        (part,) = torch.autograd.grad(
+            rendered, numbers, (rgb[pixels], opacity[pixels]), materialize_grads=True
+        )
+        total += part
+    return total
+
+
+@torch.no_grad()
+def difference(of: Case, step: float, same: bool) -> Float[Tensor, "m"]:
+    """By central differences of renders of all rays, two for each number.
+
+    ``same``: at the samples of the unmoved camera, as the derivatives have it. Otherwise each render chooses its own,
+    so that samples behind the termination come and go, in jumps that no small step removes.
+    """
+    field = of.field.with_step(of.renderer.step)
+    pixels = torch.arange(of.camera.width * of.camera.height, device=of.pose.device)
+    rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
+    samples = field.sample(of.rays(of.pose.new_zeros(len(of.rates)), pixels), of.renderer.termination)
+    found = []
+    for moved in torch.eye(len(of.rates)).to(of.pose) * step:
+        sides = []
+        for sign in (1.0, -1.0):
+            rays = of.rays(sign * moved, pixels)
+            colour, alpha = (
+                render_samples(field, rays, samples) if same else of.renderer.render_rays(of.field, rays)
+            )
+            sides.append((colour * rgb).sum() + (alpha * opacity).sum())
+        found.append((sides[0] - sides[1]) / (2.0 * step))
+    return torch.stack(found)
+
+
+@dataclass(frozen=True)
+class Derivative:
+    """The family ``derivative``.
+
+    Args:
+        size: pixels a side.
+        numbers: m, by how many numbers of its camera an image is differentiated; a series each.
+        patches: rays of a patch of the reverse mode.
+        steps: of the central differences, in radians and object radii.
+
+    Raises:
+        ValueError: a size, patch or step that is not positive, or m outside of 1 to 12.
+    """
+
+    size: int = 64
+    numbers: tuple[int, ...] = (1, 12)
+    patches: tuple[int, ...] = (64, 512)
+    steps: tuple[float, ...] = (1e-2, 1e-4, 1e-6)
+
+    def __post_init__(self) -> None:
+        positive = (self.size, *self.patches, *self.steps)
+        if min(positive) <= 0 or not all(1 <= m <= MOST for m in self.numbers):
+            raise ValueError(
+                f"work_precision.derivative: want size, patches and steps above 0 and numbers from 1 to {MOST}, got "
+                f"{self.size}, {list(self.patches)}, {list(self.steps)} and {list(self.numbers)}"
+            )
+
+    def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
+        """Errors relative to the norm of the whole image's reverse mode in float64, of the first object."""
+        del seed  # the camera and the cotangent are the same for all seeds
+        for count in self.numbers:
+            of = case(world.fields[0], world.renderer, self.size, count)
+            precise = of.double()
+            truth = reverse(precise, self.size**2)
+            points = [
+                self._point(name, line, one, way, truth, timing)
+                for name, line, one, way in self.ways(of, precise)
+            ]
+            note = (
+                f"One image of {self.size} x {self.size} pixels of {world.names[0]}, by {count} "
+                f"number{'s' if count > 1 else ''} of its camera; float32, but for differences in float64. Against "
+                "reverse mode of the whole image in float64."
+            )
+            yield Series(
+                f"derivative/by {count}",
+                "relative error of the derivative",
+                tuple(points),
+                (),
+                note,
+                timing.clock,
+            )
+
+    def ways(self, of: Case, precise: Case) -> Iterator[tuple[str, str, Case, Way]]:
+        """Setting, line, the problem in its type, and how it is differentiated."""
+        yield "forward", "forward", of, forward
+        chunks = replace(of, renderer=NerfRenderer(of.renderer.quality, rays_per_chunk=512))
+        yield "forward, chunks of 512 rays", "forward", chunks, forward
+        for patch in self.patches:
+            if patch < self.size**2:
+                yield f"reverse, patches of {patch}", "reverse", of, lambda one, p=patch: reverse(one, p)
+        yield "reverse, whole", "reverse", of, lambda one: reverse(one, self.size**2)
+        for line, one, same in (
+            ("differences", of, True), ("differences in float64", precise, True),
+            ("differences of new renders in float64", precise, False),
+        ):  # fmt: skip
+            for step in self.steps:
+                yield f"{line}, {step:g}", line, one, lambda case, h=step, s=same: difference(case, h, s)
+
+    def _point(self, name: str, line: str, of: Case, way: Way, truth: Tensor, timing: Timing) -> Point:
+        error = float((way(of).double() - truth).norm() / truth.norm())
+        seconds, memory = timing.of(lambda: way(of), of.pose.device)
+        return Point(name, error, seconds, memory, name == "forward", line)

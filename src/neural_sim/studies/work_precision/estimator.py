@@ -1,0 +1,246 @@
+"""Estimators of the hypergradient's mixed term against the derivative over hard bins, by images and seconds.
+
+Each gives d/dpsi <dL_train/dtheta, v> of one object's psi from N images, drawn and bound as in the psi loop. The
+reference, g_i = p_i (s_i - sum_j p_j s_j) up to the floor's factor with s_b the mean score <dl/dtheta, v> of bin b, is
+the derivative of the distribution that training images are drawn from. It is an estimate too, from other images.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Probes
+from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.pathwise import PathwiseEstimator
+from neural_sim.outer.frozen import FrozenLoop, centred
+from neural_sim.parameter.update import shrinkage
+from neural_sim.studies.work_precision.series import Point, Series, Timing
+from neural_sim.studies.work_precision.suite import World
+from neural_sim.types import SceneDraw
+
+Estimates = Float[Tensor, "repeats objects k"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A pathwise estimator with the settings of other packages that belong to it."""
+
+    estimator: PathwiseEstimator
+    bin_mean: str = "circular"
+    label_gradient: str = "differentiable"
+
+    def of(self, loop: FrozenLoop) -> FrozenLoop:
+        """The same state with these settings."""
+        moved = loop.with_factor(dataclasses.replace(loop.bins, bin_mean=self.bin_mean))
+        synthesizer = dataclasses.replace(moved.scene.synthesizer, label_gradient=self.label_gradient)
+        return dataclasses.replace(moved, scene=dataclasses.replace(moved.scene, synthesizer=synthesizer))
+
+
+PATHWISE = {
+    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear", "ignored"),
+    "linear": Variant(PathwiseEstimator(), "linear", "ignored"),
+    "circular": Variant(PathwiseEstimator(), "circular", "ignored"),
+    "linear, boxes": Variant(PathwiseEstimator(), "linear"),
+    "circular, boxes": Variant(PathwiseEstimator()),
+    "antithetic": Variant(PathwiseEstimator(antithetic=True)),
+    "common backgrounds": Variant(PathwiseEstimator(common_backgrounds=True)),
+    "straight-through": Variant(PathwiseEstimator(relaxation="straight_through")),
+    "Gumbel-Rao": Variant(PathwiseEstimator(relaxation="gumbel_rao", conditional_draws=16)),
+}
+
+
+@dataclass
+class Result:
+    """One estimator: estimates, and processor or wall seconds an object, by number of images."""
+
+    estimates: dict[int, Estimates] = field(default_factory=dict)
+    seconds: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """The family ``estimator``.
+
+    Args:
+        images: numbers N of an estimate, growing, each a multiple of the first.
+        default: images of the project's own, the stratified one: 24 probes of each of 8 bins.
+        repeats: estimates from the largest N; there are more from fewer.
+        truth_per_bin: images of every bin for the reference.
+        pathwise: variants of the pathwise estimator, of :data:`PATHWISE`.
+
+    Raises:
+        ValueError: an unknown variant, numbers of images that are no multiples of the first, or a count below 1.
+    """
+
+    images: tuple[int, ...] = (16, 32, 64, 128)
+    default: int = 192
+    repeats: int = 2
+    truth_per_bin: int = 128
+    pathwise: Sequence[str] = tuple(PATHWISE)
+
+    def __post_init__(self) -> None:
+        unknown = set(self.pathwise) - set(PATHWISE)
+        if unknown:
+            raise ValueError(
+                f"work_precision.estimator.pathwise: want some of {', '.join(PATHWISE)}, got {sorted(unknown)}"
+            )
+        if (
+            not self.images
+            or any(n % self.images[0] for n in self.images)
+            or list(self.images) != sorted(self.images)
+        ):
+            raise ValueError(
+                "work_precision.estimator.images: want growing multiples of the first, got "
+                f"{list(self.images)}"
+            )
+        if min(*self.images, self.default, self.repeats, self.truth_per_bin - 1) < 1:
+            raise ValueError(
+                "work_precision.estimator: want at least 1 image and repeat and 2 truth_per_bin, got "
+                f"{list(self.images)}, {self.repeats} and {self.truth_per_bin}"
+            )
+
+    def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
+        """At the initial psi of the run's loop and the v that its solver gives; means over repeats and objects."""
+        loop = world.loop
+        random = torch.Generator().manual_seed(1_000 * seed + 21)
+        hard = loop.truth(self.truth_per_bin, random)
+        truth, noise = centred(hard), torch.stack([part.standard_error for part in hard])
+        found = {f"pathwise, {name}": self._pathwise(loop, name, timing, seed) for name in self.pathwise}
+        found |= self._stratified(loop, timing, seed)
+        found["reinforce"] = self._reinforce(loop, timing, seed)
+        cosines = ", ".join(f"{ceiling:.2f}" for ceiling in ceilings(truth, noise))
+        note = (
+            f"The derivative by the centred logits of {', '.join(world.names)}, of the validation loss, "
+            f"v {loop.solve}. Reference: {self.truth_per_bin} images of every bin; the exact vector would have a "
+            f"cosine of {cosines} with it. Seconds are an object's: drawing, rendering, the estimate."
+        )
+        for kind, error in (
+            ("relative error", relative_error),
+            ("1 - cosine", lambda a, b: 1.0 - cosine(a, b)),
+        ):
+            points = tuple(
+                Point(f"{name}, {count} images", float(error(result.estimates[count], truth).mean()),
+                      result.seconds[count], None, name == "stratified" and count == self.default, name,
+                      self._spread(error(result.estimates[count], truth)))
+                for name, result in found.items() for count in result.estimates
+            )  # fmt: skip
+            yield Series(f"estimator/{kind}", f"{kind} of the estimate", points, (), note, timing.clock)
+
+    @staticmethod
+    def _spread(errors: Float[Tensor, "repeats objects"]) -> str:
+        """The standard deviation over repeats, pooled over objects."""
+        if len(errors) < 2:
+            return "1 repeat"
+        return f"± {float(errors.var(0).mean().sqrt()):.2g} over {len(errors)} repeats"
+
+    def _pathwise(self, loop: FrozenLoop, name: str, timing: Timing, seed: int) -> Result:
+        """Equal seeds: variants that draw alike see the same images. Images are independent, so that estimates from
+        more of them are means of those from the fewest.
+        """
+        variant, unit = PATHWISE[name], self.images[0]
+        # Reverse mode's numbers are those of the row "linear", but for rounding: one repeat shows its seconds.
+        repeats = 1 if variant.estimator.mode == "reverse" else self.repeats
+        moved, generator, units = variant.of(loop), torch.Generator().manual_seed(seed + 100), []
+        begun = timing.now()
+        for _ in range(repeats * self.images[-1] // unit):
+            units.append(centred(moved.pathwise(variant.estimator, unit, generator)))
+        spent = (timing.now() - begun) / (len(units) * unit * len(loop.psi))
+        stacked, result = torch.stack(units), Result()
+        for count in self.images:
+            size = count // unit
+            result.estimates[count] = stacked[: len(units) // size * size].unflatten(0, (-1, size)).mean(1)
+            result.seconds[count] = spent * count
+        return result
+
+    def _stratified(self, loop: FrozenLoop, timing: Timing, seed: int) -> dict[str, Result]:
+        """Disjoint parts of a pool of every bin; as it is, and shrunk by its noise as the psi update does it."""
+        bins = loop.scene.distribution.size
+        counts = sorted({*self.images, self.default})
+        pool = self.repeats * max(2, counts[-1] // bins)
+        begun = timing.now()
+        probed = loop.probes(pool, torch.Generator().manual_seed(seed + 31))
+        image = (timing.now() - begun) / len(probed.cached)
+        probes, plain, shrunk = [part[loop.factor.name] for part in probed.probes], Result(), Result()
+        for count in counts:
+            per_bin, values, kept = count // bins, [], []
+            if per_bin < 2:  # whose noise is unknown
+                continue
+            begun = timing.now()
+            for first in range(0, pool - per_bin + 1, per_bin):
+                rows = (torch.arange(bins)[:, None] * pool + torch.arange(first, first + per_bin)).flatten()
+                parts = [Probes(probe.index[rows], probe.bins[rows]) for probe in probes]
+                found = [
+                    score(loop, StratifiedEstimator(), probed.cached, p, label)
+                    for label, p in enumerate(parts)
+                ]
+                values.append(centred(found))
+                noise = torch.stack([part.standard_error.square() for part in found])
+                kept.append(values[-1] * shrinkage(values[-1], noise))
+            spent = (timing.now() - begun) / (len(values) * len(probes))
+            for result, estimates in ((plain, values), (shrunk, kept)):
+                result.estimates[count] = torch.stack(estimates)
+                result.seconds[count] = image * count + spent
+        return {"stratified": plain, "stratified, shrunk": shrunk}
+
+    def _reinforce(self, loop: FrozenLoop, timing: Timing, seed: int) -> Result:
+        """Disjoint parts of hard draws of every object."""
+        pool = self.repeats * self.images[-1]
+        begun = timing.now()
+        rendered = loop.scene.training_set(loop.psi, pool, torch.Generator().manual_seed(seed + 41))
+        cached = CachedSet.of(loop.detector, loop.backbone, rendered.images)
+        image, result = (timing.now() - begun) / len(rendered.images), Result()
+        for count in self.images:
+            begun, found = timing.now(), []
+            for first in range(0, pool - count + 1, count):
+                rows = torch.arange(first, first + count)
+                drawn = [
+                    Probes(label * pool + rows, part.draw.bins[rows, 0])
+                    for label, part in enumerate(rendered.objects)
+                ]
+                parts = [score(loop, ReinforceEstimator(), cached, p, label) for label, p in enumerate(drawn)]
+                found.append(centred(parts))
+            spent = (timing.now() - begun) / (len(found) * len(rendered.objects))
+            result.estimates[count], result.seconds[count] = torch.stack(found), image * count + spent
+        return result
+
+
+def score(
+    loop: FrozenLoop, estimator: Estimator, cached: CachedSet, drawn: Probes, label: int
+) -> MixedDerivative:
+    """The estimate from the scores of some of the cached images, whose pixels it does not need."""
+    count = len(drawn.index)
+    still = torch.zeros(count)
+    images = ObjectImages(
+        loop.psi[label].float(), loop.scene.distribution, torch.zeros(count, 3, 1, 1), drawn.index,
+        torch.full((count,), 1.0 / count), SceneDraw(still, still, still, drawn.bins[:, None]),
+    )  # fmt: skip
+    losses = Losses(cached.losses, _unavailable, cached.losses)
+    return estimator.estimate(losses, loop.trainable, loop.vector, images, {loop.factor.name: drawn})
+
+
+def _unavailable(*_: object) -> Tensor:
+    raise RuntimeError("an estimator asked for losses as functions of pixels, which it has no use for")
+
+
+def cosine(a: Tensor, b: Tensor) -> Tensor:
+    """Along the last axis; 0 where an estimate is nothing at all."""
+    return torch.nn.functional.cosine_similarity(a, b, dim=-1, eps=1e-30)
+
+
+def relative_error(a: Tensor, b: Tensor) -> Tensor:
+    """|a - b| / |b| along the last axis."""
+    return (a - b).norm(dim=-1) / b.norm(dim=-1)
+
+
+def ceilings(value: Float[Tensor, "objects k"], standard_error: Float[Tensor, "objects k"]) -> list[float]:
+    """Cosine that the exact vector would be expected to have with each estimate of it."""
+    noise = standard_error.square().sum(-1)
+    signal = (value.square().sum(-1) - noise).clamp_min(0.0)
+    return (signal / (signal + noise).clamp_min(1e-30)).sqrt().tolist()

@@ -1,0 +1,77 @@
+"""Held-out error of fitted fields against the seconds of their fits, by steps."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from neural_sim.field.recipe import FieldRecipe
+from neural_sim.studies.work_precision.series import Point, Series, Timing
+from neural_sim.studies.work_precision.suite import World
+
+SCHEDULES = ("refine_steps", "prune_steps")
+"""Arguments of a fitting that are steps of it, and move with their number."""
+
+
+def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
+    """The recipe with ``part`` times its steps, those at which its structure changes in proportion."""
+    fitting = recipe.fitting
+    if isinstance(fitting, functools.partial):
+        moved = {
+            key: [max(1, round(part * step)) for step in fitting.keywords[key]]
+            for key in SCHEDULES
+            if key in fitting.keywords
+        }
+        fitting = functools.partial(fitting.func, *fitting.args, **{**fitting.keywords, **moved})
+    return replace(recipe, steps=max(1, round(part * recipe.steps)), fitting=fitting, score_every=0)
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The family ``field``.
+
+    Args:
+        recipes: how the fields are fitted, by name.
+        parts: numbers of steps, by the same names, in those of the recipe.
+        default: the project's own among ``recipes``, at all of its steps.
+
+    Raises:
+        ValueError: names that differ, no such default, or a part that is not positive.
+    """
+
+    recipes: Mapping[str, FieldRecipe] = field(default_factory=dict)
+    parts: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    default: str = "grid"
+
+    def __post_init__(self) -> None:
+        if set(self.recipes) != set(self.parts) or (self.recipes and self.default not in self.recipes):
+            raise ValueError(
+                f"work_precision.field: want parts for each of {sorted(self.recipes)} and one of them as default, got "
+                f"{sorted(self.parts)} and {self.default!r}"
+            )
+        if any(part <= 0.0 for parts in self.parts.values() for part in parts):
+            raise ValueError(f"work_precision.field.parts: want numbers above 0, got {dict(self.parts)}")
+
+    def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
+        """Of the run's first object; seconds on the wall, of the training without the renders that score it."""
+        del timing, seed  # a fit notes its own time, and its recipe has its own seed
+        views, points = world.views, []
+        for name, recipe in self.recipes.items():
+            for part in self.parts[name]:
+                one = scaled(recipe, part)
+                score = one.fit(views, world.held_out, views.images.device)[1][-1]
+                error, own = 10.0 ** (-score["psnr"] / 20.0), name == self.default and part == 1.0
+                detail = f"{score['psnr']:.1f} dB"
+                points.append(
+                    Point(f"{name}, {one.steps} steps", error, score["seconds"], None, own, name, detail)
+                )
+        if points:
+            height, width = views.images.shape[1:3]
+            note = (
+                f"{world.names[0]}, {len(views) - world.held_out} views of {width} x {height} pixels, scored on "
+                f"{world.held_out} others; every row is a fit of its own, scheduled for so many steps. "
+                "Seconds on the wall."
+            )
+            yield Series("field/held-out views", "root mean square error of held-out pixels", tuple(points), (), note,
+                         "seconds")  # fmt: skip

@@ -1,0 +1,191 @@
+"""Error of the volume rendering quadrature against samples a ray, for smooth, sharp and thin densities.
+
+Theory for a step h. The midpoint rule is of second order where density and colour are smooth (Davis and Rabinowitz,
+Methods of Numerical Integration), and of first order where density jumps: a jump at a random place in a cell
+misplaces up to h/2 of the density. One sample at random in each interval: independent errors of h^2 each, 1/h of them,
+so that their root mean square is of order 3/2 (Haber 1966); of first order at a jump. A shell thinner than the step is
+hit or missed, so that there is no order until the step resolves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.field.quadrature import composite
+from neural_sim.field.samples import PackedSamples
+from neural_sim.studies.work_precision.series import Order, Point, Series, Timing, slope
+
+SPAN = 2.0
+"""Length of every ray in object radii: the unit sphere's diameter."""
+FINER = 16
+"""Samples of the reference, in those of the finest setting."""
+AT_ONCE = 1 << 18
+"""Samples of the reference that are composited together."""
+WIDE, THICKNESS = 0.6, 0.02
+"""Of the sharp box and of the thin shell, in object radii, on average over rays."""
+DEPTH = 1.0
+"""Optical depth of both, on average over rays."""
+RULES = ("midpoint", "jittered")
+
+Along = Float[Tensor, "rays samples"]
+
+
+@dataclass(frozen=True)
+class Density:
+    """A density along rays at distances from 0 to ``SPAN``, displaced by each ray's ``offset`` in [0, 1).
+
+    ``resolved`` is the largest step from which on theory gives an order; ``midpoint`` and ``jittered`` are the orders.
+    """
+
+    sigma: Callable[[Along, Along], Along]
+    midpoint: float
+    jittered: float
+    resolved: float = SPAN
+
+    def order(self, rule: str) -> float:
+        return self.midpoint if rule == "midpoint" else self.jittered
+
+
+def _blob(distance: Along, offset: Along) -> Along:
+    """Gaussian, still dense at both ends of the ray: one that vanishes there is integrated far better than theory."""
+    return 3.0 * torch.exp(-(((distance - 0.9 - 0.2 * offset) / 0.7) ** 2))
+
+
+def box(thickness: float, offset: Along) -> tuple[Along, Along]:
+    """Where a box of about this thickness begins and ends on each ray. Both ends vary by themselves: with one
+    thickness for all rays the errors at its two jumps would cancel for some steps and add up for others.
+    """
+    begin = 0.6 + 0.2 * offset
+    return begin, begin + thickness * (0.75 + 0.5 * torch.frac(37.0 * offset))
+
+
+def _box(thickness: float, depth: float) -> Callable[[Along, Along], Along]:
+    def sigma(distance: Along, offset: Along) -> Along:
+        begin, end = box(thickness, offset)
+        return (depth / thickness) * ((distance > begin) & (distance < end)).to(distance)
+
+    return sigma
+
+
+DENSITIES = {
+    "smooth": Density(_blob, 2.0, 1.5),
+    "sharp": Density(_box(WIDE, DEPTH), 1.0, 1.0),
+    "thin": Density(_box(THICKNESS, DEPTH), 1.0, 1.0, THICKNESS / 2.0),
+}
+
+
+def colour(distance: Along, offset: Along) -> Float[Tensor, "rays samples 3"]:
+    """A smooth colour along the ray."""
+    phases = torch.tensor([0.0, 1.0, 2.0]).to(distance)
+    return 0.5 + 0.4 * torch.sin(3.0 * distance[..., None] + phases + offset[..., None])
+
+
+def rendered(
+    density: Density, offset: Float[Tensor, "rays"], samples: int, generator: torch.Generator | None
+) -> Float[Tensor, "rays 4"]:
+    """Colour and opacity of the rays by the project's quadrature; samples at the middle of their intervals, or at
+    random in them with a generator.
+    """
+    rays, step = len(offset), SPAN / samples
+    inside = offset.new_full((rays, samples), 0.5)
+    if generator is not None:
+        inside = torch.rand(rays, samples, generator=generator, dtype=offset.dtype)
+    distance = (torch.arange(samples).to(offset) + inside) * step
+    at = offset[:, None].expand_as(distance)
+    packed = PackedSamples(
+        torch.arange(rays).repeat_interleave(samples), distance.reshape(-1),
+        torch.full_like(distance, step).reshape(-1), torch.arange(rays + 1) * samples,
+    )  # fmt: skip
+    sigma, rgb = density.sigma(distance, at).reshape(-1), colour(distance, at).reshape(-1, 3)
+    pixels, opacity = composite(sigma, rgb, packed)
+    return torch.cat([pixels, opacity[:, None]], -1)
+
+
+def reference(density: Density, offset: Float[Tensor, "rays"], samples: int) -> Float[Tensor, "rays 4"]:
+    """``rendered`` at the middles of ``samples`` intervals, some rays at a time."""
+    parts = offset.split(max(1, AT_ONCE // samples))
+    return torch.cat([rendered(density, part, samples, None) for part in parts])
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """The family ``quadrature``.
+
+    Args:
+        samples: numbers of samples a ray, growing.
+        default: the project's own: one for each cell of a grid field along the unit sphere's diameter.
+        rays: of every density, at random places.
+
+    Raises:
+        ValueError: fewer than two numbers of samples, ones that do not grow from 2, or fewer than two rays or samples.
+    """
+
+    samples: tuple[int, ...] = (16, 32, 64, 128, 256, 512, 1024)
+    default: int = 128
+    rays: int = 256
+
+    def __post_init__(self) -> None:
+        pairs = zip(self.samples, self.samples[1:], strict=False)
+        if len(self.samples) < 2 or self.samples[0] < 2 or any(a >= b for a, b in pairs):
+            raise ValueError(
+                f"work_precision.quadrature.samples: want growing numbers from 2, got {list(self.samples)}"
+            )
+        if min(self.rays, self.default) < 2:
+            raise ValueError(
+                f"work_precision.quadrature: rays and default must be at least 2, got {self.rays} and {self.default}"
+            )
+
+    @property
+    def counts(self) -> list[int]:
+        """All numbers of samples, the default among them."""
+        return sorted({*self.samples, self.default})
+
+    def measure(self, world: object, timing: Timing, seed: int) -> Iterator[Series]:
+        """Root mean square errors over rays, of opacity and of colour, in float64."""
+        del world  # the densities are its own
+        for name, density in DENSITIES.items():
+            offset = torch.rand(self.rays, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+            truth = reference(density, offset, FINER * self.counts[-1])
+            found = {rule: self._rule(density, offset, truth, rule, timing, seed) for rule in RULES}
+            for place, kind in enumerate(("opacity", "colour")):
+                points, orders = [], []
+                for rule, rows in found.items():
+                    points += [row[place] for row in rows]
+                    orders.append(self._order(density, rule, [row[place].error for row in rows]))
+                yield Series(
+                    f"quadrature/{name}, {kind}", f"root mean square error of {kind}", tuple(points), tuple(orders),
+                    f"{self.rays} rays of 2 object radii, float64, against {FINER * self.counts[-1]} samples a ray.",
+                    timing.clock,
+                )  # fmt: skip
+
+    def _rule(
+        self, density: Density, offset: Tensor, truth: Tensor, rule: str, timing: Timing, seed: int
+    ) -> list[tuple[Point, Point]]:
+        rows = []
+        for count in self.counts:
+
+            def run(count: int = count) -> Tensor:
+                generator = torch.Generator().manual_seed(seed + 1) if rule == "jittered" else None
+                return rendered(density, offset, count, generator)
+
+            off, (seconds, memory) = run() - truth, timing.of(run)
+            default = rule == "midpoint" and count == self.default
+            errors = (off[:, 3].square().mean().sqrt(), off[:, :3].square().mean().sqrt())
+            rows.append(tuple(
+                Point(f"{rule}, {count}", float(error), seconds, memory, default, rule) for error in errors
+            ))  # fmt: skip
+        return rows
+
+    def _order(self, density: Density, rule: str, errors: list[float]) -> Order:
+        """Over the finer half of the steps that resolve the density: the coarsest are not asymptotic yet."""
+        steps = [SPAN / count for count in self.counts]
+        kept = [(h, error) for h, error in zip(steps, errors, strict=True) if h <= density.resolved]
+        kept = kept[len(kept) // 2 :] if len(kept) > 4 else kept
+        over = f"{kept[0][0]:.2g} to {kept[-1][0]:.2g} radii" if kept else "none resolves it"
+        observed = slope([h for h, _ in kept], [error for _, error in kept])
+        return Order(rule, observed, density.order(rule), over)

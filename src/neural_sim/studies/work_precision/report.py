@@ -1,0 +1,213 @@
+"""What ``+experiment=work_precision`` leaves: work_precision.json and .md, a figure a series, a run in MLflow, sections
+of a documentation page.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from neural_sim.report import figures, tracking
+from neural_sim.report.section import replace_section
+from neural_sim.studies.work_precision.series import Series
+
+INTRODUCTION = (
+    "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. *Optimal*: no other setting "
+    "of the table has a smaller error in less time. MB is the most that tensors took at one time."
+)
+CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
+Row = Mapping[str, Any]
+
+
+def document(series: Sequence[Series], machine: Mapping[str, Any], notes: Sequence[str]) -> dict[str, Any]:
+    """The content of work_precision.json: a row a setting under ``series``, the observed orders, what was measured, and
+    defaults that are not Pareto-optimal. Numbers that do not exist are null.
+    """
+    rows, orders, overtaken = [], [], []
+    for each in series:
+        for point, best in zip(each.points, each.pareto, strict=True):
+            rows.append({
+                "name": each.name, "setting": point.setting, "error": _number(point.error),
+                "error_kind": each.error_kind, "seconds": _number(point.seconds), "memory_mb": point.memory_mb,
+                "default": point.default, "pareto": best, "line": point.line, "detail": point.detail,
+            })  # fmt: skip
+        orders += [
+            {"name": each.name, "line": o.line, "observed": _number(o.observed), "theory": o.theory, "steps": o.steps}
+            for o in each.orders
+        ]  # fmt: skip
+        overtaken += [
+            {"name": each.name, "default": mine.setting, "by": other.setting,
+             "error_ratio": _ratio(mine.error, other.error), "seconds_ratio": _ratio(mine.seconds, other.seconds)}
+            for mine, other in each.overtaken()
+        ]  # fmt: skip
+    measured = {each.name: {"clock": each.clock, "note": each.note} for each in series}
+    return {
+        "machine": dict(machine), "measured": measured, "series": rows, "orders": orders, "overtaken": overtaken,
+        "notes": list(notes),
+    }  # fmt: skip
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _ratio(mine: float, other: float) -> float | None:
+    return _number(mine / other) if other > 0.0 else None
+
+
+def markdown(held: Mapping[str, Any], family: str) -> str:
+    """One family's tables and observed orders, from the JSON's content."""
+    names = [name for name in held["measured"] if name.partition("/")[0] == family]
+    clock = CLOCKS[held["measured"][names[0]]["clock"]]
+    parts = [INTRODUCTION.format(clock=clock, **held["machine"])]
+    for name in names:
+        rows = [row for row in held["series"] if row["name"] == name]
+        parts += [f"**{name.partition('/')[2]}.** {held['measured'][name]['note']}", _table(rows)]
+        parts += [_order(order) for order in held["orders"] if order["name"] == name]
+        parts += [_overtaken(each) for each in held["overtaken"] if each["name"] == name]
+    return "\n\n".join(parts)
+
+
+def _table(rows: Sequence[Row]) -> str:
+    detailed = any(row["detail"] for row in rows)
+    more = " |" if detailed else ""
+    lines = [
+        f"| setting | {rows[0]['error_kind']} | seconds | MB | optimal |{more}",
+        f"|---|---|---|---|---|{'---|' if detailed else ''}",
+    ]
+    for row in rows:
+        setting = f"**{row['setting']}** (default)" if row["default"] else row["setting"]
+        memory = "" if row["memory_mb"] is None else f"{row['memory_mb']:.3g}"
+        cells = [
+            setting,
+            _shown(row["error"]),
+            _shown(row["seconds"]),
+            memory,
+            "yes" if row["pareto"] else "",
+        ]
+        lines.append("| " + " | ".join([*cells, *([row["detail"]] if detailed else [])]) + " |")
+    return "\n".join(lines)
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "not a number"
+    return f"{value:.0f}" if 100.0 <= value < 1e5 else f"{value:.2g}"
+
+
+def _order(order: Row) -> str:
+    observed = "none" if order["observed"] is None else f"{order['observed']:.2f}"
+    return (
+        f"Order of {order['line']} for steps of {order['steps']}: {observed}, in theory {order['theory']:g}."
+    )
+
+
+def _overtaken(each: Row) -> str:
+    ratio = each["error_ratio"]
+    if ratio is None:
+        less = "no error"
+    elif ratio < 1.01:
+        less = "the same error"
+    else:
+        less = f"{1.0 - 1.0 / ratio:.0%} less error" if ratio < 2.0 else f"{ratio:.2g} times less error"
+    faster = (
+        f"takes {1.0 / each['seconds_ratio']:.2f} of the time" if each["seconds_ratio"] else "takes no time"
+    )
+    return f"The default, {each['default']}, is not Pareto-optimal: {each['by']} has {less} and {faster}."
+
+
+def figure(series: Series) -> Figure:
+    """Error against run time, both logarithmic: a line joins settings that differ in one number, Pareto-optimal ones
+    are filled, a ring marks the default. Errors of 0 are at the lower edge.
+    """
+    made = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = made.add_subplot()
+    shown = [p for p in series.points if math.isfinite(p.error) and p.seconds > 0.0]
+    positive = [point.error for point in shown if point.error > 0.0]
+    least = 0.3 * min(positive, default=1.0)
+    lines = list(dict.fromkeys(point.line for point in shown))
+    best = dict(zip((p.setting for p in series.points), series.pareto, strict=True))
+    for number, line in enumerate(lines):
+        colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
+        marker = "os^Dvp*X"[number // len(figures.CLASS_COLOURS) % 8]
+        mine = [point for point in shown if point.line == line]
+        x, y = [p.seconds for p in mine], [max(p.error, least) for p in mine]
+        axes.plot(x, y, "-", color=colour, linewidth=1, alpha=0.6)
+        for filled in (True, False):
+            chosen = [(a, b) for a, b, p in zip(x, y, mine, strict=True) if best[p.setting] is filled]
+            if chosen:
+                face = colour if filled else "white"
+                axes.plot(
+                    *zip(*chosen, strict=True), marker, color=colour, markerfacecolor=face, markersize=5
+                )
+        axes.plot([], [], f"{marker}-", color=colour, markersize=5, linewidth=1, label=line or "settings")
+    for point in shown:
+        if point.default:
+            at = (point.seconds, max(point.error, least))
+            axes.plot(*at, "o", markersize=12, markerfacecolor="none", color=figures.INK)
+            axes.annotate(f"default: {point.setting}", at, xytext=(9, 7), textcoords="offset points", fontsize=7,
+                          color=figures.INK)  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel=f"{CLOCKS[series.clock].lower()} (log)",
+             ylabel=f"{series.error_kind} (log)")  # fmt: skip
+    axes.set_title(series.name.replace("/", ": "), fontsize=10, color=figures.INK)
+    axes.grid(color=figures.GRID)
+    axes.set_axisbelow(True)
+    figures.style(axes)
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if high < 100.0 * low:  # fewer than two powers of ten, which would be the only labels
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0),
+                title="filled: optimal", title_fontsize=7)  # fmt: skip
+    return made
+
+
+def slug(name: str) -> str:
+    """A series' name as a file's."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name).replace("__", "_").strip("_")
+
+
+def write(series: Sequence[Series], held: Mapping[str, Any], folder: Path) -> str:
+    """work_precision.json, work_precision.md and the figures in ``folder``; returns the Markdown."""
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    path = folder / "work_precision.json"
+    path.write_text(json.dumps(held, indent=1, allow_nan=False))
+    for each in series:
+        figures.save(figure(each), folder / "figures" / f"{slug(each.name)}.png")
+    families = dict.fromkeys(each.family for each in series)
+    parts = ["# Error against run time", *(f"## {name}\n\n{markdown(held, name)}" for name in families)]
+    text = "\n\n".join([*parts, *held["notes"]])
+    (folder / "work_precision.md").write_text(text + "\n")
+    return text
+
+
+def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
+    """A section of ``page`` for each family, see :func:`section.replace_section`."""
+    for family in dict.fromkeys(name.partition("/")[0] for name in held["measured"]):
+        replace_section(
+            page, f"Error against run time: {family}", f"    {command}\n\n{markdown(held, family)}"
+        )
+
+
+def track(
+    series: Sequence[Series], config: Mapping[str, Any], uri: str, folder: Path, begun: float
+) -> tracking.Run:
+    """A run in MLflow that began at ``begun`` (seconds since 1970), with ``folder`` as its artifacts."""
+    metrics = {}
+    for each in series:
+        for point in each.points:
+            if point.default:
+                metrics[f"{slug(each.name)}/default_error"] = point.error
+                metrics[f"{slug(each.name)}/default_seconds"] = point.seconds
+        metrics[f"{slug(each.name)}/defaults_not_optimal"] = float(len(list(each.overtaken())))
+        metrics |= {f"{slug(each.name)}/order_{slug(order.line)}": order.observed for order in each.orders}
+    parameters = tracking.flatten({"work_precision": config["work_precision"], "seed": config["seed"]})
+    name, tags = f"seed {config['seed']}", {"seed": str(config["seed"])}
+    return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder, begun)

@@ -1,0 +1,284 @@
+"""The inverse-Hessian product by every solver, damping and product mode, against dense oracles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.outer.retrained import as_double
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.damping import FixedDamping
+from neural_sim.solver.exact import Exact
+from neural_sim.solver.hvp import HessianOperator, Term, gradient
+from neural_sim.solver.operator import Shifted
+from neural_sim.studies.work_precision.micro import PSI, trained_problem
+from neural_sim.studies.work_precision.series import Point, Series, Timing
+from neural_sim.studies.work_precision.suite import World
+from neural_sim.types import LabelledImages
+
+UNKNOWNS = 200
+"""Of the linear systems of a given condition number."""
+Setting = tuple[str, str, AdjointSolver, bool]
+"""Its name, its line, the solver, whether it is the project's own."""
+TIGHT = 1e-12
+"""Relative residual that a solve by steps is asked for, so that its steps end it."""
+
+
+@dataclass(frozen=True)
+class Product:
+    """How a Hessian product is computed; the fields of :class:`AdjointSolver`."""
+
+    mode: str
+    retain_graph: bool
+
+    def of(self, solver: AdjointSolver) -> AdjointSolver:
+        return replace(solver, mode=self.mode, retain_graph=self.retain_graph)
+
+
+PRODUCTS = {
+    "graph kept": Product("reverse_over_reverse", True),
+    "graph built anew": Product("reverse_over_reverse", False),
+    "central differences": Product("central_difference", False),
+}
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Eigenvalues (growing) and eigenvectors of the dense Hessian, and the right-hand side in their basis."""
+
+    values: Float[Tensor, "n"]
+    vectors: Float[Tensor, "n n"]
+    coefficients: Float[Tensor, "n"]
+
+    @staticmethod
+    def of(terms: Sequence[Term], params: Parameters, b: Float[Tensor, "n"]) -> Oracle:
+        matrix = HessianOperator(terms, params, retain_graph=True).dense()
+        values, vectors = torch.linalg.eigh(0.5 * matrix + 0.5 * matrix.T)
+        return Oracle(values, vectors, vectors.T @ b)
+
+    def solve(self, damping: float) -> Float[Tensor, "n"]:
+        """(H + damping I)^-1 b. Its relative error is about n eps times the condition number."""
+        return self.vectors @ (self.coefficients / (self.values + damping))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """The family ``solver``.
+
+    Args:
+        solvers: by name; the dense one is the oracle and has no place among them.
+        detector: makes the detector of the solves, small enough for a dense Hessian.
+        timed: makes the detector whose Hessian products are timed.
+        default: the project's own among ``solvers``.
+        rtols: relative residuals of solves that choose their own damping, beside the configured one.
+        steps: of the solves with a given damping.
+        factors: of the damping that the default chooses; a series each.
+        conditions: condition numbers of linear systems; a series each.
+        images: of ``timed``, at ``size`` pixels a side.
+
+    Raises:
+        ValueError: an unknown default, or a number that is not positive.
+    """
+
+    solvers: Mapping[str, AdjointSolver] = field(default_factory=lambda: {"cg": AdjointSolver()})
+    detector: Callable[..., Detector] | None = None
+    timed: Callable[..., Detector] | None = None
+    default: str = "cg"
+    rtols: tuple[float, ...] = (1e-6, 1e-9)
+    steps: tuple[int, ...] = (5, 10, 20, 40)
+    factors: tuple[float, ...] = (1.0, 0.75)
+    conditions: tuple[float, ...] = (1e2, 1e6, 1e10)
+    images: int = 64
+    size: int = 96
+
+    def __post_init__(self) -> None:
+        if self.default not in self.solvers:
+            raise ValueError(
+                f"work_precision.solver.default must be one of {', '.join(self.solvers)}, got {self.default!r}"
+            )
+        numbers = (*self.rtols, *self.steps, *self.factors, *self.conditions, self.images, self.size)
+        if min(numbers) <= 0:
+            raise ValueError(f"work_precision.solver: want numbers above 0, got {numbers}")
+
+    def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
+        """On the detector of ``micro``, linear systems, and products of the run's kind of detector."""
+        del world  # its problems are its own
+        if self.detector is not None:
+            yield from self._inverse(*trained_problem(self.detector), timing, seed)
+        for condition in self.conditions:
+            yield self._system(condition, timing, seed)
+        if self.timed is not None:
+            yield self._products(self.timed, timing, seed)
+
+    def _inverse(self, problem, validation: list[Term], timing: Timing, seed: int) -> Iterator[Series]:
+        params = problem.anchor
+        terms, b, own = (
+            problem.at(PSI, params).terms(),
+            gradient(validation, params),
+            self.solvers[self.default],
+        )
+        random = torch.Generator().manual_seed(seed)
+        chosen = own.damping.choose(own.operator(terms, params), b, random).value
+        spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
+        problem_of = (terms, params, b)
+        yield self._solves(
+            "damping of its own", list(self._own()), *problem_of, oracle, chosen, spent, timing, seed,
+            " Each chooses its lambda itself, from products that count; a solve starts from these.",
+        )  # fmt: skip
+        for factor in self.factors:
+            value = factor * chosen
+            named = f"lambda {value:.3g} given"
+            more = f" This lambda, {factor:g} times what the default chooses, is given; no product is spent on it."
+            yield self._solves(
+                named, list(self._given(value)), *problem_of, oracle, value, spent, timing, seed, more
+            )
+
+    def _solves(
+        self, name: str, settings: Sequence[Setting], terms: Sequence[Term], params: Parameters, b: Tensor,
+        oracle: Oracle, value: float, spent: float, timing: Timing, seed: int, more: str,
+    ) -> Series:  # fmt: skip
+        truth = oracle.solve(value)
+        points = [self._point(*each, terms, params, b, truth, timing, seed) for each in settings]
+        low, high = (float(oracle.values[place]) + value for place in (0, -1))
+        condition = high / low if low > 0.0 else math.inf
+        note = (
+            f"(H + lambda I)^-1 dL_val/dtheta of a detector of {b.numel()} trained numbers after its training, "
+            f"float64, lambda = {value:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); against "
+            f"the dense matrix, whose eigenvalues take {spent:.3g} s.{more}"
+        )
+        return Series(
+            f"solver/{name}", "relative error of the product", tuple(points), (), note, timing.clock
+        )
+
+    def _given(self, value: float) -> Iterator[Setting]:
+        """By steps, with a lambda that is given."""
+        fixed = FixedDamping(value, 0)
+        for name, solver in self.solvers.items():
+            once = name == "identity"  # takes no steps
+            for steps in self.steps[:1] if once else self.steps:
+                named = name if once else f"{name}, {steps} steps"
+                yield (
+                    named,
+                    name,
+                    replace(solver, damping=fixed, rtol=TIGHT, max_steps=steps, max_raises=0),
+                    False,
+                )
+
+    def _own(self) -> Iterator[Setting]:
+        """By tolerance, as configured, with the damping that each chooses; and the default by other products."""
+        own = self.solvers[self.default]
+        others = {
+            f"{self.default}, {how}": PRODUCTS[how].of(own)
+            for how in PRODUCTS
+            if PRODUCTS[how].of(own) != own
+        }
+        for name, solver in {**self.solvers, **others}.items():
+            for rtol in (
+                [solver.rtol] if name == "identity" else sorted({*self.rtols, solver.rtol}, reverse=True)
+            ):
+                default = name == self.default and rtol == solver.rtol
+                named = name if name == "identity" else f"{name}, rtol {rtol:g}"
+                yield named, name, replace(solver, rtol=rtol), default
+
+    def _point(
+        self, name: str, line: str, solver: AdjointSolver, default: bool, terms: Sequence[Term], params: Parameters,
+        b: Tensor, oracle: Tensor, timing: Timing, seed: int,
+    ) -> Point:  # fmt: skip
+        def solve():
+            return solver.solve(terms, params, b, None, torch.Generator().manual_seed(seed))
+
+        found = solve()
+        spectrum = found.damping.spectrum
+        products = found.solution.products + (spectrum.products if spectrum else 0)
+        seconds, memory = timing.of(solve)
+        detail = f"{products} products, {found.solution.status.name.lower().replace('_', ' ')}"
+        if found.damping_raises:  # it solved another system than the oracle did
+            detail += f", lambda raised to {found.damping.value:.3g}"
+        return Point(name, relative(found.solution.value, oracle), seconds, memory, default, line, detail)
+
+    def _system(self, condition: float, timing: Timing, seed: int) -> Series:
+        """Every solver on eigenvalues spread evenly in log from 1 to 1 / condition; the truth is chosen first."""
+        generator = torch.Generator().manual_seed(seed)
+        basis, _ = torch.linalg.qr(torch.randn(UNKNOWNS, UNKNOWNS, generator=generator, dtype=torch.float64))
+        truth = torch.randn(UNKNOWNS, generator=generator, dtype=torch.float64)
+        values = torch.logspace(0.0, -math.log10(condition), UNKNOWNS, dtype=torch.float64)
+        # Half of the smallest eigenvalue is the shift that a preconditioner of low rank wants.
+        shift = 0.5 / condition
+        bare = basis * (values - shift) @ basis.T
+        bare = 0.5 * (bare + bare.T)
+        operator = Shifted(lambda v: bare @ v, shift)
+        b, points = operator(truth), []
+        for name, solver in {**self.solvers, "dense": AdjointSolver(Exact())}.items():
+            for rtol in (1e-2, 1e-6, 1e-10) if name not in ("dense", "identity") else (1e-10,):
+
+                def solve(linear=solver.linear, rtol: float = rtol):
+                    return linear.solve(operator, b, rtol=rtol, max_steps=10 * UNKNOWNS)
+
+                found = solve()
+                seconds, memory = timing.of(solve)
+                detail = f"{found.products} products, {found.status.name.lower().replace('_', ' ')}"
+                setting = name if name in ("dense", "identity") else f"{name}, rtol {rtol:g}"
+                points.append(
+                    Point(setting, relative(found.value, truth), seconds, memory, False, name, detail)
+                )
+        note = (
+            f"{UNKNOWNS} unknowns, float64, eigenvalues spread evenly in log from 1 to {1.0 / condition:.0e}; an rtol "
+            "allows an error of rtol times the condition number."
+        )
+        name = f"solver/condition {condition:.0e}"
+        return Series(name, "relative error of the solution", tuple(points), (), note, timing.clock)
+
+    def _products(self, make: Callable[..., Detector], timing: Timing, seed: int) -> Series:
+        """Hessian products on cached features in float32, against the exact one in float64."""
+        terms, params, precise = product_problem(make, self.images, self.size, seed)
+        vector = gradient(terms, params)
+        truth = HessianOperator(precise, as_double(params))(vector.double())
+        plain, _ = timing.of(lambda: gradient(terms, params))
+        points, default = [], self.solvers[self.default]
+        for name, how in PRODUCTS.items():
+            operator = HessianOperator(terms, params, how.mode, how.retain_graph)  # pyright: ignore[reportArgumentType]
+            seconds, memory = timing.of(lambda operator=operator: operator(vector))
+            error, own = relative(operator(vector).double(), truth), how.of(default) == default
+            points.append(
+                Point(name, error, seconds, memory, own, "products", f"{seconds / plain:.1f} gradients")
+            )
+        note = (
+            f"A Hessian product on {self.images} images of {self.size} px with cached features, {vector.numel()} "
+            "trained numbers, float32, against float64. A kept graph takes one gradient with its graph beforehand, "
+            "and the memory of all images as long as it is kept, which MB does not count."
+        )
+        return Series(
+            "solver/one product", "relative error of the product", tuple(points), (), note, timing.clock
+        )
+
+
+def relative(value: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> float:
+    """|value - truth| / |truth|."""
+    return float((value - truth).norm() / truth.norm())
+
+
+def product_problem(
+    make: Callable[..., Detector], images: int, size: int, seed: int
+) -> tuple[list[Term], Parameters, list[Term]]:
+    """Loss terms of an untrained detector on random pictures of one box each, its parameters; the terms in float64."""
+    generator, detector = torch.Generator().manual_seed(seed), make(num_classes=6, image_size=size)
+    backbone, params = detector.split(detector.init(generator))
+    corner = 0.5 * size * torch.rand(images, 1, 2, generator=generator)
+    side = size * (0.2 + 0.25 * torch.rand(images, 1, 2, generator=generator))
+    drawn = LabelledImages(
+        torch.rand(images, 3, size, size, generator=generator), torch.cat([corner, corner + side], -1),
+        torch.randint(0, 6, (images, 1), generator=generator), torch.zeros(images, dtype=torch.long),
+    )  # fmt: skip
+    held = CachedSet.of(detector, backbone, drawn)
+    weights = torch.full((images,), 1.0 / images)
+    double = held.double()
+    terms = InnerProblem(params, held.losses, weights).terms()
+    return terms, params, InnerProblem(as_double(params), double.losses, weights.double()).terms()

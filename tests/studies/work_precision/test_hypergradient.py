@@ -1,0 +1,91 @@
+"""Every adjoint is compared with the response of the same training; a derivative that equals it has no error."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
+from neural_sim.detector.training import Training
+from neural_sim.gradient.accumulated import Unrolled
+from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.response import Response
+from neural_sim.outer.settings import Outer
+from neural_sim.parameter.update import Mirror
+from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.damping import LanczosDamping
+from neural_sim.solver.flatten import flatten
+from neural_sim.studies.work_precision import hypergradient as family
+from neural_sim.studies.work_precision.hypergradient import DEFAULT, Hypergradients, correlation, slopes, ways
+from neural_sim.studies.work_precision.micro import PSI, small_scene
+from neural_sim.studies.work_precision.series import Timing
+
+SOLVER = AdjointSolver(damping=LanczosDamping(lanczos_steps=4), max_steps=4)
+OUTER = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, curvature_images=6, pool_per_bin=2)
+
+
+def simulator(outer, solver, seed):
+    generator, scene = torch.Generator().manual_seed(seed), small_scene()
+    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
+    validation = scene.training_set(PSI, 3, generator).images
+    inner = InnerLoop(
+        scene, detector, detector.init(generator), validation, outer, Training(batch_size=4), generator
+    )
+    return SimulatorModule(inner, PSI, StratifiedEstimator(probes_per_bin=2), solver)
+
+
+WORLD = SimpleNamespace(names=("a", "b"), outer=OUTER, simulator=simulator)
+
+
+def test_every_way_has_an_error_and_the_default_is_the_loops_own():
+    (series,) = Hypergradients(2, SOLVER).measure(WORLD, Timing(1), 0)
+    assert [point.setting for point in series.points] == list(ways(OUTER, SOLVER))
+    assert [point.setting for point in series.points if point.default] == [DEFAULT]
+    assert all(0.0 <= point.error <= 2.0 and point.seconds > 0.0 for point in series.points)
+    assert "two trainings correlate by" in series.note
+    own = ways(OUTER, SOLVER)[DEFAULT].outer
+    assert own.adjoint == OUTER.adjoint == "unrolled" and own.unrolled == OUTER.unrolled == Unrolled()
+
+
+def test_a_derivative_that_is_the_response_has_no_error(monkeypatch):
+    """The response is taken to be what one way finds, times any number and plus any constant."""
+    named = ways(OUTER, SOLVER)["unrolled, exact products"]
+    found = torch.randn(2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    monkeypatch.setattr(family, "response", lambda inner, psi: Response(3.0 * found + 1.0, 1))
+    monkeypatch.setattr(family, "ways", lambda outer, solver: {DEFAULT: named})
+    monkeypatch.setattr(family, "slopes", lambda loop, way: (found, 0.5))
+    (series,) = Hypergradients(1, SOLVER).measure(WORLD, Timing(1), 0)
+    assert series.points[0].error == pytest.approx(0.0, abs=1e-12)
+
+
+def test_ways_see_the_same_images_probes_and_training(monkeypatch):
+    loop, named, seen = simulator(OUTER, SOLVER, 0), ways(OUTER, SOLVER), []
+    derivative = SimulatorModule._derivative
+
+    def watched(self, rendered, cached):
+        probes = self._probes.cached.inputs[0]
+        seen.append((rendered.images.images, cached.inputs[0], probes, flatten(self.inner.trainable)))
+        return derivative(self, rendered, cached)
+
+    monkeypatch.setattr(SimulatorModule, "_derivative", watched)
+    first, again = (slopes(loop, named[DEFAULT])[0] for _ in range(2))
+    assert torch.equal(first, again)
+    for way in named.values():
+        slopes(loop, way)
+    assert len(seen) == 2 + len(named)
+    for other in seen[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(seen[0], other, strict=True))
+
+
+def test_correlation_of_known_vectors():
+    up, still = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[1.0, 1.0, 1.0]])
+    assert correlation(up, -up) == pytest.approx(-1.0) and correlation(up, still) == 0.0
+    assert correlation(torch.cat([up, up]), torch.cat([up, still])) == pytest.approx(0.5)
+
+
+def test_bad_settings_name_their_key():
+    with pytest.raises(ValueError, match=r"work_precision\.hypergradient\.trainings"):
+        Hypergradients(0)

@@ -1,0 +1,111 @@
+"""What the experiment leaves: the JSON's rows, the tables written from it, figures, MLflow."""
+
+import json
+import math
+
+import pytest
+from matplotlib import image
+from mlflow import MlflowClient
+
+from neural_sim.studies.work_precision.report import (
+    document,
+    figure,
+    markdown,
+    slug,
+    track,
+    write,
+    write_docs,
+)
+from neural_sim.studies.work_precision.series import Order, Point, Series
+
+MACHINE = {"processor": "a processor", "torch": "9.9", "threads": 1, "load": 0.5}
+SERIES = (
+    Series(
+        "renderer/opacity", "mean error of opacity",
+        (
+            Point("draft", 0.1, 1.0, 2.0, line="quality", detail="few samples"),
+            Point("final", 0.01, 4.0, 3.0, default=True, line="quality"),
+            Point("clever", 0.01, 2.0, None, line="other"),
+            Point("broken", math.nan, 1.0, line="other"),
+            Point("exact", 0.0, 9.0, line="other"),
+        ),
+        (Order("quality", 1.98, 2.0, "0.1 to 0.01 radii"), Order("other", math.nan, 1.0, "none resolves it")),
+        "Against everything.",
+    ),
+    Series("field/grid", "error", (Point("one", 1.0, 1.0, default=True),)),
+)  # fmt: skip
+
+
+def test_the_document_has_a_row_a_setting_and_what_beats_a_default():
+    held = document(SERIES, MACHINE, ["a note"])
+    assert json.loads(json.dumps(held, allow_nan=False)) == held
+    rows = {row["setting"]: row for row in held["series"] if row["name"] == "renderer/opacity"}
+    wanted = {"name", "setting", "error", "error_kind", "seconds", "memory_mb", "default", "pareto"}
+    assert all(wanted <= set(row) for row in held["series"])
+    assert [name for name, row in rows.items() if row["pareto"]] == ["draft", "clever", "exact"]
+    assert rows["broken"]["error"] is None and rows["clever"]["memory_mb"] is None
+    (beaten,) = held["overtaken"]
+    assert (beaten["default"], beaten["by"], beaten["error_ratio"], beaten["seconds_ratio"]) == (
+        "final",
+        "clever",
+        1,
+        2,
+    )
+    assert [order["observed"] for order in held["orders"]] == [1.98, None]
+
+
+def test_the_tables_are_written_from_the_json_alone():
+    held = json.loads(json.dumps(document(SERIES, MACHINE, [])))
+    text = markdown(held, "renderer")
+    assert (
+        "| **final** (default) | 0.01 | 4 | 3 |  |  |" in text
+        and "| broken | not a number | 1 |  |  |  |" in text
+    )
+    assert "| draft | 0.1 | 1 | 2 | yes | few samples |" in text
+    assert "Order of quality for steps of 0.1 to 0.01 radii: 1.98, in theory 2." in text
+    assert "final, is not Pareto-optimal: clever has the same error and takes 0.50 of the time." in text
+    assert "field" not in text and "a processor" in text
+
+
+@pytest.mark.parametrize(
+    ("error", "words"), [(0.99, "1% less error"), (0.4, "2.5 times less error"), (0.0, "no error")]
+)
+def test_how_much_better_a_setting_is_than_the_default(error, words):
+    two = (Point("default", 1.0, 4.0, None, True, "a"), Point("clever", error, 2.0, None, False, "a"))
+    held = document([Series("field/can", "error", two, ())], MACHINE, [])
+    assert f"clever has {words} and takes 0.50 of the time." in markdown(held, "field")
+
+
+def test_files_and_figures(tmp_path):
+    text = write(SERIES, document(SERIES, MACHINE, ["a note"]), tmp_path)
+    assert (tmp_path / "work_precision.md").read_text() == text + "\n" and text.endswith("a note")
+    names = {path.stem for path in (tmp_path / "figures").glob("*.png")}
+    assert names == {slug(series.name) for series in SERIES} == {"renderer_opacity", "field_grid"}
+    assert image.imread(tmp_path / "figures" / "renderer_opacity.png").std() > 0.01
+    axes = figure(SERIES[0]).axes[0]
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    assert [t.get_text() for t in axes.get_legend().get_texts()] == ["quality", "other"]
+
+
+def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
+    page = tmp_path / "numerics.md"
+    page.write_text("kept\n")
+    held = document(SERIES, MACHINE, [])
+    for _ in range(2):  # the second replaces the first
+        write_docs(held, page, "python -m src.main +experiment=work_precision")
+    text = page.read_text()
+    assert text.startswith("kept\n") and text.count("## Error against run time: renderer\n") == 1
+    assert text.count("## Error against run time: field\n") == 1
+    assert "    python -m src.main +experiment=work_precision\n" in text
+
+
+@pytest.mark.slow  # a new MLflow store takes ten seconds
+def test_a_run_is_logged(tmp_path, uri):
+    config = {"name": "work_precision", "seed": 2, "work_precision": {"repeats": 3}}
+    (tmp_path / "run").mkdir()  # not the folder that holds the store
+    run = track(SERIES, config, uri, tmp_path / "run", begun=5.0)
+    logged = MlflowClient(uri).get_run(run.run_id)
+    assert logged.info.start_time == 5000 and logged.data.params["work_precision.repeats"] == "3"
+    assert logged.data.metrics["renderer_opacity/default_error"] == 0.01
+    assert logged.data.metrics["renderer_opacity/defaults_not_optimal"] == 1.0
+    assert logged.data.metrics["renderer_opacity/order_quality"] == 1.98

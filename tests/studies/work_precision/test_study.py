@@ -1,0 +1,98 @@
+"""The stage: its families and what they need, bad settings, the experiment through the command line."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from documented_checks import check_of
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from neural_sim.main import UserError, conf_directory, context_of
+from neural_sim.stages.walk import walk
+from neural_sim.studies.work_precision import study as stage
+from neural_sim.studies.work_precision.study import FAMILIES, WorkPrecisionStep
+
+ROOT = Path(__file__).parents[3]
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        return compose("config", ["+experiment=work_precision", "progress=false", *overrides])
+
+
+def test_the_experiment_has_every_family_and_the_stages_that_they_need():
+    config = composed()
+    assert tuple(config.work_precision.families) == FAMILIES
+    assert WorkPrecisionStep(families=["quadrature", "solver"]).needs == ()
+    assert WorkPrecisionStep(families=["renderer", "derivative"]).needs == ("views", "field")
+    assert WorkPrecisionStep(families=FAMILIES).needs == (
+        "views", "field", "target_sets", "warm_start", "psi", "evaluate"
+    )  # fmt: skip
+
+
+def test_the_parts_are_those_of_the_configuration(tmp_path):
+    step = context_of(composed("scale=smoke"), tmp_path)[1]["work_precision"]
+    assert set(step.solver.solvers) == {"cg", "minres", "neumann", "nystrom", "identity"}
+    detector = step.solver.detector(num_classes=2, image_size=32)
+    trained = detector.split(detector.init(torch.Generator().manual_seed(0)))[1]
+    assert sum(part.numel() for part in trained.values()) < 5000  # whose dense Hessian fits in memory
+    assert set(step.fits.recipes) == {"grid", "mlp"} and step.quadrature.default == 64
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("work_precision.families=[astrology]", r"work_precision\.families wants some of quadrature"),
+        ("work_precision.repeats=0", r"work_precision\.repeats"),
+        ("work_precision.clock=sundial", r"work_precision\.clock"),
+        ("work_precision.quadrature.rays=1", r"work_precision\.quadrature"),
+        ("+work_precision.speed=1", r"work_precision\.speed"),
+    ],
+)
+def test_bad_settings_name_their_key(override, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        context_of(composed(override), tmp_path)
+
+
+def test_one_family_leaves_its_files_and_its_section_of_a_page(tmp_path, monkeypatch):
+    class Nowhere:
+        where = "not logged"
+
+    monkeypatch.setattr(stage, "track", lambda *arguments: Nowhere())
+    page = tmp_path / "page.md"
+    config = composed(
+        "scale=smoke", "work_precision.families=[quadrature]", f"work_precision.docs={page}",
+        "work_precision.quadrature.samples=[8,16,32]", "work_precision.quadrature.rays=8",
+    )  # fmt: skip
+    walk(*context_of(config, tmp_path / "run"))
+    held = json.loads((tmp_path / "run" / "work_precision.json").read_text())
+    assert {row["name"].split("/")[0] for row in held["series"]} == {"quadrature"}
+    assert all(math.isfinite(row["error"]) for row in held["series"])
+    assert "## Error against run time: quadrature" in page.read_text()
+    assert stage.COMMAND in page.read_text()
+
+
+@pytest.mark.slow
+def test_the_command_line_measures_every_family(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "src.main",
+        "+experiment=work_precision",
+        "scale=smoke",
+        "progress=false",
+    ]
+    command += [
+        f"hydra.run.dir={tmp_path}/run",
+        f"paths.mlflow={tmp_path}/mlflow.db",
+        f"paths.store={tmp_path}/store",
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    config = OmegaConf.to_container(OmegaConf.load(tmp_path / "run" / ".hydra" / "config.yaml"), resolve=True)
+    check_of(config)(tmp_path / "run", config)
