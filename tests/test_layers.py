@@ -57,7 +57,6 @@ def test_heavy_libraries_stay_in_their_rooms():
         "jinja2": {"report/page/render.py"},
         "filelock": {"report/tracking.py", "stages/store.py"},
         "beartype": {"configuration.py"},
-        "optuna": {"baseline/search.py"},
         "h5py": {"target/matlab.py"},
         "skimage": {"field/reconstruction.py"},
         "hydra": {"main.py"},

@@ -117,7 +117,7 @@ def _differences(one, other, where=""):
     }
 
 
-@pytest.mark.parametrize("baseline", ["auto_sim", "lts", "ns", "random_search"])
+@pytest.mark.parametrize("baseline", ["auto_sim", "lts", "ns"])
 @pytest.mark.parametrize("name", EVERY)
 def test_another_method_gets_everything_but_the_method(name, baseline):
     arguments = (f"+experiment={name}", "+variant=paper", "scale=paper")

@@ -43,7 +43,7 @@ def test_a_task_chooses_detector_score_and_objective():
     assert made().config == chosen["detection"].config
 
 
-@pytest.mark.parametrize("baseline", ["neural_sim_paper", "auto_sim", "lts", "response", "bayes_opt"])
+@pytest.mark.parametrize("baseline", ["neural_sim_paper", "auto_sim", "lts", "response"])
 def test_every_kind_of_method_takes_it(baseline):
     x = made("task=classification", f"baseline={baseline}", "+experiment=pose_gap")
     assert x.score == "accuracy" and x.loop.outer.objective in ("accuracy", "loss")

@@ -51,6 +51,8 @@ def own_folder(wanted: Path) -> Path:
 
 GONE: dict[str, str] = {
     "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
+    "baseline=random_search": "want baseline=lts, which learns from the same rewards",
+    "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
 }
 """What to say of keys and choices (``key=value``) that no longer exist. A key stands for all keys below it, too."""
 

@@ -33,7 +33,7 @@ def test_every_method_is_scored_alike(experiment):
     methods = [
         "baseline=lts",
         "baseline=auto_sim",
-        "baseline=bayes_opt",
+        "baseline=response",
         "baseline=neural_sim_paper",
         "gradient=reinforce",
     ]

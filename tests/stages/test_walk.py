@@ -204,7 +204,7 @@ def test_the_report_leaves_the_detector_that_was_scored_as_learned(
     )  # of the images that it was trained on
 
 
-LOOP = ["baseline=random_search", "outer.iterations=1", "outer.images_per_object=4"]  # two rounds
+LOOP = ["baseline=lts", "outer.iterations=1", "outer.images_per_object=4"]  # two rounds
 WHOLE = [*LOOP, "stages=[views,field,target_sets,warm_start,psi,evaluate,report]"]
 
 

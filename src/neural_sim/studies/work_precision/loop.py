@@ -15,9 +15,7 @@ from neural_sim.studies.work_precision.series import Clock, Point, Series, Timin
 from neural_sim.studies.work_precision.suite import World
 
 Results = Mapping[str, Any]
-COMMAND = (
-    "python -m src.main -m +experiment={experiment} baseline=neural_sim,auto_sim,lts,random_search seed=0,1"
-)
+COMMAND = "python -m src.main -m +experiment={experiment} baseline=neural_sim,auto_sim,lts seed=0,1"
 
 
 @dataclass(frozen=True)
