@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from neural_sim import main as program
 from neural_sim.report.tracking import tracking_uri
-from neural_sim.stages.walk import STEPS
+from neural_sim.tasks.walk import STEPS
 
 CONF = program.conf_directory()
 FILES = ("json", "md", "png", "py", "yaml", "db", "pt", "safetensors")

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
 from neural_sim.main import UserError, context_of
-from neural_sim.stages.walk import STEPS
+from neural_sim.tasks.walk import STEPS
 
 ROOT = Path(__file__).parents[1]
 CONF = conf_directory()

@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim import devices
 from neural_sim.main import conf_directory, context_of
-from neural_sim.stages.walk import walk
+from neural_sim.tasks.walk import walk
 
 RUNS = {
     "stratified": [],

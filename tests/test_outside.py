@@ -13,8 +13,8 @@ from hydra import compose, initialize_config_dir
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.main import UserError, build, conf_directory, context_of
-from neural_sim.stages.walk import walk
 from neural_sim.synthesis.export.coco import write_coco
+from neural_sim.tasks.walk import walk
 
 OUTSIDE = Path(__file__).parent / "outside"
 MINE = {

@@ -106,8 +106,8 @@ def context_of(
         UserError: as :func:`build`, and for an unknown stage.
     """
     plain = _plain(config)
-    from neural_sim.stages.walk import STEPS
     from neural_sim.tasks.context import Context
+    from neural_sim.tasks.walk import STEPS
 
     others: dict[str, Task] = {}
     for name in plain["stages"]:
@@ -224,7 +224,7 @@ def _task(config: DictConfig) -> float | None:
         given = list(runtime.overrides.task)
         folder, name = Path(runtime.runtime.output_dir), runtime.job.config_name
         context, others = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
-        from neural_sim.stages.walk import walk
+        from neural_sim.tasks.walk import walk
 
         return walk(context, others)
     except (ValueError, FileNotFoundError) as error:

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from neural_sim.field.scores import compare
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.renderer.subject import FieldSubject
-from neural_sim.stages.walk import walk
+from neural_sim.tasks.walk import walk
 
 SMALL = (
     "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "objects=photos", "objects.up=-y", 

@@ -13,8 +13,8 @@ from neural_sim.detector.training import train_detector
 from neural_sim.main import build, conf_directory, context_of
 from neural_sim.randomness import stream
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.walk import walk
 from neural_sim.target.sets import RenderedTarget
+from neural_sim.tasks.walk import walk
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",

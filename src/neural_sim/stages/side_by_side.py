@@ -15,8 +15,8 @@ from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Results
 from neural_sim.stages.store import Store
 from neural_sim.stages.target_sets import TargetSetsStage
-from neural_sim.stages.walk import STEPS
 from neural_sim.tasks.context import Context
+from neural_sim.tasks.walk import STEPS
 from neural_sim.types import LabelledImages
 
 

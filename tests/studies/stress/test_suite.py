@@ -15,11 +15,11 @@ import neural_sim.field.quadrature as quadrature
 import neural_sim.parameter.bins as binned
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.stages.walk import walk
 from neural_sim.studies.stress import cases, linear, rendering, report, sampling, simplex
 from neural_sim.studies.stress.cases import FAMILIES, Check, Scope, Suite, run_case
 from neural_sim.studies.stress.report import failures, markdown, table, track, write
 from neural_sim.tasks.context import TaskFailure
+from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[3]
 

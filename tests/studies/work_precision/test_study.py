@@ -13,9 +13,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.stages.walk import walk
 from neural_sim.studies.work_precision import study as stage
 from neural_sim.studies.work_precision.study import FAMILIES, WorkPrecisionStep
+from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[3]
 

@@ -17,7 +17,6 @@ from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.machine import machine
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.stages.report import run_results
 from neural_sim.stages.temperatures import frozen_loop
 from neural_sim.studies.work_precision.derivative import Derivative
 from neural_sim.studies.work_precision.estimator import Estimators
@@ -31,6 +30,7 @@ from neural_sim.studies.work_precision.series import Clock, Series, Timing
 from neural_sim.studies.work_precision.solver import Solver
 from neural_sim.studies.work_precision.suite import Family, WorkPrecision
 from neural_sim.tasks.context import Context
+from neural_sim.tasks.report import run_results
 from neural_sim.types import PosedViews
 
 _log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Stage ``report``: figures, the final training set, results.json, MLflow."""
+"""Task ``report``: figures, the final training set, results.json, MLflow."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 def write_report(context: Context) -> None:
-    """All that a run leaves in its folder and in MLflow."""
+    """Write all that a run leaves in its folder and in MLflow."""
     graph, results, folder = context.graph, context.results, context.folder
     if context.live is None:
         raise RuntimeError("report: want an open MLflow run, see Context.tracked")
@@ -60,7 +60,7 @@ def write_report(context: Context) -> None:
 
 
 def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str, Scores]) -> Shown:
-    """What the page shows: a few images before and after, drawn with the same random numbers, and detections."""
+    """Return a few images before and after, drawn with the same random numbers, and detections, for the page."""
     graph, scene = context.graph, context.results(context.graph.scene)
     before, after = (
         scene.training_set(each, max(PER_OBJECT.values()), graph.warm_start.generator()).images.to("cpu")
@@ -70,7 +70,7 @@ def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str
 
 
 def _commands(context: Context, detector: bool) -> dict[str, str]:
-    """What to run next, by what it does; ``detector``: whether the run leaves one."""
+    """Return what to run next, by what it does; ``detector``: whether the run leaves one."""
     name, folder = context.experiment.run.name, context.folder
     compare = f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'"
     predict = f"python -m src.main 'stages=[predict]' predict.model={folder} predict.images=/data/photos"
@@ -79,8 +79,9 @@ def _commands(context: Context, detector: bool) -> dict[str, str]:
 
 
 def _write_model(context: Context, test: LabelledImages) -> None:
-    """The detector trained on the learned distribution, which was scored as ``learned``: in the run's folder, and in
-    MLflow where that is asked for. One whose settings have no JSON is left out with a warning.
+    """Write the detector that was scored as ``learned`` to the folder, and to MLflow where that is asked for.
+
+    One whose settings have no JSON is left out with a warning.
     """
     graph, results, wanted = context.graph, context.results, context.experiment.model
     stage = graph.trained_on(results(graph.learned).last, "learned")
@@ -99,7 +100,7 @@ def _write_model(context: Context, test: LabelledImages) -> None:
 
 
 def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool = True) -> RunResults:
-    """What there is to report: a run without evaluation has no AP. ``symmetric``: with the bins that look the same."""
+    """Gather what there is to report; without ``symmetric`` the bins that look the same are left out."""
     x, graph, results = context.experiment, context.graph, context.results
     distribution, learned = x.imaging.distribution, results(graph.learned)
     psi = {"initial": graph.psi("initial"), "learned": learned.last, "target": graph.target_psi}
@@ -135,7 +136,7 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
 
 
 def _real(context: Context) -> dict[str, Any]:
-    """How photographs trained; empty where none did."""
+    """Return how photographs trained; empty where none did."""
     real = context.experiment.training.real
     if not real.used:
         return {}
@@ -145,7 +146,7 @@ def _real(context: Context) -> dict[str, Any]:
 
 
 def _curve(context: Context) -> list[dict[str, Any]]:
-    """What the method had spent and what its psi was worth, at its start, on the way as asked, and at its end."""
+    """Return cost and score of psi at the start, at the iterations asked for, and at the end."""
     graph, results = context.graph, context.results
     learned, points = results(graph.learned), []
     for iteration, psi in graph.on_the_way(learned).items():
@@ -156,7 +157,7 @@ def _curve(context: Context) -> list[dict[str, Any]]:
 
 
 def _identity(context: Context) -> dict[str, Any]:
-    """What says which runs this one can be compared with."""
+    """Return what says which runs this one can be compared with."""
     graph, imaging = context.graph, context.experiment.imaging
     sources = {"background": imaging.synthesis.background, "target": imaging.target}
     if imaging.synthesis.distractors.used:

@@ -1,4 +1,4 @@
-"""Stage ``predict``: a saved detector on photographs, without objects, fields or a target set."""
+"""Task ``predict``: a saved detector on photographs, without objects, fields or a target set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)
-class PredictStep:
+class PredictTask:
     """Detections on photographs of any size.
 
     Args:
@@ -54,8 +54,9 @@ class PredictStep:
         _ = PhotoFiles(self.images, "predict.images")
 
     def run(self, context: Context) -> None:
-        """``pictures/``, ``coco_results.json``, ``coco_images.json`` and, with annotations, ``scores.json`` to the
-        run's folder; the table of scores to the screen.
+        """Write pictures with boxes and COCO results, and with annotations the scores.
+
+        The files are ``pictures/``, ``coco_results.json``, ``coco_images.json`` and ``scores.json``.
 
         Raises:
             ValueError: a model, a picture or annotations that cannot be used, with the key and the file.
@@ -110,7 +111,7 @@ class PredictStep:
 
 
 def _entry(path: Path, photos: PhotoFiles, truth: Truth | None, number: int) -> dict[str, Any]:
-    """COCO's entry of an image: the annotations', or a new one."""
+    """Return COCO's entry of an image: the annotations', or a new one."""
     if truth is None:
         return {"id": number, "file_name": photos.name(path)}
     return {key: truth.entries[path][key] for key in ("id", "file_name")}

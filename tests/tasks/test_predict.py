@@ -16,7 +16,7 @@ from PIL import Image, ImageColor
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.report.figures import CLASS_COLOURS
-from neural_sim.stages.walk import walk
+from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
 RED, GREEN = (255, 0, 0), (0, 255, 0)

@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.stages.repeat import APART, again, groups
+from neural_sim.tasks.repeat import APART, again, groups
 
 
 def context(*overrides):

@@ -1,4 +1,4 @@
-"""Stage ``preflight``: before any optimisation, whether it is worth it, and what else keeps images from the target."""
+"""Task ``preflight``: whether an optimisation is worth it, and how renders differ from the target otherwise."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)
-class PreflightStep:
-    """The detector of the initial distribution by bin of the validation images, the expected gain of every object and
-    bin to first order, and how renders differ from the target. Views, fields, target sets and the warm start are
-    computed, or read from the store, where a later run finds them.
+class PreflightTask:
+    """What to expect of an optimisation, before any.
+
+    It shows the detector of the initial distribution by bin of the validation images, the expected gain of every
+    object and bin to first order, and how renders differ from the target.
 
     Args:
         trials: trainings whose derivatives are averaged.
@@ -50,7 +51,7 @@ class PreflightStep:
             raise ValueError(f"preflight.labelled: want numbers of at least 1, got {list(self.labelled)}")
 
     def run(self, context: Context) -> None:
-        """preflight.json and preflight.html to the run's folder, a summary to the screen.
+        """Write preflight.json and preflight.html, and print a summary.
 
         Raises:
             ValueError: a method without a derivative.

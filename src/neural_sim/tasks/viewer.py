@@ -1,4 +1,4 @@
-"""Stage ``viewer``: a page that shows fields, distributions and detections while it is open."""
+"""Task ``viewer``: a page that shows fields, distributions and detections while it is open."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neural_sim.tasks.context import Context
 
 
 @dataclass(frozen=True)
-class ViewerStep:
+class ViewerTask:
     """A page on this machine's own address, until Ctrl-C. Fields and the detector are read from the store, or computed.
 
     Args:
@@ -59,7 +59,7 @@ class ViewerStep:
             pass
 
     def shots(self, context: Context) -> Shots:
-        """The scene, the known distributions, and the detector trained on ``psi``."""
+        """Return the scene, the known distributions, and the detector trained on ``psi``."""
         graph, distribution = context.graph, context.experiment.imaging.distribution
         known = {"initial": graph.psi("initial")}
         if self.psi == "target" or graph.target_psi is not None:

@@ -1,4 +1,4 @@
-"""Stage ``export``: images drawn from a distribution, with their annotations, as a data set of any size."""
+"""Task ``export``: images drawn from a distribution, with their annotations, as a data set of any size."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ UNKNOWN_RADIUS = 100.0
 
 
 @dataclass(frozen=True)
-class ExportStep:
+class ExportTask:
     """A data set of ``count`` images. See ``docs/usage.md``, Exporting a data set.
 
     Args:
@@ -93,7 +93,7 @@ class ExportStep:
                 raise ValueError(f"export.{key} must be one of {known}, got {getattr(self, key)!r}")
 
     def run(self, context: Context) -> None:
-        """The data set and the table of psi.
+        """Write the data set and the table of psi.
 
         Raises:
             ValueError: a psi that is not in the store or the file, a folder of other images or that cannot be written,
@@ -156,7 +156,7 @@ class ExportStep:
         return self.workers
 
     def _identity(self, source: ImageSource, fields: Sequence[str]) -> dict[str, Any]:
-        """What an image depends on but its number."""
+        """Return all that an image depends on, except its number."""
         scene = source.scene
         described = {"renderer": describe(scene.renderer), "synthesis": describe(scene.synthesizer)}
         p = scene.distribution.probabilities(source.psi.double())
@@ -180,9 +180,9 @@ class ExportStep:
 
 
 def models_of(objects: Objects) -> list[Model]:
-    """The objects in the frames of their own meshes, in millimetres; photographed ones in their normalised frame.
+    """Return the objects in millimetres, in their meshes' frames, photographed ones in their normalised frame.
 
-    Where the size of any is not known, 100 mm stand for the radius of each, which the log says.
+    Where the size of any is unknown, the radius of each counts as 100 mm, and the log says so.
     """
     radii, made = objects.radii, []
     unknown = [name for name, radius in radii.items() if radius is None]
@@ -204,7 +204,7 @@ def models_of(objects: Objects) -> list[Model]:
 
 
 def farthest(source: ImageSource) -> float:
-    """No depth is larger, in millimetres."""
+    """Return an upper bound of all depths, in millimetres."""
     scene, distribution = source.scene, source.scene.distribution
     factor = next((f for f in distribution.binned if f.coordinate == "distance"), None)
     reach = distribution.ranges["distance"][1] if factor is None else factor.high

@@ -9,7 +9,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.stages.walk import walk
+from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
 PLUGIN = '''

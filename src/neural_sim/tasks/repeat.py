@@ -1,4 +1,4 @@
-"""Stage ``repeat``: the scored detectors trained again with other random numbers, and what then is left of the gain."""
+"""Task ``repeat``: the scored detectors trained again with other random numbers, and how much of the gain remains."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ APART = 1_000
 
 
 @dataclass(frozen=True)
-class RepeatStep:
-    """Detectors of the initial, the learned and the target's distribution, each trained several times; the first
-    training is the run's own. The target's is left out where it is not known or where the run starts at it. Fields,
-    psi and test images stay as they are. Where some of the photographs train too, each training chooses its own.
+class RepeatTask:
+    """Detectors of the initial, the learned and the target's distribution, each trained several times.
+
+    The first training is the run's own. The target's is left out where it is unknown or where the run starts at it.
+    Fields, psi and test images stay as they are. Where some of the photographs train too, each training chooses its
+    own.
 
     Args:
         trainings: of each distribution, at least 2.
@@ -42,7 +44,7 @@ class RepeatStep:
         at_least("repeat", 2, trainings=self.trainings, draws=self.draws)
 
     def run(self, context: Context) -> None:
-        """repeat.md, also on the screen, and repeat.json to the run's folder."""
+        """Write repeat.md, which is also printed, and repeat.json."""
         graph, results, score = context.graph, context.results, context.experiment.score
         names, test = list(graph.names), results(graph.targets).test
         first = graph.compared(results(graph.learned))
@@ -71,8 +73,9 @@ class RepeatStep:
 def groups(
     names: Sequence[str], biased: Container[str], shown: Sequence[int]
 ) -> list[tuple[list[str], list[int]]]:
-    """Names and labels of the objects that a run is about, of all objects, and of each one, without those that no
-    test image shows.
+    """Return names and labels of the objects that a run is about, of all objects, and of each one.
+
+    Objects that no test image shows are left out.
     """
     about = [label for label in shown if names[label] in biased]
     found: list[list[int]] = []
@@ -83,7 +86,7 @@ def groups(
 
 
 def again(stage: ScoresStage, training: int) -> ScoresStage:
-    """The same scores of a detector with other random numbers; training 0 is the run's."""
+    """Return the same scores of a detector with other random numbers; training 0 is the run's."""
     return replace(stage, trained=_seeded(stage.trained, APART * training))
 
 

@@ -15,8 +15,8 @@ from PIL import Image
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.stages import export as stage
 from neural_sim.stages.detail import finer_recipe, view_size_for
-from neural_sim.stages.walk import walk
 from neural_sim.target.coco import CocoTarget
+from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
 SMALL = [

@@ -20,8 +20,8 @@ from neural_sim.report import logged
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.stages.target_sets import TargetSets
-from neural_sim.stages.walk import walk
 from neural_sim.synthesis.export.coco import write_coco
+from neural_sim.tasks.walk import walk
 
 SMALL = [
     "+experiment=pose_gap", "scale=smoke", "progress=false", "baseline=ns", "detector=micro", "views.count=8",

@@ -9,19 +9,21 @@ from typing import Any
 
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.plan import plan
-from neural_sim.stages.report import write_report
 from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
+from neural_sim.tasks.report import write_report
 
 _log = logging.getLogger(__name__)
 
 
 def views(context: Context) -> None:
+    """Make the views of all objects."""
     for stage in context.shown(context.graph.views, "views"):
         context.results(stage)
 
 
 def fields(context: Context) -> None:
+    """Make the fields of all objects."""
     for stage in context.shown(context.graph.fields, "field"):
         fitted = context.results(stage)
         if context.live:
@@ -29,20 +31,24 @@ def fields(context: Context) -> None:
 
 
 def target_sets(context: Context) -> None:
+    """Make the target sets."""
     context.results(context.graph.targets)
 
 
 def warm_start(context: Context) -> None:
+    """Train the warm start."""
     context.results(context.graph.warm_start)
 
 
 def psi(context: Context) -> None:
+    """Learn psi."""
     learned = context.results(context.graph.learned)
     if context.live:
         context.live.iterations([dataclasses.asdict(record) for record in learned.records])
 
 
 def evaluate(context: Context) -> None:
+    """Score the detectors that the report compares."""
     graph, results = context.graph, context.results
     learned = results(graph.learned)
     on_the_way = [
