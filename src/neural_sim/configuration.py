@@ -51,6 +51,8 @@ def own_folder(wanted: Path) -> Path:
 
 GONE: dict[str, str] = {
     "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
+    "solver=neumann": "want solver=cg, or solver=minres for indefinite systems",
+    "solver=nystrom": "want solver=cg, or solver=minres for indefinite systems",
     "baseline=random_search": "want baseline=lts, which learns from the same rewards",
     "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
 }

@@ -11,24 +11,14 @@ from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.exact import Exact
 from neural_sim.solver.identity import Identity
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.neumann import Neumann
-from neural_sim.solver.nystrom import Nystrom
 from neural_sim.solver.operator import norm
 from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
 SIZE = 24
-ALL = [
-    ConjugateGradient(),
-    MinimumResidual(),
-    Neumann(),
-    Nystrom(shift=0.5),
-    Nystrom(shift=0.5, sketch="gaussian", refine=False),
-    Identity(),
-    Exact(),
-]
-# Those whose settings carry no unit of the operator, unlike a fixed scale or shift.
-WITHOUT_UNIT = [solver for solver in ALL if not isinstance(solver, Identity | Nystrom)]
+ALL = [ConjugateGradient(), MinimumResidual(), Identity(), Exact()]
+# Those whose settings carry no unit of the operator, unlike a fixed scale.
+WITHOUT_UNIT = [solver for solver in ALL if not isinstance(solver, Identity)]
 
 
 def name(solver) -> str:

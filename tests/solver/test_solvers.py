@@ -13,44 +13,10 @@ import torch
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.identity import Identity
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.neumann import Neumann
-from neural_sim.solver.nystrom import Nystrom
-from neural_sim.solver.operator import Shifted
 from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
 SIZE = 24
-
-
-def name(solver) -> str:
-    return repr(solver)
-
-
-@pytest.mark.parametrize("sketch", ["columns", "gaussian"])
-def test_nystrom_is_exact_on_low_rank_plus_shift(sketch, symmetric, right_hand_side):
-    eigenvalues = torch.zeros(SIZE, dtype=DOUBLE)
-    eigenvalues[:4] = torch.tensor([5.0, 3.0, 1.0, 0.3])
-    matrix, b, shift = symmetric(eigenvalues), right_hand_side(), 0.01
-    solver = Nystrom(rank=6, sketch=sketch, refine=False)
-    solution = solver.solve(Shifted(lambda v: matrix @ v, shift), b, rtol=1e-9)
-    reference = torch.linalg.solve(matrix + shift * torch.eye(SIZE, dtype=DOUBLE), b)
-    torch.testing.assert_close(solution.value, reference, rtol=1e-8, atol=1e-8)
-    assert solution.status is Status.CONVERGED
-    assert solution.products == 7  # six columns, one residual
-
-
-def test_nystrom_refines_what_the_sketch_left_over(symmetric, right_hand_side):
-    matrix, b = symmetric(torch.logspace(1, -3, SIZE, dtype=DOUBLE)), right_hand_side()
-    operator = Shifted(lambda v: matrix @ v, 0.05)
-    plain = Nystrom(rank=12, sketch="gaussian", refine=False).solve(operator, b, rtol=1e-8, max_steps=60)
-    refined = Nystrom(rank=12, sketch="gaussian").solve(operator, b, rtol=1e-8, max_steps=60)
-    assert plain.status is Status.APPROXIMATE and plain.residual > 1e-8
-    assert refined.status is Status.CONVERGED
-
-
-def test_nystrom_wants_a_positive_shift(right_hand_side):
-    with pytest.raises(ValueError, match="positive damping"):
-        Nystrom().solve(lambda v: v, right_hand_side())
 
 
 def test_identity_reports_an_honest_residual(symmetric, right_hand_side, spread):
@@ -95,7 +61,7 @@ def test_minres_claims_a_least_squares_solution_only_where_it_is_one(
 def test_warm_start_is_used_or_dropped(symmetric, right_hand_side, spread):
     matrix, b = symmetric(spread(1e2)), right_hand_side()
     close = torch.linalg.solve(matrix, b) * (1 + 1e-3)
-    for solver in (ConjugateGradient(), MinimumResidual(), Neumann(lanczos_steps=SIZE)):
+    for solver in (ConjugateGradient(), MinimumResidual()):
         warm = solver.solve(lambda v: matrix @ v, b, x0=close, rtol=1e-4, max_steps=900)
         cold = solver.solve(lambda v: matrix @ v, b, rtol=1e-4, max_steps=900)
         assert warm.warm_started and not cold.warm_started

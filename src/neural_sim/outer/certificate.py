@@ -160,7 +160,7 @@ def _doubts(result: Hypergradient, cosine: float, trust: Trust) -> list[str]:
     # solver=identity never iterates: whoever chooses it accepts its residual.
     residual = 0.0 if solution.status is Status.APPROXIMATE else solution.residual
     failed = {
-        "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE, Status.DIVERGED),
+        "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE),
         "residual": _above(residual, trust.max_residual),
         "stationarity": _above(result.stationarity, trust.max_stationarity),
         "sensitivity": _above(result.sensitivity, trust.max_sensitivity),

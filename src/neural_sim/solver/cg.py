@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
-from neural_sim.solver.operator import Matvec, dot, in_range, norm, numbers, plain_dot, plain_norm
+from neural_sim.solver.operator import dot, in_range, norm, numbers, plain_dot, plain_norm
 from neural_sim.solver.solution import Status
 
 
@@ -23,51 +23,39 @@ class ConjugateGradient(LinearSolver):
         check_restart_gain("cg", self.restart_gain)
 
     def iterate(self, system: System) -> Iterate:
-        return conjugate_gradients(system, self.restart_gain)
-
-
-def conjugate_gradients(system: System, restart_gain: float, precondition: Matvec | None = None) -> Iterate:
-    """The iteration itself; ``precondition`` applies a positive definite approximation of the inverse.
-
-    A system with a search's direction continues that search; with a preconditioner, whose directions differ, it does
-    not.
-    """
-    operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
-    value = best = system.start
-    residual = system.residual
-    confirmed = best_norm = norm(residual)
-    if confirmed <= tolerance:
-        return Iterate(best, Status.CONVERGED, 0, confirmed)
-    conditioned = residual if precondition is None else precondition(residual)
-    begun = system.direction if precondition is None else None
-    direction = conditioned if begun is None else begun
-    energy = dot(residual, conditioned)
-    for step in range(1, system.max_steps + 1):
-        product = operator.measured(direction)
-        # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich), so one
-        # below machine epsilon is curvature that rounding cannot tell from zero.
-        if product.energy <= torch.finfo(rhs.dtype).eps * product.size * product.length:
-            return Iterate(best, Status.NEGATIVE_CURVATURE, step)
-        alpha = energy / product.energy
-        value = value + alpha * direction
-        residual = residual - alpha * product.value
-        conditioned = residual if precondition is None else precondition(residual)
-        before = energy
-        size, energy = numbers(plain_norm(residual), plain_dot(residual, conditioned))
-        size = in_range(size, residual)
-        if size < best_norm:
-            best, best_norm = value, size
-        restart = size <= tolerance
-        if restart:
-            residual = rhs - operator(value)
-            true = norm(residual)
-            if true <= tolerance:
-                return Iterate(value, Status.CONVERGED, step, true)
-            if true > restart_gain * confirmed:
-                return Iterate(value, Status.STAGNATED, step, true)
-            confirmed = best_norm = true
-            best = value
-            conditioned = residual if precondition is None else precondition(residual)
-            energy = dot(residual, conditioned)
-        direction = conditioned if restart else conditioned + (energy / before) * direction
-    return Iterate(best, Status.MAX_STEPS, system.max_steps)
+        """Iterate from the start, or go on with a search where the system has its direction."""
+        operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
+        value = best = system.start
+        residual = system.residual
+        confirmed = best_norm = norm(residual)
+        if confirmed <= tolerance:
+            return Iterate(best, Status.CONVERGED, 0, confirmed)
+        direction = residual if system.direction is None else system.direction
+        energy = dot(residual, residual)
+        for step in range(1, system.max_steps + 1):
+            product = operator.measured(direction)
+            # For positive definite A the cosine of p and Ap is at least 2 sqrt(kappa) / (kappa + 1) (Kantorovich),
+            # so one below machine epsilon is curvature that rounding cannot tell from zero.
+            if product.energy <= torch.finfo(rhs.dtype).eps * product.size * product.length:
+                return Iterate(best, Status.NEGATIVE_CURVATURE, step)
+            alpha = energy / product.energy
+            value = value + alpha * direction
+            residual = residual - alpha * product.value
+            before = energy
+            size, energy = numbers(plain_norm(residual), plain_dot(residual, residual))
+            size = in_range(size, residual)
+            if size < best_norm:
+                best, best_norm = value, size
+            restart = size <= tolerance
+            if restart:
+                residual = rhs - operator(value)
+                true = norm(residual)
+                if true <= tolerance:
+                    return Iterate(value, Status.CONVERGED, step, true)
+                if true > self.restart_gain * confirmed:
+                    return Iterate(value, Status.STAGNATED, step, true)
+                confirmed = best_norm = true
+                best = value
+                energy = dot(residual, residual)
+            direction = residual if restart else residual + (energy / before) * direction
+        return Iterate(best, Status.MAX_STEPS, system.max_steps)

@@ -19,7 +19,7 @@ class NonFiniteProduct(ArithmeticError):
 
 @dataclass(frozen=True)
 class Shifted:
-    """``x -> A x + shift x``: a Hessian with its damping. Solvers that treat the shift apart (nystrom) can see it."""
+    """``x -> A x + shift x``: a Hessian with its damping."""
 
     matvec: Matvec
     shift: float
@@ -84,11 +84,6 @@ class Watched:
     @property
     def curvature(self) -> tuple[float, float]:
         return (self._low, self._high) if self._low <= self._high else (0.0, 0.0)
-
-    @property
-    def shift(self) -> float:
-        """The known multiple of the identity inside this operator."""
-        return self._matvec.shift if isinstance(self._matvec, Shifted) else 0.0
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         return self.measured(vector).value

@@ -18,7 +18,6 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import FixedDamping
 from neural_sim.solver.exact import Exact
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
-from neural_sim.solver.operator import Shifted
 from neural_sim.studies.work_precision.micro import PSI, trained_problem
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.suite import World
@@ -210,17 +209,14 @@ class Solver:
         basis, _ = torch.linalg.qr(torch.randn(UNKNOWNS, UNKNOWNS, generator=generator, dtype=torch.float64))
         truth = torch.randn(UNKNOWNS, generator=generator, dtype=torch.float64)
         values = torch.logspace(0.0, -math.log10(condition), UNKNOWNS, dtype=torch.float64)
-        # Half of the smallest eigenvalue is the shift that a preconditioner of low rank wants.
-        shift = 0.5 / condition
-        bare = basis * (values - shift) @ basis.T
-        bare = 0.5 * (bare + bare.T)
-        operator = Shifted(lambda v: bare @ v, shift)
-        b, points = operator(truth), []
+        matrix = basis * values @ basis.T
+        matrix = 0.5 * (matrix + matrix.T)
+        b, points = matrix @ truth, []
         for name, solver in {**self.solvers, "dense": AdjointSolver(Exact())}.items():
             for rtol in (1e-2, 1e-6, 1e-10) if name not in ("dense", "identity") else (1e-10,):
 
                 def solve(linear=solver.linear, rtol: float = rtol):
-                    return linear.solve(operator, b, rtol=rtol, max_steps=10 * UNKNOWNS)
+                    return linear.solve(matrix.mv, b, rtol=rtol, max_steps=10 * UNKNOWNS)
 
                 found = solve()
                 seconds, memory = timing.of(solve)
