@@ -26,10 +26,10 @@ from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import psi_contributions
 from neural_sim.gradient.significance import no_association, no_difference, zero_mean
 from neural_sim.gradient.stratified import stratified
-from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.report.section import replace_section
+from neural_sim.studies.frozen import FrozenLoop
 
 DOUBLE = torch.float64
 BINS, LIGHTS, IMAGES, LEVEL = 8, 6, 50, 0.05

@@ -20,10 +20,10 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.report.machine import machine
 from neural_sim.report.section import replace_section
+from neural_sim.studies.frozen import FrozenLoop, State
 from neural_sim.tasks.context import Context
 
 WAY = (0.0, 0.2, 0.4, 0.7, 1.0)
@@ -41,16 +41,8 @@ def at(context: Context, part: float, seeds: int, per_light: int) -> dict[str, A
         inner = InnerLoop(scene, detector, warm_start, validation, x.loop.outer, x.training, generator)
         images = inner.draw(psi).images
         inner.train(CachedSet.of(inner.detector, inner.backbone, images))
-        loop = FrozenLoop.at(
-            scene,
-            inner.detector,
-            inner.theta,
-            psi,
-            images,
-            validation,
-            x.loop.solver,
-            generator,
-        )
+        state = State(scene, inner.detector, inner.theta, psi)
+        loop = FrozenLoop.at(state, images, validation, x.loop.solver, generator)
         blends = loop.pathwise(PathwiseEstimator(), x.loop.outer.images_per_object, generator)
         proportions = loop.truth(per_light, generator)
         rows.append([inner.validation_loss(), *predicted(blends, way), *predicted(proportions, way)])

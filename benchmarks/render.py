@@ -18,9 +18,8 @@ import torch
 from field import HELD_OUT, fit, load_objects, training_views  # the benchmark beside this one
 from machine import add_device
 
-from neural_sim.devices import synchronise
+from neural_sim.devices import peak_bytes, synchronise
 from neural_sim.field.base import RadianceField
-from neural_sim.outer.peak_memory import peak_bytes
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.report.machine import machine
 from neural_sim.studies.work_precision.renderer import left_out

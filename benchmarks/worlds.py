@@ -5,8 +5,7 @@ from __future__ import annotations
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.stages.temperatures import frozen_loop
+from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.tasks.context import Context
 
 SMALL = [
@@ -20,4 +19,4 @@ def make_world(overrides: list[str]) -> FrozenLoop:
     """Fields and detector from the store, or made now; v by the configured solver."""
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
         context = Context.of(build(compose("config", [*SMALL, *overrides])))
-    return frozen_loop(context, seed=11)
+    return FrozenLoop.of(context, seed=11)

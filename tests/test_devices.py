@@ -6,6 +6,8 @@ from trips import counted
 
 from neural_sim import devices
 
+MB = 2**20
+
 
 def test_a_gpu_that_is_not_there_is_refused_with_the_key(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # nor is one that is there, for this test
@@ -67,3 +69,30 @@ def test_a_gpu_is_started_before_its_peak_is_forgotten(monkeypatch):
 def test_memory_of_a_gpu_is_reported_only_where_there_is_one():
     found = devices.peak_memory_mb(torch.device("cpu"))
     assert set(found) == {"peak_memory_mb"} and found["peak_memory_mb"] > 10.0
+
+
+def _floats(megabytes):
+    return torch.empty(megabytes * MB // 4)
+
+
+def test_memory_that_is_given_back_does_not_add_up():
+    def run():
+        for size in (1, 4, 2):
+            _floats(size)
+
+    assert devices.peak_bytes(run) == 4 * MB
+
+
+def test_memory_that_is_kept_adds_up_until_it_is_given_back():
+    def run():
+        first, second = _floats(2), _floats(3)
+        del first
+        third = _floats(1)
+        return second, third
+
+    assert devices.peak_bytes(run) == 5 * MB
+
+
+def test_what_was_there_before_does_not_count():
+    before = _floats(8)
+    assert devices.peak_bytes(lambda: before.add_(1.0).new_empty(MB)) == 4 * MB

@@ -6,12 +6,17 @@ device. Fields, images, features and targets live on the run's device; what leav
 
 from __future__ import annotations
 
+import os
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import SingleDeviceStrategy
+from torch.profiler import ProfilerActivity, profile
+
+# Read when the profiler first runs, which otherwise writes lines of its own to the screen.
+os.environ.setdefault("KINETO_LOG_LEVEL", "99")
 
 DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 """torch's device type by ``trainer.accelerator``."""
@@ -104,6 +109,32 @@ def forget_gpu_peak(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.init()  # without which torch has no count to reset, and raises
         torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_bytes(run: Callable[[], object], device: torch.device | None = None) -> int:
+    """Measure the most bytes that tensors took at one time while ``run`` ran, beyond what they took before.
+
+    On a CPU (the default) by the profiler's record of every allocation, on a GPU by the allocator's own count.
+
+    Raises:
+        RuntimeError: the profiler recorded no allocation.
+    """
+    if device is not None and device.type == "cuda":
+        before = torch.cuda.memory_allocated(device)
+        forget_gpu_peak(device)
+        run()
+        return torch.cuda.max_memory_allocated(device) - before
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
+        run()
+    current, most = 0, 0
+    kineto = record.profiler.kineto_results if record.profiler is not None else None
+    events = [event for event in kineto.events() if event.name() == "[memory]"] if kineto is not None else []
+    if not events:
+        raise RuntimeError("the profiler recorded no allocation")
+    for event in sorted(events, key=lambda event: event.start_ns()):
+        current += event.nbytes()  # pyright: ignore[reportAttributeAccessIssue]
+        most = max(most, current)
+    return most
 
 
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:

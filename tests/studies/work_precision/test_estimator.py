@@ -8,9 +8,9 @@ import torch
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
-from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import LanczosDamping
+from neural_sim.studies.frozen import FrozenLoop, State
 from neural_sim.studies.work_precision.estimator import Estimators, ceilings, cosine, relative_error
 from neural_sim.studies.work_precision.micro import PSI, small_scene
 from neural_sim.studies.work_precision.series import Timing
@@ -22,7 +22,7 @@ def world():
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     theta, images = detector.init(generator), scene.training_set(PSI, 4, generator).images
     solver = AdjointSolver(damping=LanczosDamping(lanczos_steps=6), max_steps=6)
-    loop = FrozenLoop.at(scene, detector, theta, PSI, images, images, solver, generator)
+    loop = FrozenLoop.at(State(scene, detector, theta, PSI), images, images, solver, generator)
     return SimpleNamespace(loop=loop, names=scene.names)
 
 

@@ -19,8 +19,8 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Probes
 from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.frozen import FrozenLoop, centred
 from neural_sim.parameter.update import shrinkage
+from neural_sim.studies.frozen import FrozenLoop, centred
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.suite import World
 from neural_sim.types import SceneDraw

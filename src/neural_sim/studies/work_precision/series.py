@@ -11,8 +11,7 @@ from typing import Literal, TypeVar, get_args
 
 import torch
 
-from neural_sim.devices import synchronise
-from neural_sim.outer.peak_memory import peak_bytes
+from neural_sim.devices import peak_bytes, synchronise
 
 T = TypeVar("T")
 Clock = Literal["cpu_seconds", "seconds"]

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.field.base import RadianceField
-from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.machine import machine
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.stages.temperatures import frozen_loop
+from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.studies.work_precision.derivative import Derivative
 from neural_sim.studies.work_precision.estimator import Estimators
 from neural_sim.studies.work_precision.field import Fields
@@ -75,7 +74,7 @@ class RunWorld:
 
     @property
     def loop(self) -> FrozenLoop:
-        return frozen_loop(self.context, self.context.experiment.run.seed)
+        return FrozenLoop.of(self.context, self.context.experiment.run.seed)
 
     @property
     def outer(self) -> Outer:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from neural_sim.field.base import RadianceField
-from neural_sim.outer.frozen import FrozenLoop
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.studies.work_precision.series import Series, Timing
 from neural_sim.types import PosedViews
 

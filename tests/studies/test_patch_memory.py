@@ -3,18 +3,20 @@
 import copy
 import dataclasses
 import itertools
+import json
 
 import pytest
 import torch
+from mlflow import MlflowClient
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.outer.patch_memory import FORWARD, WHOLE, PatchMemory
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
+from neural_sim.studies.frozen import FrozenLoop, State
+from neural_sim.studies.patch_memory import FORWARD, WHOLE, PatchCost, PatchMemory, publish
 
 PATCHES = (64, 128, 256)
 
@@ -29,7 +31,7 @@ def loop(scene):
     validation = scene.training_set(psi, 3, generator).images
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     images = scene.training_set(psi, 4, generator).images
-    return FrozenLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
+    return FrozenLoop.at(State(scene, detector, theta, psi), images, validation, solver, generator)
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +63,19 @@ def test_memory_grows_with_the_patch_and_the_derivative_stays(rows):
 def test_bad_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="patch_memory"):
         PatchMemory(**wrong)
+
+
+def test_the_files_and_the_run_have_every_row(context):
+    rows = [
+        PatchCost("pitcher", "forward", None, 1.25, 9.5, 13.0, 26.0, 0.0),
+        PatchCost("pitcher", "reverse, patches of 64", 64, 0.5, 8.0, 250.4, 251.0, 2e-6),
+    ]
+    run = publish(context, rows, "a field")
+    text = (context.folder / "patch_memory.md").read_text()
+    assert "| reverse, patches of 64 | 0.50 | 8.0 | 250 | 251 | 2e-06 |" in text and "**pitcher**" in text
+    document = json.loads((context.folder / "patch_memory.json").read_text())
+    assert [row["patch"] for row in document["rows"]] == [None, 64]
+    logged = MlflowClient(context.uri).get_run(run.run_id).data
+    assert (
+        logged.metrics["pitcher/64/gradient_mb"] == 0.5 and logged.metrics["pitcher/forward/total_mb"] == 9.5
+    )

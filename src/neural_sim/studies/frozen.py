@@ -1,4 +1,4 @@
-"""One state of the psi loop (psi, detector and v), to compare estimators with a reference."""
+"""One state of the psi loop (psi, detector and v), in which estimators are compared with a reference."""
 
 from __future__ import annotations
 
@@ -22,13 +22,26 @@ from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.flatten import unflatten
 from neural_sim.synthesis.scene import Scene
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 
 @dataclass(frozen=True)
+class State:
+    """The parts of the psi loop at one moment; ``theta`` has all of the detector's parameters."""
+
+    scene: Scene
+    detector: Detector
+    theta: Parameters
+    psi: Float[Tensor, "objects K"]
+
+
+@dataclass(frozen=True)
 class FrozenLoop:
-    """``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta,
-    ``solve`` describes that solve.
+    """The psi loop at one psi and theta, with the adjoint solved once.
+
+    ``trainable`` and ``backbone`` are theta's two parts, ``vector`` is v = (H + lambda I)^-1 dL_val/dtheta, and
+    ``solve`` describes that solve in words.
     """
 
     scene: Scene
@@ -40,18 +53,26 @@ class FrozenLoop:
     solve: str
 
     @staticmethod
+    def of(context: Context, seed: int) -> FrozenLoop:
+        """Return the loop at its start: images of the initial psi, the warm-started detector, v by the run's solver."""
+        graph, results, generator = context.graph, context.results, torch.Generator().manual_seed(seed)
+        psi, scene = graph.psi("initial"), results(graph.scene)
+        images = scene.training_set(psi, context.experiment.loop.outer.images_per_object, generator).images
+        theta, validation = results(graph.warm_start).params, results(graph.targets).val
+        state = State(scene, graph.warm_start.build(), theta, psi)
+        return FrozenLoop.at(state, images, validation, context.experiment.loop.solver, generator)
+
+    @staticmethod
     def at(
-        scene: Scene,
-        detector: Detector,
-        theta: Parameters,
-        psi: Float[Tensor, "objects K"],
+        state: State,
         images: LabelledImages,
         validation: LabelledImages,
         solver: AdjointSolver,
         generator: torch.Generator,
     ) -> FrozenLoop:
-        """V for the inner problem of ``images``, drawn from ``psi``, at ``theta``."""
-        backbone, trainable = detector.split(theta)
+        """Solve for v with the inner problem of ``images``, which are drawn from the state's psi."""
+        scene, detector, psi = state.scene, state.detector, state.psi
+        backbone, trainable = detector.split(state.theta)
         cached = CachedSet.of(detector, backbone, images)
         dtype = next(iter(trainable.values())).dtype
         weights = torch.full((len(images),), 1.0 / len(images), dtype=dtype, device=cached.device)
@@ -66,13 +87,17 @@ class FrozenLoop:
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)
 
     def with_factor(self, factor: BinnedFactor) -> FrozenLoop:
-        """The same state with ``factor``, of the same bins, as the distribution's only one."""
+        """Return the same state with ``factor``, of the same bins, as the distribution's only one."""
         distribution = replace(self.scene.distribution, factors=(factor,))
         return replace(self, scene=replace(self.scene, distribution=distribution))
 
     @property
     def factor(self) -> Factor:
-        """The distribution's only factor. Raises ``ValueError`` where there are more."""
+        """The distribution's only factor.
+
+        Raises:
+            ValueError: the distribution has more than one.
+        """
         factors = self.scene.distribution.factors
         if len(factors) != 1:
             names = [factor.name for factor in factors]
@@ -81,22 +106,26 @@ class FrozenLoop:
 
     @property
     def bins(self) -> BinnedFactor:
-        """The only factor, which must have bins. Raises ``ValueError`` for another."""
+        """The distribution's only factor, which has bins.
+
+        Raises:
+            ValueError: the factor has no bins.
+        """
         if (self.factor,) != self.scene.distribution.binned:
             raise ValueError(f"parameter: want one parameter with bins, got {self.factor.name}")
         return self.scene.distribution.binned[0]
 
     def probes(self, per_bin: int, generator: torch.Generator) -> ProbeSet:
-        """``per_bin`` images of every bin of every object."""
+        """Draw ``per_bin`` images of every bin of every object."""
         objects = range(len(self.scene.names))
         return ProbeSet.draw(self.scene, self.detector, self.backbone, per_bin, self.psi, generator, objects)
 
     def truth(self, per_bin: int, generator: torch.Generator) -> list[MixedDerivative]:
-        """The derivative over hard bins of every object, from ``per_bin`` images of each."""
+        """Estimate every object's derivative over hard bins, from ``per_bin`` images of each bin."""
         return self.over_strata(self.probes(per_bin, generator))
 
     def over_strata(self, probed: ProbeSet) -> list[MixedDerivative]:
-        """Every object's stratified estimate, from the scores <dl/dtheta, v> of the probes in each bin or light."""
+        """Return every object's stratified estimate, from scores <dl/dtheta, v> of its probes in each bin or light."""
         return [self._stratified(probed, label) for label in range(len(probed.probes))]
 
     def _stratified(self, probed: ProbeSet, label: int) -> MixedDerivative:
@@ -107,7 +136,7 @@ class FrozenLoop:
     def pathwise(
         self, estimator: PathwiseEstimator, count: int, generator: torch.Generator
     ) -> list[MixedDerivative]:
-        """Every object's estimate from ``count`` relaxed draws of each, through the psi loop's own binding."""
+        """Return every object's estimate from ``count`` relaxed draws of it, through the psi loop's own binding."""
         rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
         images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
@@ -119,7 +148,7 @@ class FrozenLoop:
 
 
 def centred(derivatives: list[MixedDerivative]) -> Float[Tensor, "objects k"]:
-    """Derivatives by centred logits: a constant added to all logits does not change p."""
+    """Return derivatives by centred logits: a constant added to all logits does not change p."""
     values = torch.stack([part.value for part in derivatives])
     return values - values.mean(-1, keepdim=True)
 

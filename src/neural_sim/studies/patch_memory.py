@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from neural_sim.devices import synchronise
+from neural_sim.checks import at_least
+from neural_sim.devices import peak_bytes, synchronise
+from neural_sim.documents import markdown_table
 from neural_sim.gradient.mixed import input_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
 from neural_sim.outer.binding import image_losses, rendered_path
-from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.outer.peak_memory import peak_bytes
+from neural_sim.report.tracking import Run
+from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.synthesis.draws import HARD
+from neural_sim.tasks.context import Context
 from neural_sim.types import Maps
 
 FORWARD, WHOLE = "forward", "reverse, whole image"
@@ -28,11 +32,17 @@ FORWARD, WHOLE = "forward", "reverse, whole image"
 class PatchCost:
     """One way to differentiate one image of an object by the numbers of its draw that depend on psi.
 
-    ``patch`` is in rays, None in forward mode. ``gradient_mb`` is the most memory of the renderer's derivative, in
-    forward mode of the render that computes it, without the maps and their derivatives. ``total_mb`` is that of the
-    whole estimate from one image of every object: rendering, the loss's derivative by the images, the renderer's. Both
-    in MiB. ``milliseconds`` and ``cpu_milliseconds`` (of all cores) are of rendering and the renderer's derivative.
-    ``difference`` is the result's from that of forward mode, relative to its norm.
+    Attributes:
+        object: the object's name.
+        method: forward or reverse mode, and the patch.
+        patch: rays of a patch; None in forward mode.
+        gradient_mb: peak memory of the renderer's derivative in MiB; in forward mode of the render that computes it,
+            without the maps and their derivatives.
+        total_mb: peak memory in MiB of the whole estimate from one image of every object: rendering, the loss's
+            derivative by the images, the renderer's derivative.
+        milliseconds: wall time of rendering and the renderer's derivative.
+        cpu_milliseconds: processor time of all cores for the same.
+        difference: distance from the result of forward mode, relative to the latter's norm.
     """
 
     object: str
@@ -63,11 +73,26 @@ class PatchMemory:
     def __post_init__(self) -> None:
         if not self.patches or min(self.patches) < 1:
             raise ValueError(f"patch_memory.patches: want numbers of rays from 1, got {list(self.patches)}")
-        if self.repeats < 1:
-            raise ValueError(f"patch_memory.repeats must be at least 1, got {self.repeats}")
+        at_least("patch_memory", 1, repeats=self.repeats)
+
+    def run(self, context: Context) -> None:
+        """Measure at the initial psi with the warm-started detector, and publish.
+
+        Raises:
+            ValueError: an estimator that does not differentiate the renderer.
+        """
+        x = context.experiment
+        if not isinstance(x.loop.gradient, PathwiseEstimator):
+            raise ValueError(
+                "patch_memory: want gradient=pathwise, no other estimator differentiates the renderer"
+            )
+        rows = self.measure(FrozenLoop.of(context, x.run.seed), x.loop.gradient, x.run.seed)
+        camera, field = context.graph.camera, type(context.results(context.graph.fields[0]).field).__name__
+        setting = f"{field}, {camera.width} x {camera.height} pixels, {x.imaging.renderer.rays_per_chunk} rays a chunk"
+        publish(context, rows, setting)
 
     def measure(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> list[PatchCost]:
-        """Every object: forward mode, the reverse mode by each patch size, and by the whole image at once."""
+        """Measure every object: forward mode, reverse mode by each patch size and by the whole image at once."""
         pixels = loop.scene.camera.width * loop.scene.camera.height
         sizes = [*(size for size in self.patches if size < pixels), pixels]
         ahead = replace(estimator, mode="forward")
@@ -89,12 +114,12 @@ class PatchMemory:
         return rows
 
     def _total(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> float:
-        """MiB of one estimate from one image of every object."""
+        """Return the peak memory in MiB of one estimate from one image of every object."""
         device = loop.scene.device(0)
         return peak_bytes(lambda: loop.pathwise(estimator, 1, _generator(seed)), device) / 2**20
 
     def _timed(self, run: Callable[[], object], device: torch.device) -> tuple[float, float]:
-        """Median milliseconds, by the clock on the wall and of all cores."""
+        """Return median milliseconds, of wall time and of processor time."""
         wall, worked = [], []
         for _ in range(self.repeats):
             begun, cpu_begun = time.perf_counter(), time.process_time()
@@ -107,9 +132,7 @@ class PatchMemory:
 
 @dataclass(frozen=True)
 class _Image:
-    """One image of one object with the loss's cotangent of its maps. ``names`` are the numbers of the draw that depend
-    on psi; each rendering repeats the draw from the seed.
-    """
+    """One image of one object, and the loss's cotangent of its maps; each rendering repeats the draw from the seed."""
 
     loop: FrozenLoop
     label: int
@@ -139,7 +162,7 @@ class _Image:
         return self.cotangents.rgb.device
 
     def peak(self, run: Callable[[], object]) -> float:
-        """MiB."""
+        """Return the peak memory of ``run`` in MiB."""
         return peak_bytes(run, self.device) / 2**20
 
     def render(self, tangents: bool) -> RenderedObject:
@@ -158,7 +181,7 @@ class _Image:
         )
 
     def output_mb(self) -> float:
-        """MiB of the maps and their derivatives, each as large as the cotangents."""
+        """Return MiB of the maps and their derivatives, each as large as the cotangents."""
         maps = (self.cotangents.rgb, self.cotangents.opacity)
         each = sum(values.numel() * values.element_size() for values in maps)
         return each * (1 + len(self.forward())) / 2**20
@@ -169,6 +192,43 @@ def _generator(seed: int) -> torch.Generator:
 
 
 def _apart(values: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> float:
-    """Distance over the numbers that ``truth`` has, relative to its norm."""
+    """Return the distance over the numbers that ``truth`` has, relative to its norm."""
     one, other = (torch.cat([each[name] for name in truth]) for each in (values, truth))
     return float((one - other).norm() / other.norm())
+
+
+def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run:
+    """Write patch_memory.json and patch_memory.md, and log every cost to MLflow; ``setting`` is the table's heading."""
+    document = {"setting": setting, "rows": [dataclasses.asdict(row) for row in rows]}
+    metrics = {
+        f"{row.object}/{'forward' if row.patch is None else row.patch}/{key}": getattr(row, key)
+        for row in rows
+        for key in ("gradient_mb", "total_mb", "milliseconds", "cpu_milliseconds")
+    }
+    tags = {"method": "pathwise"}
+    return context.publish("patch_memory", document, table(rows, setting), metrics=metrics, tags=tags)
+
+
+def table(rows: Sequence[PatchCost], setting: str) -> str:
+    """Return Markdown, a table for each object."""
+    parts = [
+        f"Derivative of one image by the scene parameters that depend on psi ({setting}). *Gradient* is the working "
+        "memory of the renderer's derivative, *total* that of the whole estimate with the detector's, from one image "
+        "of every object."
+    ]
+    head = ["method", "gradient, MB", "total, MB", "ms", "CPU ms", "relative difference from forward"]
+    for name in dict.fromkeys(row.object for row in rows):
+        cells = [
+            (
+                row.method,
+                f"{row.gradient_mb:.2f}",
+                f"{row.total_mb:.1f}",
+                f"{row.milliseconds:.0f}",
+                f"{row.cpu_milliseconds:.0f}",
+                f"{row.difference:.0e}",
+            )
+            for row in rows
+            if row.object == name
+        ]
+        parts += [f"**{name}**", markdown_table(head, cells)]
+    return "\n\n".join(parts)

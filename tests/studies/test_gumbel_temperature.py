@@ -8,12 +8,12 @@ import torch
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.frozen import FrozenLoop
-from neural_sim.outer.temperatures import Temperatures, against, bin_frequencies
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
+from neural_sim.studies.frozen import FrozenLoop, State
+from neural_sim.studies.gumbel_temperature import Temperatures, against, bin_frequencies
 
 
 def test_bias_and_spread_of_known_estimates(generator):
@@ -52,7 +52,7 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
     theta, validation = detector.init(generator), scene.training_set(psi, 3, generator).images
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=6), max_steps=6)
     images = scene.training_set(psi, 4, generator).images
-    loop = FrozenLoop.at(scene, detector, theta, psi, images, validation, solver, generator)
+    loop = FrozenLoop.at(State(scene, detector, theta, psi), images, validation, solver, generator)
     rows, truths = Temperatures((1e-4,), rounds=2, truth_per_bin=4, draws=100).measure(
         loop, PathwiseEstimator(), 4, seed=0
     )
