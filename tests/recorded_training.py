@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neural_sim.detector.cached import CachedSet
-from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.protocol import Detector
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
@@ -18,11 +18,10 @@ from neural_sim.types import LabelledImages
 DOUBLE = torch.float64
 ALL = Recording()
 EXACT = Unrolled("reverse_over_reverse", scored_steps=0, floor=0.0)
-RULES = [SGD(0.05), SGD(0.05, 0.8), AdamW(0.05)]
-NAMES = ["sgd", "momentum", "adamw"]
-# Warm-up, the peak, and decay to nearly zero; smaller steps where the gradient's size counts.
-SHAPE = (0.3, 0.7, 1.0, 0.9, 0.6, 0.2)
-PEAK = {SGD: 1e-2, AdamW: 3e-3}
+RULE = AdamW(0.05)
+RATES = tuple(
+    3e-3 * part for part in (0.3, 0.7, 1.0, 0.9, 0.6, 0.2)
+)  # warm-up, the peak, decay to nearly zero
 STEP = 1e-5  # of differences: AdamW's steps bend within |gradient| of their start, some entries of which are tiny
 
 
@@ -55,10 +54,9 @@ class Micro:
             base.anchor,
         )
 
-    def trained(self, rule, examples, recording=ALL):
-        rates = tuple(PEAK[type(rule)] * part for part in SHAPE)
+    def trained(self, examples, recording=ALL, rule=RULE):
         return train(
-            rule, flatten(self.like), self.rows, rates,
+            rule, flatten(self.like), self.rows, RATES,
             lambda theta, rows: examples.gradient(theta, self.like, rows), recording,
         )  # fmt: skip
 
@@ -69,9 +67,9 @@ class Micro:
         point = theta.detach().requires_grad_()
         return torch.autograd.grad(sum(t(unflatten(point, self.like)) for t in self.validation), point)[0]
 
-    def accumulated(self, rule, how=EXACT, examples=None, recording=ALL, **wanted):
+    def accumulated(self, how=EXACT, examples=None, recording=ALL, rule=RULE, **wanted):
         examples = examples or self.examples
-        made = self.trained(rule, examples, recording)
+        made = self.trained(examples, recording, rule)
         generator = torch.Generator().manual_seed(0)
         return how.accumulate(made, examples, self.like, self.slope(made.end), generator, **wanted)
 

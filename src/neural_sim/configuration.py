@@ -53,6 +53,8 @@ GONE: dict[str, str] = {
     "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
     "solver=neumann": "want solver=cg, or solver=minres for indefinite systems",
     "solver=nystrom": "want solver=cg, or solver=minres for indefinite systems",
+    "outer.update._target_=neural_sim.parameter.update.Adam": "want neural_sim.parameter.update.Mirror or SGD",
+    "outer.light_update._target_=neural_sim.parameter.update.Adam": "want neural_sim.parameter.update.Mirror or SGD",
     "baseline=random_search": "want baseline=lts, which learns from the same rewards",
     "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
 }

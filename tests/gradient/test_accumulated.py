@@ -9,7 +9,7 @@ import pytest
 import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
-from neural_sim.detector.optimiser import SGD, AdamW
+from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
@@ -61,9 +61,9 @@ def up_to_a_constant(values):
 
 @pytest.mark.parametrize("per_step", [0, 5])  # 5: more than there are
 def test_all_probes_in_all_steps_are_the_sum_of_their_scores(micro, per_step):
-    made = micro.trained(RULE, micro.examples)
+    made = micro.trained(micro.examples)
     how = dataclasses.replace(EXACT, probes_per_step=per_step, chunk_size=3)
-    found = micro.accumulated(RULE, how, probes=ProbeGroups(micro.cached.losses, [GROUP]))
+    found = micro.accumulated(how, probes=ProbeGroups(micro.cached.losses, [GROUP]))
     expected = up_to_a_constant(all_scores(micro, made).sum(0))
     assert found.scored == 6 * 8
     # Probes are scored by central differences: eps^(2/3) times third derivatives of the losses.
@@ -73,7 +73,7 @@ def test_all_probes_in_all_steps_are_the_sum_of_their_scores(micro, per_step):
 @pytest.mark.parametrize(("per_step", "every"), [(1, 1), (1, 2), (1, 4), (2, 3)])
 def test_a_few_probes_a_step_are_unbiased(micro, per_step, every):
     """The mean of the bins' means over many draws lies within four standard errors of all scores' sum."""
-    made = micro.trained(RULE, micro.examples)
+    made = micro.trained(micro.examples)
     scores = all_scores(micro, made)
     expected = up_to_a_constant(scores.sum(0).view(4, 2).mean(1))
     generator, drawn = torch.Generator().manual_seed(11), []
@@ -91,7 +91,7 @@ def test_a_few_probes_a_step_are_unbiased(micro, per_step, every):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_walk_scores_the_probes_that_were_drawn(micro, seed):
     """The same draw of places and steps, by hand from all scores; two groups share places and keep their own means."""
-    made = micro.trained(RULE, micro.examples)
+    made = micro.trained(micro.examples)
     scores = all_scores(micro, made)
     # Blocks of 6 / 4 steps on average, rounded up.
     how = Unrolled("reverse_over_reverse", probes_per_step=1, scored_steps=4, floor=0.0)
@@ -141,7 +141,7 @@ def test_the_standard_error_counts_the_probes_and_the_few_that_are_scored(genera
     examples = Examples((design,), lambda p, x, rows: torch.tanh(x[0] @ p["w"]).square())
     rows = tuple(torch.randperm(5, generator=generator)[:2] for _ in range(steps))
     made = train(
-        SGD(), like["w"], rows, (0.02,) * steps, lambda theta, index: examples.gradient(theta, like, index)
+        RULE, like["w"], rows, (0.02,) * steps, lambda theta, index: examples.gradient(theta, like, index)
     )
     strata, how = torch.arange(bins).repeat_interleave(per_bin), Unrolled(scored_steps=12 // every)
     values, errors = [], []
@@ -199,7 +199,7 @@ def test_stratified_is_the_derivative_over_hard_bins_of_the_training_that_was_ru
 
 
 def test_the_score_function_takes_the_derivative_by_the_images_weights(micro):
-    found = micro.accumulated(RULE)
+    found = micro.accumulated()
     images = images_of(torch.full((8,), 1 / 8, dtype=DOUBLE))
     ours = ReinforceEstimator().accumulated(found, images, {})
     theirs = reinforce(8.0 * found.images, lambda psi: DISTRIBUTION.log_prob(psi, images.draw), PSI, 1.0)

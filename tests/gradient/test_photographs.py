@@ -6,15 +6,13 @@ import dataclasses
 
 import pytest
 import torch
-from recorded_training import DOUBLE, EXACT, NAMES, PEAK, RULES, SHAPE, STEP, Micro, extrapolated
+from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
-from neural_sim.detector.trajectory import train
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.solver.flatten import flatten
 from neural_sim.types import SceneDraw
 
 BINS = torch.tensor([0, 1, 2, 0, 1, 2])  # of images 0 to 5; 6 and 7 are photographs
@@ -32,17 +30,14 @@ class Mixed(Micro):
         self.rows = tuple(torch.cat([drawn, torch.tensor(own, dtype=torch.long)]) for own in photographs)
         self.examples = dataclasses.replace(self.examples, drawn=6)
 
-    def trained_at(self, rule, psi):
+    def trained_at(self, psi):
         """The training whose drawn images have the weights p_b / n_b times their number, that is on average over draws
         from p_psi; photographs have weight 1."""
         weights = torch.ones(8, dtype=DOUBLE)
         p = DISTRIBUTION.factors[0].log_probabilities(psi).exp()
         weights[:6] = 6 * (p / torch.bincount(BINS))[BINS]
-        examples, rates = self.weighted(weights), tuple(PEAK[type(rule)] * part for part in SHAPE)
-        return examples, train(
-            rule, flatten(self.like), self.rows, rates,
-            lambda theta, rows: examples.gradient(theta, self.like, rows),
-        )  # fmt: skip
+        examples = self.weighted(weights)
+        return examples, self.trained(examples)
 
 
 def images_of_object(psi):
@@ -53,12 +48,11 @@ def images_of_object(psi):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("rule", RULES, ids=NAMES)
 @pytest.mark.parametrize("proximal", [0.0, 0.5])
-def test_the_stratified_derivative_counts_photographs_in_the_training_alone(rule, proximal):
+def test_the_stratified_derivative_counts_photographs_in_the_training_alone(proximal):
     """Probes are the drawn images themselves, so that their mean scores are exact."""
     problem = Mixed(proximal)
-    examples, made = problem.trained_at(rule, PSI)
+    examples, made = problem.trained_at(PSI)
     examples = dataclasses.replace(examples, drawn=6)
     order = BINS.argsort(stable=True).view(3, 2)
     how = dataclasses.replace(EXACT, probes_per_step=0)
@@ -71,20 +65,19 @@ def test_the_stratified_derivative_counts_photographs_in_the_training_alone(rule
     for direction in torch.eye(3, dtype=DOUBLE):
 
         def outcome(step, direction=direction):
-            return problem.outer(problem.trained_at(rule, PSI + step * direction)[1].end)
+            return problem.outer(problem.trained_at(PSI + step * direction)[1].end)
 
         difference = extrapolated(outcome, STEP)
         assert float(found @ direction) == pytest.approx(difference, rel=1e-6, abs=1e-6 * float(found.norm()))
 
 
-@pytest.mark.parametrize("rule", RULES, ids=NAMES)
-def test_the_derivative_by_the_weights_of_drawn_images_is_that_of_the_same_training(rule, generator):
+def test_the_derivative_by_the_weights_of_drawn_images_is_that_of_the_same_training(generator):
     problem = Mixed()
     direction = torch.cat([torch.randn(6, generator=generator, dtype=DOUBLE), torch.zeros(2, dtype=DOUBLE)])
-    found = float(problem.accumulated(rule).images @ direction)
+    found = float(problem.accumulated().images @ direction)
 
     def outcome(step):
-        return problem.outer(problem.trained(rule, problem.weighted(1.0 + step * direction)).end)
+        return problem.outer(problem.trained(problem.weighted(1.0 + step * direction)).end)
 
     # Some entries' gradients are smaller here than in the batches that STEP is for, and AdamW bends within them.
     assert found == pytest.approx(extrapolated(outcome, STEP / 100), rel=1e-6)
@@ -92,13 +85,11 @@ def test_the_derivative_by_the_weights_of_drawn_images_is_that_of_the_same_train
 
 def test_forward_differences_stand_for_exact_products():
     """As without photographs, the order eps^(1/2) times second derivatives a step."""
-    problem, rule = Mixed(0.5), RULES[2]
+    problem = Mixed(0.5)
     probes = ProbeGroups(problem.cached.losses, [BINS.argsort(stable=True).view(3, 2)])
     settings = {"probes_per_step": 0, "scored_steps": 0}
     exact, near = (
-        problem.accumulated(
-            rule, Unrolled(product=product, **settings), probes=probes, wanted="probes"
-        ).probes
+        problem.accumulated(Unrolled(product=product, **settings), probes=probes, wanted="probes").probes
         for product in ("reverse_over_reverse", "forward_difference")
     )
     assert float((near - exact).norm()) < 1e-5 * float(exact.norm())

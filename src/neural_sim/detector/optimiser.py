@@ -1,35 +1,19 @@
 """Optimiser steps as pure functions of flat vectors, differentiated to reverse a training.
 
-A state is theta, then the rule's buffers. A step consists of elementwise operations of torch, whose derivative autograd
-knows.
+A state is theta, then the optimiser's buffers. A step consists of elementwise operations of torch, whose derivative
+autograd knows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 State = tuple[Tensor, ...]
-
-
-class Rule(Protocol):
-    """One optimiser. ``step`` takes the batch's gradient, the learning rate and the number of steps done before it."""
-
-    def begin(self, theta: Float[Tensor, "n"]) -> State: ...
-
-    def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State: ...
-
-    def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> Self:
-        """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``; itself for a
-        ``fraction`` of 0, or a rule that divides by nothing. ``sizes`` are the numbers of entries of theta's tensors,
-        in their order.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -59,8 +43,11 @@ class AdamW:
         return theta, first, second
 
     def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> AdamW:
-        """With a least denominator of ``fraction`` times the larger of the entry's in the last step and the root mean
-        square of those of its tensor.
+        """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``.
+
+        Its least denominator is ``fraction`` times the larger of the entry's in the last step and the root mean square
+        of those of its tensor; itself for a ``fraction`` of 0. ``sizes`` are the numbers of entries of theta's tensors,
+        in their order.
 
         Where an entry's gradients have been tiny so far (a level of the pyramid before the first batch with an object
         of its size), a step is the moments' ratio, whatever their size, and its derivative is about 1 / |g|: thousands
@@ -77,30 +64,8 @@ class AdamW:
         return replace(self, floor=fraction * torch.maximum(usual, torch.cat(levels)))
 
 
-@dataclass(frozen=True)
-class SGD:
-    """Gradient descent as ``torch.optim.SGD`` steps: weight decay joins the gradient, momentum is heavy-ball.
-
-    ``weight_decay`` is one number, or one for each entry of theta. The buffer is the momentum's.
-    """
-
-    weight_decay: float | Float[Tensor, "n"] = 0.0
-    momentum: float = 0.0
-
-    def begin(self, theta: Float[Tensor, "n"]) -> State:
-        return theta, torch.zeros_like(theta)
-
-    def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
-        theta, buffer = state
-        buffer = self.momentum * buffer + gradient + self.weight_decay * theta
-        return theta - rate * buffer, buffer
-
-    def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> SGD:
-        return self
-
-
 def pulled_back(
-    rule: Rule,
+    rule: AdamW,
     state: State,
     gradient: Float[Tensor, "n"],
     rate: float,

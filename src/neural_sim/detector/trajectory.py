@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.detector.optimiser import Rule, State
+from neural_sim.detector.optimiser import AdamW, State
 
 logger = logging.getLogger(__name__)
 GradientAt = Callable[[Tensor, Tensor], Tensor]
@@ -71,7 +71,7 @@ class Trajectory:
     ``gradients`` those of all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
     """
 
-    rule: Rule
+    rule: AdamW
     rows: tuple[Int[Tensor, "batch"], ...]
     rates: tuple[float, ...]
     checkpoints: Mapping[int, State]
@@ -134,7 +134,7 @@ class Recorder:
         ValueError: the states do not fit ``recording.max_memory_mb``.
     """
 
-    def __init__(self, recording: Recording, rule: Rule, steps: int, theta: Float[Tensor, "n"]) -> None:
+    def __init__(self, recording: Recording, rule: AdamW, steps: int, theta: Float[Tensor, "n"]) -> None:
         self.rule = rule
         self._first = recording.first(steps)
         self._length = segment_length(steps - self._first)
@@ -165,7 +165,7 @@ class Recorder:
 
 
 def train(
-    rule: Rule,
+    rule: AdamW,
     theta: Float[Tensor, "n"],
     rows: tuple[Int[Tensor, "batch"], ...],
     rates: tuple[float, ...],

@@ -132,7 +132,7 @@ def reversed_steps(
     recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as ``central_difference``);
     ``central_difference``, two gradients at ``theta +- h a``, of relative error eps^(2/3); ``reverse_over_reverse``,
     exact, at the time of three and a half gradients and the memory of a second derivative. ``floor`` is the fraction of
-    :meth:`detector.optimiser.Rule.floored`; at 0 the derivative is that of the training.
+    :meth:`detector.optimiser.AdamW.floored`; at 0 the derivative is that of the training.
 
     Raises:
         ValueError: an unknown product, or a slope of another length than theta.

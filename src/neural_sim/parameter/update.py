@@ -40,15 +40,14 @@ class UpdateState:
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
-def check_rates(learning_rate: float, max_step: float | None, **rates: float) -> None:
+def check_rates(learning_rate: float, max_step: float | None, momentum: float) -> None:
     """Raises ``ValueError`` for a setting out of its range, with its key."""
     if not learning_rate > 0.0:
         raise ValueError(f"learning_rate must be positive, got {learning_rate}")
     if max_step is not None and not max_step > 0.0:
         raise ValueError(f"max_step must be positive, got {max_step}")
-    for name, rate in rates.items():
-        if not 0.0 <= rate < 1.0:
-            raise ValueError(f"{name} must lie in [0, 1), got {rate}")
+    if not 0.0 <= momentum < 1.0:
+        raise ValueError(f"momentum must lie in [0, 1), got {momentum}")
 
 
 def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:
@@ -90,7 +89,7 @@ class SGD:
     max_step: float | None = None
 
     def __post_init__(self) -> None:
-        check_rates(self.learning_rate, self.max_step, momentum=self.momentum)
+        check_rates(self.learning_rate, self.max_step, self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
@@ -100,32 +99,6 @@ class SGD:
         step = -self.learning_rate * velocity
         moved = psi + (step if self.max_step is None else bound(step, self.max_step))
         return _accept(psi, moved, state, velocity, state.second, state.noise)
-
-
-@dataclass(frozen=True)
-class Adam:
-    """Adam (Kingma and Ba 2015) on psi, its steps bounded by ``max_step``."""
-
-    learning_rate: float = 0.3
-    betas: tuple[float, float] = (0.8, 0.95)
-    epsilon: float = 1e-12
-    max_step: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_rates(self.learning_rate, self.max_step, beta1=self.betas[0], beta2=self.betas[1])
-
-    def step(
-        self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
-    ) -> tuple[Tensor, UpdateState]:
-        """Psi after one step, and the state to pass to the next."""
-        beta1, beta2 = self.betas
-        steps = state.steps + 1
-        first = beta1 * state.first + (1 - beta1) * gradient
-        second = beta2 * state.second + (1 - beta2) * gradient.square()
-        unbiased = first / (1 - beta1**steps)
-        scale = (second / (1 - beta2**steps)).sqrt() + self.epsilon
-        moved = psi + bound(-self.learning_rate * unbiased / scale, self.max_step)
-        return _accept(psi, moved, state, first, second, state.noise)
 
 
 @dataclass(frozen=True)
@@ -148,7 +121,7 @@ class Mirror:
     shrink: bool = True
 
     def __post_init__(self) -> None:
-        check_rates(self.learning_rate, self.max_step, momentum=self.momentum)
+        check_rates(self.learning_rate, self.max_step, self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
@@ -187,4 +160,4 @@ def shrinkage(
     return torch.where(torch.isfinite(variance), factors, torch.ones_like(factors))
 
 
-Update = SGD | Adam | Mirror
+Update = SGD | Mirror

@@ -19,7 +19,7 @@ from neural_sim.outer.settings import OnUntrusted, Outer
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.parameter.update import SGD, Adam, Mirror, Update, UpdateState
+from neural_sim.parameter.update import SGD, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
@@ -34,7 +34,6 @@ from neural_sim.types import PinholeCamera
 FLOOR, MAX_STEP = 0.005, 0.5
 UPDATES: dict[str, Callable[[float], Update]] = {
     "sgd": lambda rate: SGD(learning_rate=rate, max_step=MAX_STEP),
-    "adam": lambda rate: Adam(learning_rate=rate, max_step=MAX_STEP),
     "mirror": lambda rate: Mirror(learning_rate=rate, max_step=MAX_STEP),
 }
 RATES = (1e-6, 1e-3, 1.0, 1e3)
