@@ -13,7 +13,7 @@ from neural_sim.detector.training import train_detector
 from neural_sim.main import build, conf_directory, context_of
 from neural_sim.randomness import stream
 from neural_sim.stages.graph import Graph
-from neural_sim.target.sets import RenderedTarget
+from neural_sim.target.rendered import RenderedTarget
 from neural_sim.tasks.walk import walk
 
 SMALL = [

@@ -11,9 +11,10 @@ from PIL import Image
 from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.target.camera import GivenCamera, TargetCamera, camera_of_entry
 from neural_sim.target.coco import CocoTarget
-from neural_sim.target.sets import RenderedTarget
+from neural_sim.target.rendered import RenderedTarget
 from neural_sim.types import PinholeCamera
 
+RENDERED = RenderedTarget()
 ENTRY = {"width": 64, "height": 48, "fx": 80.0, "fy": 72.0, "cx": 30.0, "cy": 25.0}
 
 
@@ -27,17 +28,17 @@ def labels(folder, **changes):
 
 
 def test_nothing_said_is_the_square_camera_of_the_views():
-    assert GivenCamera().camera(96, 40.0, None) == PinholeCamera(96, 96, math.radians(40.0))
-    assert GivenCamera(96, 64).camera(10, 30.0, None) == PinholeCamera(96, 64, math.radians(30.0))
-    assert GivenCamera(field_of_view_deg=50.0).camera(8, 40.0, None).field_of_view == math.radians(50.0)
+    assert GivenCamera().camera(96, 40.0, RENDERED) == PinholeCamera(96, 96, math.radians(40.0))
+    assert GivenCamera(96, 64).camera(10, 30.0, RENDERED) == PinholeCamera(96, 64, math.radians(30.0))
+    assert GivenCamera(field_of_view_deg=50.0).camera(8, 40.0, RENDERED).field_of_view == math.radians(50.0)
 
 
 def test_a_camera_matrix_is_opencvs():
-    made = GivenCamera(96, 64, fx=120.0, fy=110.0, cx=40.0, cy=35.5).camera(8, 40.0, None)
+    made = GivenCamera(96, 64, fx=120.0, fy=110.0, cx=40.0, cy=35.5).camera(8, 40.0, RENDERED)
     assert (made.width, made.height) == (96, 64)
     assert focal_lengths(made) == pytest.approx((120.0, 110.0), rel=1e-14)
     assert principal_point(made) == (40.5, 36.0)  # OpenCV's origin is the middle of the first pixel
-    assert principal_point(GivenCamera(96, 64, fx=120.0).camera(8, 40.0, None)) == (48.0, 32.0)
+    assert principal_point(GivenCamera(96, 64, fx=120.0).camera(8, 40.0, RENDERED)) == (48.0, 32.0)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +93,7 @@ def test_targets_without_a_camera_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"labels.json: camera=from_target wants an entry 'camera'"):
         TargetCamera().camera(8, 40.0, CocoTarget(path))
     with pytest.raises(ValueError, match=r"from_target wants a target .* got RenderedTarget"):
-        TargetCamera().camera(8, 40.0, RenderedTarget())
+        TargetCamera().camera(8, 40.0, RENDERED)
     with pytest.raises(ValueError, match=r"camera\.width must be at least 1"):
         TargetCamera(0)
 

@@ -13,8 +13,7 @@ from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.training_set import Synthesizer
-from neural_sim.target.rendered import render_target
-from neural_sim.target.sets import RenderedTarget
+from neural_sim.target.rendered import RenderedTarget, render_target
 from neural_sim.types import PinholeCamera, SceneDraw
 
 CAMERA = PinholeCamera(32, 32, 0.7)

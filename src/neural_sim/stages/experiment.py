@@ -21,6 +21,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.meshes import ObjectSource
 from neural_sim.stages.psi import Method
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
 
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
@@ -54,7 +55,7 @@ class Imaging:
     field: FieldRecipe
     renderer: NerfRenderer
     synthesis: Synthesizer
-    target: Any
+    target: Target
     camera: PinholeCamera
     distribution: SceneDistribution
 
@@ -103,7 +104,7 @@ class Experiment:
                 "outer.train_first=false takes the first hypergradient at the warm start: want "
                 f"training.warm_start=initial, got {self.training.warm_start}"
             )
-        if score == "AP" and not getattr(self.imaging.target, "boxed", True):
+        if score == "AP" and not self.imaging.target.boxed:
             raise ValueError(
                 f"target: its photographs have no boxes, want task=classification, got task={task}"
             )

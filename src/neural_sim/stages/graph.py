@@ -55,7 +55,7 @@ class Graph:
                 f"biased or outer.learned names {sorted(unknown)}, objects are {list(self.names)}"
             )
         real = self.experiment.training.real
-        if real.used and not getattr(imaging.target, "trains", False):
+        if real.used and not imaging.target.trains:
             raise ValueError(
                 f"training.real.mode={real.mode} wants labelled photographs: set target.train_fraction (of a target of "
                 "photographs) or target.train_per_object (of a rendered one)"
@@ -144,7 +144,7 @@ class Graph:
     @property
     def renders_target(self) -> bool:
         """Whether the target's images are rendered; otherwise they are photographs."""
-        return getattr(self.experiment.imaging.target, "renders", True)
+        return self.experiment.imaging.target.renders
 
     def symmetry(self, name: str, angle: str) -> SymmetryStage:
         """Of an object's bins of an angle."""
@@ -209,9 +209,8 @@ class Graph:
         how many photographs train, whatever was asked for, where the target knows how many it has.
         """
         x, real = self.experiment, self.experiment.training.real
-        count = getattr(x.imaging.target, "training_count", None)
-        if real.used and count is not None:
-            real = real.of(count(x.run.seed))
+        if real.used and (count := x.imaging.target.training_count(x.run.seed)) is not None:
+            real = real.of(count)
         return replace(x.training, warm_start="initial", real=real)
 
     def _detector(

@@ -90,7 +90,7 @@ class NerfVsMeshStep:
         x, begun = context.experiment, time.time()
         if not isinstance(context.graph.objects, Meshes):
             raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
-        if not getattr(x.imaging.target, "renders", True):
+        if not x.imaging.target.renders:
             raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")
         graphs, results = graphs_of_seeds(context, self.seeds), results_of_study(context)
         kinds = {"single": self.single, "multiple": self.multiple}

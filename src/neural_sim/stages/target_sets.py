@@ -1,10 +1,10 @@
-"""Stage ``target_sets``: the labelled target images, in parts that steer psi, are scored, and train detectors."""
+"""Stage ``target_sets``: labelled target images for validation, for scores, and for training."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -15,13 +15,14 @@ from neural_sim.stages.meshes import Objects
 from neural_sim.stages.pixels import from_bytes, to_bytes
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.base import Target
 from neural_sim.types import LabelledImages, PinholeCamera
 
 
 @dataclass(frozen=True)
 class TargetSets:
-    """``val`` steers psi, ``test`` is scored, ``train`` trains detectors where ``training.real`` asks for it (None:
-    there is no such part); they share no image.
+    """Disjoint parts: ``val`` is what psi is learned on, ``test`` is scored once, ``train`` trains detectors if
+    ``training.real`` asks for it (None: no such part).
     """
 
     val: LabelledImages
@@ -31,14 +32,16 @@ class TargetSets:
 
 @dataclass(frozen=True)
 class TargetSetsStage(Stage[TargetSets]):
-    """The sets of a configured target; ``contents`` are the digests of the objects by name. ``fields`` are those of
-    objects that there are no meshes of, where the target renders them.
+    """The sets of a configured target.
+
+    ``contents`` are the digests of the objects by name; ``fields`` stand in for meshes where the target renders objects
+    that have none.
     """
 
     name: ClassVar[str] = "target_sets"
     kind: ClassVar[str] = "target"
 
-    target: Any
+    target: Target
     contents: Mapping[str, str]
     distribution: SceneDistribution
     synthesizer: Synthesizer

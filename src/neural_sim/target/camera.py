@@ -1,27 +1,34 @@
-"""The camera of synthesis and of rendered target images: as given, or the one that took the target's photographs."""
+"""The camera of synthesised and of rendered target images: given, or that of the target's photographs."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
+
+from typing_extensions import override
 
 from neural_sim.cameras import opencv_camera, resized
+from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
 
 
 class CameraSource(Protocol):
     """What a configured camera is made from."""
 
-    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
-        """``image_size`` (pixels) is the side of a square image where no size is given, ``field_of_view_deg`` what is
-        taken where neither a field of view nor a focal length is; ``target`` is the run's target.
+    def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:
+        """Return the camera.
+
+        Args:
+            image_size: side of a square image in pixels, for a source that gives no size.
+            field_of_view_deg: vertical field of view, for a source that gives neither this nor a focal length.
+            target: the run's target.
         """
         ...
 
 
 @dataclass(frozen=True)
-class GivenCamera:
+class GivenCamera(CameraSource):
     """A camera by its field of view or by its OpenCV camera matrix.
 
     Args:
@@ -54,10 +61,13 @@ class GivenCamera:
             raise ValueError(
                 f"camera: want fx or field_of_view_deg, got {self.fx} and {self.field_of_view_deg}"
             )
-        self.camera(64, 40.0, None)  # numbers out of their range are refused here
+        self._made(64, 40.0)  # numbers out of their range are refused here
 
-    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
-        """See :class:`CameraSource`."""
+    @override
+    def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:
+        return self._made(image_size, field_of_view_deg)
+
+    def _made(self, image_size: int, field_of_view_deg: float) -> PinholeCamera:
         width = image_size if self.width is None else self.width
         height = image_size if self.height is None else self.height
         if self.fx is not None:
@@ -68,8 +78,8 @@ class GivenCamera:
 
 
 @dataclass(frozen=True)
-class TargetCamera:
-    """The camera that took the target's photographs, its images scaled down to a size that the detector is for.
+class TargetCamera(CameraSource):
+    """The camera that took the target's photographs, with images scaled to the detector's size.
 
     Args:
         width: of the detector's images, in pixels, with the height in proportion; null: the photographs' own.
@@ -84,22 +94,16 @@ class TargetCamera:
         if self.width is not None and self.width < 1:
             raise ValueError(f"camera.width must be at least 1 or null, got {self.width}")
 
-    def camera(self, image_size: int, field_of_view_deg: float, target: Any) -> PinholeCamera:
-        """See :class:`CameraSource`."""
-        read = getattr(target, "camera", None)
-        if not callable(read):
-            raise ValueError(
-                "camera=from_target wants a target with a camera of its own (target=ycb_video, bop, or coco with an "
-                f"entry 'camera' in its file), got {type(target).__name__}"
-            )
-        own = cast(PinholeCamera, read())
+    @override
+    def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:
+        own = target.camera()
         if self.width is None:
             return own
         return resized(own, self.width, max(1, round(own.height * self.width / own.width)))
 
 
 def camera_of_entry(entry: Any, where: str) -> PinholeCamera:
-    """The camera of a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (OpenCV, pixels).
+    """Return the camera of a mapping with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (OpenCV, pixels).
 
     Raises:
         ValueError: a key that is missing, unknown (photographs with distortion have to be undistorted first) or no

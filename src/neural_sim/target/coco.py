@@ -19,6 +19,7 @@ from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, large_enough
+from neural_sim.target.base import Target
 from neural_sim.target.bin_attribute import bins_of
 from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
@@ -44,7 +45,7 @@ class _Read:
 
 
 @dataclass(frozen=True)
-class CocoTarget:
+class CocoTarget(Target):
     """Photographs with a COCO ``annotations`` file, letterboxed to the detector's image size.
 
     Args:

@@ -20,6 +20,7 @@ from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble
+from neural_sim.target.base import Target
 from neural_sim.target.groups import ATTRIBUTE, groups_of
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.near_duplicates import thumbnail
@@ -34,7 +35,7 @@ Unmatched = Literal["refuse", "leave_out"]
 
 
 @dataclass(frozen=True)
-class FolderTarget:
+class FolderTarget(Target):
     """Photographs ``<root>/<class>/...`` at any depth, letterboxed to the classifier's image size. They have no boxes:
     an image's box is the whole photograph.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +23,7 @@ from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.assembling import Photo, assemble, boxes_by_bin, large_enough
+from neural_sim.target.base import Target
 from neural_sim.target.frames import Frame, FrameName, Listed, opened
 from neural_sim.target.letterbox import letterbox
 from neural_sim.target.split import check_fraction, evenly, for_training, split
@@ -35,7 +36,7 @@ Unmatched = Literal["refuse", "leave_out"]
 
 
 @dataclass(frozen=True)
-class PosedTarget(ABC):
+class PosedTarget(Target):
     """Photographs with poses, letterboxed to the detector's image size.
 
     Args:

@@ -1,27 +1,100 @@
-"""Labelled images rendered from the objects themselves, at given scene parameters."""
+"""The target set of a controlled experiment: the objects themselves, rendered at the target distribution."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.cameras import cameras_of, orbit
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.assembly import RenderedObject, Shared
-from neural_sim.synthesis.layout import Layout
+from neural_sim.synthesis.layout import Layout, draw_layout, own_labels
 from neural_sim.synthesis.training_set import Synthesizer, images_without_boxes
+from neural_sim.target.base import Target
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 _log = logging.getLogger(__name__)
 
 # Views rendered and composed together, which bounds the memory. Part of what a seed means, so not a setting.
 CHUNK = 64
+
+
+@dataclass(frozen=True)
+class RenderedTarget(Target):
+    """Images rendered at the target distribution, each part with random numbers of its own.
+
+    Args:
+        val_per_object: images of each object to learn psi on.
+        test_per_object: images of each object to score.
+        test_per_biased_object: the same for objects that some parameter's ``biased`` names, whose scores are compared.
+        train_per_object: images that stand for labelled photographs in training (``training.real``); 0: none do.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    renders: ClassVar[bool] = True
+    val_per_object: int = 50
+    test_per_object: int = 100
+    test_per_biased_object: int = 200
+    train_per_object: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("val_per_object", "test_per_object", "test_per_biased_object"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"target.{name} must be at least 1, got {getattr(self, name)}")
+        if self.train_per_object < 0:
+            raise ValueError(f"target.train_per_object must be at least 0, got {self.train_per_object}")
+
+    @property
+    @override
+    def trains(self) -> bool:
+        return self.train_per_object > 0
+
+    @override
+    def sets(
+        self,
+        objects: Mapping[str, Subject],
+        distribution: SceneDistribution,
+        camera: PinholeCamera,
+        synthesizer: Synthesizer,
+        seed: int,
+        rig: LightRig | None = None,
+    ) -> dict[str, LabelledImages]:
+        biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
+        radii = distribution.radii({name: item.radius for name, item in objects.items()})
+        parts = {}
+        for name in ("val", "test", "train") if self.trains else ("val", "test"):
+            generator = stream(seed, f"target {name}")
+            counts = [self._count(name, item.name in biased) for item in objects.values()]
+            layout = None
+            if synthesizer.several:
+                layout = draw_layout(own_labels(counts), len(objects), synthesizer.count, generator)
+                counts = [len(layout.places(label)[0]) for label in range(len(objects))]
+            draws = []
+            for label, (count, psi) in enumerate(zip(counts, target, strict=True)):
+                drawn = distribution.hard(psi, distribution.draw_noise(count, generator))
+                draws.append(drawn if radii is None else replace(drawn, radius=radii[label]))
+            items = list(objects.values())
+            parts[name] = render_target(items, draws, camera, synthesizer, generator, rig, layout)
+        return parts
+
+    def _count(self, part: str, biased: bool) -> int:
+        """Return the number of an object's images; with several objects an image, of those drawn for this one."""
+        if part != "test":
+            return self.val_per_object if part == "val" else self.train_per_object
+        return self.test_per_biased_object if biased else self.test_per_object
 
 
 def render_target(

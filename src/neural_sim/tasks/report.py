@@ -159,10 +159,12 @@ def _curve(context: Context) -> list[dict[str, Any]]:
 def _identity(context: Context) -> dict[str, Any]:
     """Return what says which runs this one can be compared with."""
     graph, imaging = context.graph, context.experiment.imaging
-    sources = {"background": imaging.synthesis.background, "target": imaging.target}
+    sources: dict[str, Any] = {"background": imaging.synthesis.background}
     if imaging.synthesis.distractors.used:
         sources["distractors"] = imaging.synthesis.distractors
     read = {name: source.digest() for name, source in sources.items() if hasattr(source, "digest")}
+    if (target := imaging.target.digest()) is not None:
+        read["target"] = target
     scored, learned = graph.scores(graph.psi("initial"), "initial"), graph.learned
     code = {"scoring": scored.description["code"], "method": learned.description["code"]}
     test = context.results(graph.targets).test
