@@ -7,9 +7,9 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
-    "types", "alpha", "checks", "digests", "documents", "randomness", "configuration", "cameras", "devices", "objects",
-    "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer",
-    "report", "stages", "tasks", "studies", "main",
+    "types", "alpha", "checks", "digests", "documents", "randomness", "configuration", "ranges", "cameras", "devices",
+    "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline",
+    "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TASKS_IN_STAGES = {
     "methods", "side_by_side", "compare", "experiments", "interpolation", "samples_gallery", "detection_gallery",
@@ -55,7 +55,6 @@ def test_heavy_libraries_stay_in_their_rooms():
         "safetensors": {"detector/saved.py"},
         "jinja2": {"report/page/render.py"},
         "filelock": {"report/tracking.py", "stages/store.py"},
-        "beartype": {"configuration.py"},
         "h5py": {"target/matlab.py"},
         "skimage": {"field/reconstruction.py"},
         "hydra": {"main.py"},

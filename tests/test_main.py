@@ -83,8 +83,8 @@ def test_one_run_from_objects_to_a_report(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("seed=abc", "seed must be"),
-        ("seed=-1", "seed must be"),
+        ("seed=abc", "seed: want"),
+        ("seed=-1", "seed: want"),
         ("stages=[fields]", "unknown stage 'fields'"),
         ("outer.iterations=many", "outer.iterations"),
         ("outer.iterations=0", "outer.iterations"),
@@ -107,7 +107,7 @@ def test_bad_settings_are_refused_in_one_line_that_names_the_key(override, messa
 def test_a_user_error_is_one_line_and_exit_status_two(tmp_path):
     done = _run(tmp_path, "+experiment=pose_gap", "seed=abc")
     assert done.returncode == 2
-    assert done.stderr.strip().splitlines()[-1].startswith("neural-sim: seed must be")
+    assert done.stderr.strip().splitlines()[-1].startswith("neural-sim: seed: want")
     assert "Traceback" not in done.stderr
 
 

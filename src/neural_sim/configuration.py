@@ -1,12 +1,10 @@
-"""Where the configuration files are, and what their values may be."""
+"""Where the configuration files are, and how what is wrong in them is told."""
 
 from __future__ import annotations
 
 import re
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 
 class UserError(ValueError):
@@ -118,47 +116,6 @@ def _with_parents(key: str) -> list[str]:
     """A dotted key and the keys above it, the longest first."""
     parts = key.split(".")
     return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
-
-
-def check_top(plain: Mapping[str, Any]) -> None:
-    """The top level's own values. Raises ``UserError``."""
-    if isinstance(plain["seed"], bool) or not isinstance(plain["seed"], int) or plain["seed"] < 0:
-        raise UserError(f"seed must be a whole number from 0, got {plain['seed']!r}")
-    if not isinstance(plain["stages"], list) or not plain["stages"]:
-        raise UserError(f"stages must be a list of names, got {plain['stages']!r}")
-    parts = isinstance(plain["score_at"], list) and all(
-        type(at) in (int, float) and 0 < at <= 1 for at in plain["score_at"]
-    )
-    if not parts:
-        raise UserError(
-            f"score_at must be a list of parts of the method's iterations in (0, 1], got {plain['score_at']!r}"
-        )
-    if not isinstance(plain["progress"], bool):
-        raise UserError(f"progress must be true or false, got {plain['progress']!r}")
-    if plain["trainer"]["accelerator"] not in ("cpu", "gpu"):
-        raise UserError(f"trainer.accelerator must be cpu or gpu, got {plain['trainer']['accelerator']!r}")
-
-
-def check_fits(value: Any, hint: Any, where: str) -> None:
-    """Raises ``UserError`` for a YAML scalar that does not fit a type hint, naming its key ``where``."""
-    if not _fits(value, hint):
-        raise UserError(f"{where}: want {_type_name(hint)}, got {value!r}")
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a YAML scalar fits a type hint. Lists and mappings are left to the constructor."""
-    if isinstance(value, bool):  # an int to Python, not to a user
-        return hint is Any or bool in (hint, *typing.get_args(hint))
-    if not isinstance(value, (str, int, float, type(None))):
-        return True
-    from beartype import BeartypeConf
-    from beartype.door import is_bearable
-
-    return is_bearable(value, hint, conf=BeartypeConf(is_pep484_tower=True))
-
-
-def _type_name(hint: Any) -> str:
-    return getattr(hint, "__name__", None) if isinstance(hint, type) else str(hint).replace("typing.", "")  # pyright: ignore
 
 
 def first_line(error: BaseException) -> str:

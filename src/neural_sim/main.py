@@ -10,15 +10,13 @@ import logging
 import os
 import re
 import sys
-import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import is_dataclass
-from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypedDict
 
 import hydra
+from annotated_types import MinLen
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
@@ -28,14 +26,13 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from neural_sim.configuration import (
     UserError,
-    check_fits,
-    check_top,
     conf_directory,
     first_line,
     job_folder,
     own_folder,
     updated,
 )
+from neural_sim.ranges import NonNegativeInt, PositiveFraction, check
 
 if TYPE_CHECKING:
     from neural_sim.stages.experiment import Experiment
@@ -56,6 +53,15 @@ _PARTS = (
     "objects", "views", "field", "renderer", "synthesis", "target", "camera", "detector", "solver", "baseline",
     "gradient", "outer", "training", "unlearned", "model",
 )  # fmt: skip
+
+# Types of the top level's own values.
+_TOP = {
+    "seed": NonNegativeInt,
+    "stages": Annotated[list[str], MinLen(1)],
+    "score_at": list[PositiveFraction],
+    "progress": bool,
+    "trainer": TypedDict("Trainer", {"accelerator": Literal["cpu", "gpu"]}),
+}
 
 
 def build(config: DictConfig) -> Experiment:
@@ -171,14 +177,15 @@ def _plain(config: DictConfig) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise UserError(f"the configuration must be a mapping, got {type(plain).__name__}")
     plain = {str(key): value for key, value in plain.items()}
-    check_top(plain)
+    for key, hint in _TOP.items():
+        check(plain[key], hint, key)
     return plain
 
 
 def _instantiate(node: Any, where: str) -> Any:
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise UserError(f"{where}: want a group with a _target_, got {node!r}")
-    _check_arguments(node, where)
+    check(node, Any, where)
     try:
         return hydra.utils.instantiate(dict(node), _convert_="all")
     except Exception as error:  # Hydra wraps whatever the constructor raised
@@ -188,24 +195,6 @@ def _instantiate(node: Any, where: str) -> Any:
         if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
             raise UserError(f"{where}: {first_line(cause)}") from error
         raise
-
-
-def _check_arguments(node: Mapping[str, Any], where: str) -> None:
-    """Keys and scalar types against the constructor's signature, since plain YAML takes anything."""
-    make = hydra.utils.get_object(node["_target_"])
-    known = signature(make).parameters
-    # A dataclass's own hints are resolved where each field was declared, which may be another module.
-    whole = is_dataclass(make) or not isinstance(make, type)
-    hints = typing.get_type_hints(make if whole else make.__init__)
-    for key, value in node.items():
-        if key.startswith("_"):
-            continue
-        if key not in known:
-            raise UserError(f"{where}.{key}: unknown key, want one of {', '.join(known)}")
-        if isinstance(value, Mapping) and "_target_" in value:
-            _check_arguments(value, f"{where}.{key}")
-        else:
-            check_fits(value, hints.get(key, Any), f"{where}.{key}")
 
 
 def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
