@@ -37,11 +37,11 @@ class Accumulated:
     inputs_of: InputsOf | None = None
 
     def cotangents(
-        self, leaves: tuple[Tensor, ...], index: Int[Tensor, "n"], chunk_size: int = 16
-    ) -> tuple[Tensor, ...]:
-        """Derivatives of L_val by images, and by boxes where they move: the vector-Jacobian product of ``inputs_of``.
+        self, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], chunk_size: int = 16
+    ) -> Float[Tensor, "n 3 h w"]:
+        """Derivatives of L_val by images: the vector-Jacobian product of ``inputs_of``.
 
-        ``leaves`` are these images and boxes, of the rows ``index``; ``chunk_size`` rows are differentiated at a time.
+        ``images`` are those of the rows ``index``; ``chunk_size`` of them are differentiated at a time.
 
         Raises:
             ValueError: no derivatives by the inputs were accumulated.
@@ -49,19 +49,18 @@ class Accumulated:
         if not self.inputs or self.inputs_of is None:
             raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
         parts = []
-        chunks = zip(index.split(chunk_size), *(leaf.split(chunk_size) for leaf in leaves), strict=True)
-        for rows, *chunk in chunks:
+        for rows, chunk in zip(index.split(chunk_size), images.split(chunk_size), strict=True):
             rows = rows.to(self.inputs[0].device)
-            chunk_leaves = tuple(part.detach().requires_grad_() for part in chunk)
+            leaf = chunk.detach().requires_grad_()
             with torch.enable_grad():
-                inputs = self.inputs_of(chunk_leaves, rows)
-            # Targets of fixed boxes depend on no image.
+                inputs = self.inputs_of(leaf, rows)
+            # Targets of boxes depend on no image.
             moved = [
                 (x, pulled[rows]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
             ]
             values, pulled = zip(*moved, strict=True)
-            parts.append(torch.autograd.grad(values, chunk_leaves, pulled, materialize_grads=True))
-        return tuple(torch.cat(column) for column in zip(*parts, strict=True))
+            parts.append(torch.autograd.grad(values, leaf, pulled, materialize_grads=True)[0])
+        return torch.cat(parts)
 
 
 @dataclass(frozen=True)

@@ -26,18 +26,10 @@ class IndexedLoss(Protocol):
 
 
 class ImageLoss(Protocol):
-    """Losses of training images, twice differentiable in parameters and images; targets by row ``index``.
-
-    ``boxes``, where given, replace those rows' boxes; the losses are differentiable in them too.
-    """
+    """Losses of training images, twice differentiable in parameters and images; targets by row ``index``."""
 
     def __call__(
-        self,
-        params: Params,
-        images: Float[Tensor, "n 3 h w"],
-        index: Int[Tensor, "n"],
-        boxes: Float[Tensor, "n boxes 4"] | None = None,
-        /,
+        self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
     ) -> Float[Tensor, "n"]: ...
 
 
@@ -64,9 +56,8 @@ class RenderedPath:
 
     ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to premultiplied colour
     [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images with the
-    nuisance bound, ``boxes`` opacity maps to the images' boxes where the boxes' derivative is wanted. ``rgb`` and
-    ``opacity`` are the first render's. ``tangents`` (forward mode only) are the maps' derivatives by
-    the draw's numbers that depend on psi, from that same render.
+    nuisance bound. ``rgb`` and ``opacity`` are the first render's. ``tangents`` (forward mode only) are the maps'
+    derivatives by the draw's numbers that depend on psi, from that same render.
     """
 
     relaxed: Callable[[Float[Tensor, "K"]], SceneDraw]
@@ -76,7 +67,6 @@ class RenderedPath:
     rgb: Float[Tensor, "n h w 3"]
     opacity: Float[Tensor, "n h w"]
     tangents: Mapping[str, Maps] | None = None
-    boxes: Callable[[Float[Tensor, "n h w"]], Float[Tensor, "n boxes 4"]] | None = None
 
 
 @dataclass(frozen=True)

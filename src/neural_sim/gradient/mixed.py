@@ -16,7 +16,7 @@ from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
 from neural_sim.solver.flatten import flatten
 from neural_sim.solver.hvp import difference_length
 
-ThetaMode = Literal["forward", "reverse", "central_difference"]
+ThetaMode = Literal["forward", "central_difference"]
 
 
 def scores(
@@ -30,10 +30,11 @@ def scores(
     """``s_i = <dl_i/dtheta, v>`` of the images in ``index``, at most ``chunk_size`` of them in memory at a
     time.
 
-    ``forward``: one Jacobian-vector product gives a chunk's scores. ``reverse`` differentiates the
-    vector-Jacobian product by its own cotangent, for losses without forward-mode rules. ``central_difference``:
-    the losses at ``theta +- h v``, two plain passes instead of forward mode's four, with an error of relative order
-    eps^(2/3). Raises ``ValueError`` for an unknown mode.
+    ``forward``: one Jacobian-vector product gives a chunk's scores. ``central_difference``: the losses at
+    ``theta +- h v``, two plain passes instead of forward mode's four, with an error of relative order eps^(2/3).
+
+    Raises:
+        ValueError: an unknown mode, or a chunk of no image.
     """
     _check(mode, chunk_size)
     along = _ALONG[mode]
@@ -44,55 +45,39 @@ def scores(
     return torch.cat(parts).detach()
 
 
-def input_cotangents(
+def image_cotangents(
     loss_of: ImageLoss,
     params: Params,
     vector: Params,
-    inputs: tuple[Tensor, ...],
+    images: Float[Tensor, "n 3 h w"],
     index: Int[Tensor, "n"],
     weights: Float[Tensor, "n"],
     chunk_size: int = 16,
-    mode: ThetaMode = "forward",
-) -> tuple[Tensor, ...]:
-    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the cotangents (left factor of Eq. 3 times v) of images (n, 3, h, w) and,
-    where ``inputs`` has them too, boxes.
+) -> Float[Tensor, "n 3 h w"]:
+    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (left factor of Eq. 3 times v).
 
-    ``mode`` says how the inner derivative, in theta, is taken; the outer one, in the inputs, is always reverse.
+    The inner derivative, in theta, is taken in forward mode, the outer one, in the images, in reverse mode.
+
+    Raises:
+        ValueError: a chunk of no image.
     """
-    _check(mode, chunk_size)
-    along = _ALONG[mode]
+    _check("forward", chunk_size)
     if not len(index):
-        return tuple(torch.zeros_like(values) for values in inputs)
+        return torch.zeros_like(images)
     index, weights = index.to(_device(params)), weights.to(_device(params))
     parts = []
-    for rows, weight, *chunk in zip(
-        *(values.split(chunk_size) for values in (index, weights, *inputs)), strict=True
-    ):
-        leaves = [values.detach().requires_grad_() for values in chunk]
+    chunks = zip(*(values.split(chunk_size) for values in (index, weights, images)), strict=True)
+    for rows, weight, chunk in chunks:
+        leaf = chunk.detach().requires_grad_()
         with torch.enable_grad():
-            score = along(lambda p, x=leaves, rows=rows: loss_of(p, x[0], rows, *x[1:]), params, vector)
-            parts.append(torch.autograd.grad(score @ weight.to(score), leaves, materialize_grads=True))
-    return tuple(torch.cat(cotangents).detach() for cotangents in zip(*parts, strict=True))
+            score = _forward_scores(lambda p, x=leaf, rows=rows: loss_of(p, x, rows), params, vector)
+            parts.append(torch.autograd.grad(score @ weight.to(score), leaf, materialize_grads=True)[0])
+    return torch.cat(parts).detach()
 
 
 def _forward_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
     fixed = {name: tensor.detach() for name, tensor in params.items()}
     return torch.func.jvp(losses, (fixed,), ({name: vector[name].detach() for name in fixed},))[1]
-
-
-def _reverse_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
-    leaves = {name: tensor.detach().requires_grad_() for name, tensor in params.items()}
-    with torch.enable_grad():
-        values = losses(leaves)
-        probe = torch.zeros_like(values, requires_grad=True)
-        slopes = torch.autograd.grad(
-            values, list(leaves.values()), probe, create_graph=True, materialize_grads=True
-        )
-        # Linear in the probe, so that its derivative by the probe is the product J v itself.
-        along = torch.stack(
-            [(slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True)]
-        ).sum()
-        return torch.autograd.grad(along, probe, create_graph=True, materialize_grads=True)[0]
 
 
 def _differenced_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
@@ -107,7 +92,7 @@ def _differenced_scores(losses, params: Params, vector: Params) -> Float[Tensor,
     return (losses(above) - losses(below)) * (0.5 / length)
 
 
-_ALONG = {"forward": _forward_scores, "reverse": _reverse_scores, "central_difference": _differenced_scores}
+_ALONG = {"forward": _forward_scores, "central_difference": _differenced_scores}
 
 
 def _device(params: Params) -> torch.device:

@@ -31,7 +31,7 @@ from neural_sim.gradient.base import (
     from_contributions,
     group_sums,
 )
-from neural_sim.gradient.mixed import ThetaMode, input_cotangents
+from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.significance import zero_mean
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import COORDINATES, Relaxation
@@ -57,7 +57,6 @@ class PathwiseEstimator:
         common_backgrounds: the images of a pair share background and shift.
         patch_size: rays in a patch of the reverse mode.
         chunk_size: images whose losses are differentiated at a time.
-        theta_mode: how the inner derivative of the loss, in theta along v, is taken.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.
@@ -71,10 +70,9 @@ class PathwiseEstimator:
     common_backgrounds: bool = False
     patch_size: int = 4096
     chunk_size: int = 16
-    theta_mode: ThetaMode = "forward"
 
     def __post_init__(self) -> None:
-        for key, choice in (("mode", Mode), ("relaxation", Relaxation), ("theta_mode", ThetaMode)):
+        for key, choice in (("mode", Mode), ("relaxation", Relaxation)):
             if getattr(self, key) not in get_args(choice):
                 raise ValueError(
                     f"gradient.{key} must be one of {get_args(choice)}, got {getattr(self, key)!r}"
@@ -114,23 +112,28 @@ class PathwiseEstimator:
             ValueError: images without a path.
         """
         path = _path(images)
-        cotangents = input_cotangents(
-            losses.from_images, params, vector, _inputs(images, path), images.index, images.weights,
-            self.chunk_size, self.theta_mode,
-        )  # fmt: skip
+        cotangents = image_cotangents(
+            losses.from_images,
+            params,
+            vector,
+            _pixels(images),
+            images.index,
+            images.weights,
+            self.chunk_size,
+        )
         return self._through_images(path, cotangents, images)
 
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
         path = _path(images)
-        cotangents = sums.cotangents(_inputs(images, path), images.index, self.chunk_size)
+        cotangents = sums.cotangents(_pixels(images), images.index, self.chunk_size)
         return self._through_images(path, cotangents, images)
 
     def _through_images(
-        self, path: RenderedPath, cotangents: tuple[Tensor, ...], images: ObjectImages
+        self, path: RenderedPath, cotangents: Float[Tensor, "n 3 h w"], images: ObjectImages
     ) -> MixedDerivative:
-        maps = map_cotangents(path, *cotangents)
+        maps = map_cotangents(path, cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
             # The first render computes derivatives by lights in any mode, those by the camera in forward mode only.
@@ -150,24 +153,16 @@ def _path(images: ObjectImages) -> RenderedPath:
     return images.path
 
 
-def _inputs(images: ObjectImages, path: RenderedPath) -> tuple[Tensor, ...]:
-    """The images, and their boxes where these depend on psi."""
+def _pixels(images: ObjectImages) -> Float[Tensor, "n 3 h w"]:
     assert images.images is not None  # as images with a path always have
-    return (images.images, *([] if path.boxes is None else [path.boxes(path.opacity)]))
+    return images.images
 
 
-def map_cotangents(
-    path: RenderedPath,
-    image_cotangents: Float[Tensor, "n 3 h w"],
-    box_cotangents: Float[Tensor, "n boxes 4"] | None = None,
-) -> Maps:
-    """Cotangents of images, and of boxes where they move, pulled back through the compositing onto the maps."""
+def map_cotangents(path: RenderedPath, cotangents: Float[Tensor, "n 3 h w"]) -> Maps:
+    """Pull cotangents of images back through the compositing onto the maps."""
     rgb, opacity = path.rgb.detach().requires_grad_(), path.opacity.detach().requires_grad_()
     with torch.enable_grad():
-        composed, cotangents = [path.compose(rgb, opacity)], [image_cotangents]
-        if path.boxes is not None and box_cotangents is not None:
-            composed.append(path.boxes(opacity))
-            cotangents.append(box_cotangents)
+        composed = path.compose(rgb, opacity)
     return Maps(*torch.autograd.grad(composed, (rgb, opacity), cotangents, materialize_grads=True))
 
 

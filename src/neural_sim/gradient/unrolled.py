@@ -31,7 +31,7 @@ Product = Literal["forward_difference", "central_difference", "reverse_over_reve
 Wanted = Literal["probes", "weights", "inputs"]
 """Sums that an estimator reads: probes' scores only, also derivatives by the training images' weights, or also those by
 the images' inputs."""
-InputsOf = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, ...]]
+InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 
 
 class LossesFrom(Protocol):
@@ -47,8 +47,8 @@ class Examples:
     """A training's examples and their losses.
 
     ``inputs`` [N, ...] are those by which losses are differentiated where images move. Each step's objective was its
-    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images (and
-    from boxes where they move) and their rows. The first ``drawn`` rows were drawn from p_psi, the others (photographs)
+    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images and
+    their rows. The first ``drawn`` rows were drawn from p_psi, the others (photographs)
     do not depend on it; None: all were drawn.
     """
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from jaxtyping import Int
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
@@ -14,28 +13,18 @@ from neural_sim.synthesis.scene import Scene
 from neural_sim.types import SceneDraw
 
 
-def image_losses(
-    detector: Detector, backbone: Parameters, targets: Targets, labels: Int[Tensor, "images boxes"]
-) -> ImageLoss:
-    """Losses of images, differentiable by pixels, and by boxes where those are given."""
+def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> ImageLoss:
+    """Losses of images, differentiable in their pixels."""
 
-    def losses(params: Parameters, chunk: Tensor, index: Tensor, boxes: Tensor | None = None) -> Tensor:
-        wanted = targets.select(index)
-        if boxes is not None:
-            wanted = detector.assign(boxes, labels[index, : boxes.shape[1]])
-        return detector.per_image_loss(params, detector.features(backbone, chunk), wanted)
+    def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
+        return detector.per_image_loss(params, detector.features(backbone, chunk), targets.select(index))
 
     return losses
 
 
-def bound_losses(
-    cached: CachedSet, backbone: Parameters, labels: Int[Tensor, "images boxes"], probes: CachedSet | None
-) -> Losses:
-    """Losses of an iteration's training images, from features and from pixels, and of its probes.
-
-    ``labels`` are those of the training images' boxes.
-    """
-    from_images = image_losses(cached.detector, backbone, cached.targets, labels)
+def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | None) -> Losses:
+    """Losses of an iteration's training images, from features and from pixels, and of its probes."""
+    from_images = image_losses(cached.detector, backbone, cached.targets)
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
 
@@ -55,7 +44,6 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
     def replay(psi: Tensor) -> SceneDraw:
         return scene.distribution.relaxed(psi, noise, relaxed.relaxation)
 
-    moving = scene.synthesizer.label_gradient == "differentiable"
     return RenderedPath(
         relaxed=replay,
         render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays, **light),
@@ -64,7 +52,6 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
         rgb=part.rgb,
         opacity=part.opacity,
         tangents=part.tangents,
-        boxes=(lambda opacity: compose(part.rgb, opacity).boxes) if moving else None,
     )
 
 

@@ -42,7 +42,7 @@ class SimulatorModule(GradientLoop):
             self._recording = self.settings.unrolled.recording
 
     def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
-        trainable, labels = self.inner.trainable, rendered.images.labels
+        trainable = self.inner.trainable
         drawn, weights, device = len(rendered), self.inner.weights(cached), self.inner.device
         subset, subset_weights = curvature_rows(
             drawn, weights, self.settings.curvature_images, self.inner.generator
@@ -59,9 +59,9 @@ class SimulatorModule(GradientLoop):
         learned = {name: by_object[name] for name in self._names}
         if unrolled:
             return self._with_fixed(
-                through_training(self.inner, inner, self.estimator, cached, labels, learned, probed)
+                through_training(self.inner, inner, self.estimator, cached, learned, probed)
             )
-        losses = bound_losses(cached, self.inner.backbone, labels, probed.cached if probed else None)
+        losses = bound_losses(cached, self.inner.backbone, probed.cached if probed else None)
         estimates = {
             name: self._bind(losses, learned[name], probed.probes[label] if probed else {})
             for label, name in zip(self._learned, self._names, strict=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
-from jaxtyping import Int
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
@@ -23,7 +22,6 @@ def through_training(
     problem: InnerProblem,
     estimator: Estimator,
     cached: CachedSet,
-    labels: Int[Tensor, "images boxes"],
     images: Mapping[str, ObjectImages],
     probed: ProbeSet | None,
 ) -> Hypergradient:
@@ -33,7 +31,7 @@ def through_training(
         loop: with the recorded training.
         problem: its objective.
         estimator: of the derivative by psi.
-        cached, labels: its training set, and the labels of the boxes of those images that were drawn from p_psi.
+        cached: its training set.
         images: those of each learned object.
         probed: the probes of all objects.
 
@@ -43,7 +41,7 @@ def through_training(
     if loop.trajectory is None:
         raise ValueError("unrolled: the last training was not recorded; want train(images, recording)")
     examples = Examples(
-        cached.inputs, cached.losses_from, problem.proximal, problem.anchor, inputs_of(loop, cached, labels),
+        cached.inputs, cached.losses_from, problem.proximal, problem.anchor, inputs_of(loop, cached),
         None if loop.photographs is None else loop.drawn(cached),
     )  # fmt: skip
     probes: dict[str, Mapping[str, Probes]] = {name: {} for name in images}
@@ -69,17 +67,10 @@ def through_training(
     )
 
 
-def inputs_of(loop: InnerLoop, cached: CachedSet, labels: Int[Tensor, "images boxes"]) -> InputsOf:
-    """The function that computes a cached set's inputs from drawn images, and from their boxes where those are given
-    too.
-    """
+def inputs_of(loop: InnerLoop, cached: CachedSet) -> InputsOf:
+    """The function that computes a cached set's inputs from drawn images and their rows."""
 
-    def inputs(leaves: tuple[Tensor, ...], rows: Tensor) -> tuple[Tensor, ...]:
-        pixels, *boxes = leaves
-        features = loop.detector.features(loop.backbone, pixels)
-        targets = cached.targets.select(rows)
-        if boxes:
-            targets = loop.detector.assign(boxes[0], labels[rows, : boxes[0].shape[1]])
-        return (*features, targets.deltas)
+    def inputs(pixels: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
+        return (*loop.detector.features(loop.backbone, pixels), cached.targets.select(rows).deltas)
 
     return inputs

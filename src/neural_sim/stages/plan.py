@@ -65,10 +65,8 @@ def _hypergradient(x: Experiment, objects: int) -> Iterator[Omission]:
     if isinstance(estimator.draws, HardDraws):
         why = f"gradient={name} scores images and differentiates none"
         yield Omission("psi", "the renderer's derivative", why, 1.0)
-    elif x.imaging.synthesis.label_gradient == "ignored":
-        yield Omission(
-            "psi", "the boxes' derivative", "synthesis.label_gradient=ignored, as in the paper", 1.0
-        )
+    else:
+        yield Omission("psi", "the boxes' derivative", "boxes are fixed labels, as in the paper", 1.0)
     if outer.learned is not None and len(outer.learned) < objects:
         fraction = 1.0 - len(outer.learned) / objects
         yield Omission(

@@ -140,7 +140,7 @@ class FrozenLoop:
         rendered = self.scene.training_set(self.psi, count, generator, estimator.draws)
         images = rendered.images
         targets = self.detector.assign(images.boxes, images.labels)
-        losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets, images.labels))
+        losses = Losses(_unavailable, image_losses(self.detector, self.backbone, targets))
         # The weights of an object's images sum to 1.
         weights = torch.full((len(images),), len(rendered.objects) / len(images))
         parts = object_images(self.scene, rendered, self.psi, weights).values()

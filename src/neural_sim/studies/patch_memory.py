@@ -15,7 +15,7 @@ from torch import Tensor
 from neural_sim.checks import at_least
 from neural_sim.devices import peak_bytes, synchronise
 from neural_sim.documents import markdown_table
-from neural_sim.gradient.mixed import input_cotangents
+from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
 from neural_sim.outer.binding import image_losses, rendered_path
 from neural_sim.report.tracking import Run
@@ -149,13 +149,12 @@ class _Image:
         rendered = one_each([part], [nuisance], [label], [bins], scene.synthesizer)
         images, first = rendered.images, torch.zeros(1, dtype=torch.long)
         targets = loop.detector.assign(images.boxes, images.labels)
-        losses = image_losses(loop.detector, loop.backbone, targets, images.labels)
-        pulled = input_cotangents(
-            losses, loop.trainable, loop.vector, (images.images,), first, torch.ones(1),
-            mode=estimator.theta_mode,
-        )  # fmt: skip
+        losses = image_losses(loop.detector, loop.backbone, targets)
+        pulled = image_cotangents(
+            losses, loop.trainable, loop.vector, images.images, first, torch.ones(1)
+        )
         path = rendered_path(scene, label, part, rendered.compose[0])
-        return _Image(loop, label, seed, replace(part, tangents=None), map_cotangents(path, *pulled))
+        return _Image(loop, label, seed, replace(part, tangents=None), map_cotangents(path, pulled))
 
     @property
     def device(self) -> torch.device:

@@ -58,19 +58,15 @@ class Synthesizer:
             for it to get a box.
         sensor: blur and noise of the camera.
         distractors: things without a label, behind and in front of the objects.
-        label_gradient: ``ignored`` is the paper's; ``differentiable`` lets boxes carry the derivative of their
-            edges, so that the pathwise gradient sees that regression targets move with the object.
 
     Raises:
-        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, another label_gradient, a
-            range that is none; boxes that move, with several objects an image or with things that hide them.
+        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, or a range that is none.
     """
 
     background: Background
     shift: float = 0.15
     threshold: float = 0.5
     minimum_area: float = 16.0
-    label_gradient: Literal["ignored", "differentiable"] = "ignored"
     objects_per_image: Sequence[int] = (1, 1)
     min_visibility: float = 0.1
     sensor: Sensor = field(default_factory=Sensor)
@@ -87,18 +83,9 @@ class Synthesizer:
             raise ValueError(f"synthesis.minimum_area must not be negative, got {self.minimum_area}")
         if not 0.0 <= self.min_visibility <= 1.0:
             raise ValueError(f"synthesis.min_visibility must lie in [0, 1], got {self.min_visibility}")
-        if self.label_gradient not in ("ignored", "differentiable"):
-            raise ValueError(
-                f"synthesis.label_gradient must be ignored or differentiable, got {self.label_gradient!r}"
-            )
         if len(self.objects_per_image) != 2:
             raise ValueError(
                 f"synthesis.objects_per_image: want fewest and most, got {list(self.objects_per_image)}"
-            )
-        if (self.count.most > 1 or self.distractors.hide) and self.label_gradient == "differentiable":
-            raise ValueError(
-                "synthesis.label_gradient=differentiable wants one object an image and no distractors in front: how a "
-                "box moves with what hides it is not derived"
             )
 
     @property
@@ -141,15 +128,13 @@ class Synthesizer:
     ) -> LabelledImages:
         """One object's images with their boxes, on the device and in the dtype of ``rgb``.
 
-        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes in
-        ``opacity`` if ``label_gradient`` says so. An object that is out of frame or below ``minimum_area`` gives
-        an image without a box.
+        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes are not. An
+        object that is out of frame or below ``minimum_area`` gives an image without a box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
         images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
         if nuisance.front is None:
-            moving = self.label_gradient == "differentiable"
-            boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area, moving)
+            boxes, present = boxes_from_opacity(opacity, self.threshold, self.minimum_area)
         else:
             images, alone = nuisance.front.over(images), opacity.detach()[:, None]
             boxes, visible = self._boxes(alone, alone * _clear(nuisance.front, alone))

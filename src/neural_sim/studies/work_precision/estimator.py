@@ -34,21 +34,16 @@ class Variant:
 
     estimator: PathwiseEstimator
     bin_mean: str = "circular"
-    label_gradient: str = "differentiable"
 
     def of(self, loop: FrozenLoop) -> FrozenLoop:
         """The same state with these settings."""
-        moved = loop.with_factor(dataclasses.replace(loop.bins, bin_mean=self.bin_mean))
-        synthesizer = dataclasses.replace(moved.scene.synthesizer, label_gradient=self.label_gradient)
-        return dataclasses.replace(moved, scene=dataclasses.replace(moved.scene, synthesizer=synthesizer))
+        return loop.with_factor(dataclasses.replace(loop.bins, bin_mean=self.bin_mean))
 
 
 PATHWISE = {
-    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear", "ignored"),
-    "linear": Variant(PathwiseEstimator(), "linear", "ignored"),
-    "circular": Variant(PathwiseEstimator(), "circular", "ignored"),
-    "linear, boxes": Variant(PathwiseEstimator(), "linear"),
-    "circular, boxes": Variant(PathwiseEstimator()),
+    "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear"),
+    "linear": Variant(PathwiseEstimator(), "linear"),
+    "circular": Variant(PathwiseEstimator()),
     "antithetic": Variant(PathwiseEstimator(antithetic=True)),
     "common backgrounds": Variant(PathwiseEstimator(common_backgrounds=True)),
     "straight-through": Variant(PathwiseEstimator(relaxation="straight_through")),
