@@ -24,8 +24,7 @@ from torch import Tensor
 
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.response import response
-from neural_sim.outer.retrained import centred_cosine
+from neural_sim.outer.response import centred_cosine, response
 from neural_sim.report.machine import machine
 from neural_sim.report.section import replace_section
 from neural_sim.solver.adjoint import AdjointSolver

@@ -32,12 +32,6 @@ PAPER = [
     ("gradient.mode", "reverse", EVERY, 'l. 598: "two forward passes over NeRF rendering"'),
     ("gradient.relaxation", "gumbel_softmax", EVERY, "l. 494, Eq. 4"),
     (
-        "synthesis.label_gradient",
-        "ignored",
-        EVERY,
-        "l. 322, footnote: the loss's dependence on labels is dropped",
-    ),
-    (
         "solver.linear._target_",
         "neural_sim.solver.cg.ConjugateGradient",
         EVERY,

@@ -55,6 +55,10 @@ GONE: dict[str, str] = {
     "outer.light_update._target_=neural_sim.parameter.update.Adam": "want neural_sim.parameter.update.Mirror or SGD",
     "baseline=random_search": "want baseline=lts, which learns from the same rewards",
     "baseline=bayes_opt": "want baseline=lts, which learns from the same rewards",
+    "gradient.theta_mode=reverse": "it gained nothing; want forward or central_difference, with gradient=stratified",
+    "outer.certify": "the reference is the response of training; outer.certify_every alone asks for it",
+    "outer.certify_per_bin": "it belonged to outer.certify=retrained, which is a reference of the tests now",
+    "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/numerics.md); boxes are fixed labels",
 }
 """What to say of keys and choices (``key=value``) that no longer exist. A key stands for all keys below it, too."""
 

@@ -197,12 +197,9 @@ class Pipeline:
     def compose(self, rgb, opacity):
         return self.synthesizer.compose(rgb, opacity, self.nuisance, 1, torch.zeros(COUNT, dtype=torch.long))
 
-    def loss_of(self, params, images, index, boxes=None):
+    def loss_of(self, params, images, index):
         features = self.detector.features(self.backbone, images)
-        targets = self.targets.select(index)
-        if boxes is not None:
-            targets = self.detector.assign(boxes, torch.ones(len(boxes), 1, dtype=torch.long))
-        return self.detector.per_image_loss(params, features, targets)
+        return self.detector.per_image_loss(params, features, self.targets.select(index))
 
     def losses(self, params, index):
         features = [level[index] for level in self.features]

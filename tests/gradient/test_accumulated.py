@@ -218,7 +218,7 @@ def test_pathwise_is_the_derivative_of_the_training_on_images_that_move(problem,
         images = problem.images(psi).detach()
         return Examples(
             (images,), lambda p, inputs, index: problem.loss_of(p, inputs[0], index), 0.3, anchor,
-            lambda leaves, index: leaves,
+            lambda images, index: (images,),
         )  # fmt: skip
 
     def trained(psi):
@@ -248,8 +248,8 @@ def test_pathwise_goes_through_the_backbone_once_for_all_steps(pipeline):
     rates, every = (3e-3, 5e-3, 4e-3, 2e-3), [torch.tensor([0, 2]), torch.tensor([1, 3])] * 2
     labels = pipeline.targets.labels
 
-    def inputs_of(leaves, rows):
-        return (*pipeline.detector.features(pipeline.backbone, leaves[0]), pipeline.targets.deltas[rows])
+    def inputs_of(images, rows):
+        return (*pipeline.detector.features(pipeline.backbone, images), pipeline.targets.deltas[rows])
 
     def losses(params, inputs, rows):
         return pipeline.detector.per_image_loss(params, inputs[:-1], Targets(labels[rows], inputs[-1]))
@@ -257,7 +257,7 @@ def test_pathwise_goes_through_the_backbone_once_for_all_steps(pipeline):
     def trained(psi):
         with torch.no_grad():
             images = pipeline.compose(*pipeline.render(psi)).images
-            inputs = inputs_of((images,), torch.arange(len(images)))
+            inputs = inputs_of(images, torch.arange(len(images)))
         held = Examples(inputs, losses, inputs_of=inputs_of)
         made = train(
             RULE, flatten(pipeline.trainable), tuple(every), rates,

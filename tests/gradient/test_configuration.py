@@ -33,14 +33,6 @@ def test_the_papers_method_is_its_plain_form():
     assert paper.loop.gradient == PathwiseEstimator(mode="reverse")
     assert paper.loop.gradient.draws == RelaxedDraws()
     assert paper.imaging.distribution.factors[0].bin_mean == "linear"
-    assert paper.imaging.synthesis.label_gradient == "ignored"
-
-
-def test_boxes_move_by_one_override():
-    assert (
-        experiment("synthesis.label_gradient=differentiable").imaging.synthesis.label_gradient
-        == "differentiable"
-    )
 
 
 @pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.relaxation=concrete"])

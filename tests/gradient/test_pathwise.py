@@ -39,8 +39,7 @@ def test_sum_over_patches_equals_the_whole_image(problem, maps, patch_size):
         assert float((whole[name] - patches[name]).abs().max()) < 1e-10
 
 
-@pytest.mark.parametrize("theta_mode", ["forward", "reverse"])
-def test_mixed_derivative_equals_autograd_through_everything(problem, pathwise, generator, theta_mode):
+def test_mixed_derivative_equals_autograd_through_everything(problem, pathwise, generator):
     batch = problem.object_images()
     params = {name: tensor + 0.1 for name, tensor in problem.minimiser(problem.psi).items()}
     vector = {
@@ -54,7 +53,7 @@ def test_mixed_derivative_equals_autograd_through_everything(problem, pathwise, 
     slopes = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
     along = sum((slope * vector[name]).sum() for slope, name in zip(slopes, leaves, strict=True))
     (reference,) = torch.autograd.grad(along, psi)
-    settings = {"patch_size": 4, "chunk_size": 2, "theta_mode": theta_mode}
+    settings = {"patch_size": 4, "chunk_size": 2}
     ours = pathwise(problem.loss_of, params, vector, batch, **settings)
     torch.testing.assert_close(ours.value, reference, rtol=1e-10, atol=1e-12)
 
@@ -133,7 +132,6 @@ def test_standard_error_counts_pairs_as_one():
         {"chunk_size": 0},
         {"conditional_draws": 0},
         {"mode": "sideways"},
-        {"theta_mode": "sideways"},
         {"relaxation": "none"},
     ],
 )

@@ -66,7 +66,7 @@ def test_the_derivative_by_weights_against_central_differences():
     psi = torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.6, 0.3]], dtype=DOUBLE)
     rendered = scene.training_set(psi, 3, generator, estimator.draws)
     images = rendered.images
-    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, images.labels, None)
+    losses = bound_losses(CachedSet.of(detector, backbone, images), backbone, None)
     weights = torch.full((6,), 1.0 / 6, dtype=DOUBLE)
     held = object_images(scene, rendered, psi, weights)
     targets = detector.assign(images.boxes, images.labels)
@@ -78,7 +78,7 @@ def test_the_derivative_by_weights_against_central_differences():
         maps = scene._maps(label, draw)
         pixels = rendered.compose[label](maps.rgb, maps.opacity).images
         index = torch.arange(3 * label, 3 * label + 3)
-        loss = image_losses(detector, backbone, targets, images.labels)
+        loss = image_losses(detector, backbone, targets)
         along = scores(lambda p, rows: loss(p, pixels[rows - 3 * label], rows), trainable, vector, index, 3)
         return float(along @ weights[index])
 
@@ -117,7 +117,7 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
     rendered = scene.training_set(psi, 3, generator)
     probed = ProbeSet.draw(scene, detector, backbone, 4, psi, generator, range(2))
     cached = CachedSet.of(detector, backbone, rendered.images)
-    losses = bound_losses(cached, backbone, rendered.images.labels, probed.cached)
+    losses = bound_losses(cached, backbone, probed.cached)
     held = object_images(scene, rendered, psi, torch.full((6,), 1.0 / 6, dtype=DOUBLE))
     estimator = StratifiedEstimator(4, theta_mode="forward")
     for label, name in enumerate(scene.names):

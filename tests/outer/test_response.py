@@ -12,7 +12,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.response import Response, ResponseLoop, agreement, response
+from neural_sim.outer.response import Response, ResponseLoop, agreement, centred_cosine, response
 
 CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
 PSI = torch.tensor([[0.5, 0.0, -0.5, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -117,3 +117,9 @@ def test_slopes_share_out_over_all_classes(inner):
     slopes = Response(value, 5).slopes(inner, PSI)
     assert float(slopes[0, 0]) < 0.0 and float(slopes[0].sum()) == pytest.approx(0.0, abs=1e-12)
     assert not slopes[1].any()
+
+
+def test_cosines_are_blind_to_a_common_shift():
+    left, right = torch.tensor([1.0, 2.0, 4.0]), torch.tensor([3.0, 4.0, 6.0])
+    assert centred_cosine(left, right) == pytest.approx(1.0)
+    assert math.isnan(centred_cosine(left, torch.ones(3)))

@@ -1,26 +1,15 @@
 """The implicit hypergradient of a detector against the dense oracle and against finite differences of retraining."""
 
-import math
-
 import pytest
 import torch
+from retrained import BinnedProblem, contrasts, finite_difference
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.base import Probes
 from neural_sim.gradient.hypergradient import hypergradient
-from neural_sim.outer.retrained import (
-    BinnedProblem,
-    as_double,
-    binned_problem,
-    centred_cosine,
-    contrasts,
-    finite_difference,
-    first_of_every_bin,
-    merged_anchor,
-    retrained_cosine,
-)
+from neural_sim.outer.response import centred_cosine
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping
@@ -108,41 +97,9 @@ def test_conjugate_gradients_reach_the_oracle_inside_40_products(problem, oracle
     assert (torch.cat(list(tight.psi_gradients.values())) - exact).norm() < 1e-9 * exact.norm()
 
 
-def test_the_cosine_with_retraining_is_nan_where_that_does_not_converge(problem, oracle, monkeypatch):
-    binned, terms, minimum = problem
-    right = oracle.psi_gradients["1"]
-    assert retrained_cosine(binned, terms, PSI, 1, minimum.params, right) > 0.9999
-    monkeypatch.setattr("neural_sim.outer.retrained.TOLERANCE", 1e-40)
-    assert math.isnan(retrained_cosine(binned, terms, PSI, 1, minimum.params, right))
-
-
 def test_weights_are_the_bins_probabilities_shared_by_their_images(problem):
     weights = problem[0].weights(PSI)
     torch.testing.assert_close(weights, 0.5 * torch.softmax(PSI, -1).flatten())
-
-
-def test_several_pulls_are_one(generator):
-    points = [{"w": torch.randn(4, generator=generator, dtype=DOUBLE)} for _ in range(3)]
-    weight, anchor = merged_anchor([(2.0, points[0]), (0.5, points[1])])
-    slope = 2.0 * (points[2]["w"] - points[0]["w"]) + 0.5 * (points[2]["w"] - points[1]["w"])
-    torch.testing.assert_close(weight * (points[2]["w"] - anchor["w"]), slope)
-    assert merged_anchor([(0.0, points[0])])[0] == 0.0
-
-
-def test_a_binned_problem_takes_the_first_images_of_every_bin(generator):
-    bins = torch.tensor([2, 0, 0, 1, 2])
-    kept = first_of_every_bin(Probes(torch.arange(5) + 10, bins), 1)
-    assert kept.index.tolist() == [11, 13, 10] and kept.bins.tolist() == [0, 1, 2]
-    detector = RetinaNet(2, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,))))
-    params = detector.init(generator)
-    backbone, trainable = detector.split(params)
-    labels, every = torch.zeros(6, dtype=torch.long), torch.arange(3).repeat_interleave(2)
-    images = CachedSet.of(detector, backbone, stripes(labels, every, generator))
-    problem = binned_problem(
-        images, [Probes(torch.arange(6), every)], 1, [(1.0, trainable)], log_probabilities
-    )
-    expected = images.double().losses(as_double(trainable), torch.tensor([0, 2, 4]))
-    torch.testing.assert_close(problem.losses(as_double(trainable), torch.arange(3)), expected)
 
 
 @pytest.mark.parametrize("k", [2, 3, 8])
@@ -150,9 +107,3 @@ def test_contrasts_are_a_basis_of_centred_logits(k):
     rows = contrasts(k)
     torch.testing.assert_close(rows @ rows.T, torch.eye(k - 1, dtype=DOUBLE))
     assert rows.sum(-1).abs().max() < 1e-14
-
-
-def test_cosines_are_blind_to_a_common_shift():
-    left, right = torch.tensor([1.0, 2.0, 4.0]), torch.tensor([3.0, 4.0, 6.0])
-    assert centred_cosine(left, right) == pytest.approx(1.0)
-    assert math.isnan(centred_cosine(left, torch.ones(3)))

@@ -166,10 +166,8 @@ def test_images_are_made_again_of_one_objects_maps(several):
     assert derivative == pytest.approx(float((along(1e-6) - along(-1e-6)).detach()) / 2e-6, rel=1e-6)
 
 
-def test_pairs_and_moving_boxes_want_one_object_an_image(several):
+def test_pairs_want_one_object_an_image(several):
     with pytest.raises(ValueError, match="pair images of one object"):
         several((1, 2)).training_set(PSI, 4, torch.Generator(), RelaxedDraws(antithetic=True))
-    with pytest.raises(ValueError, match="one object an image"):
-        Synthesizer(Plain(), label_gradient="differentiable", objects_per_image=[1, 2])
     with pytest.raises(ValueError, match="at most the 3 objects"):
         several((1, 4)).training_set(PSI, 4, torch.Generator())

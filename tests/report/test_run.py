@@ -95,7 +95,7 @@ def test_summary_names_every_method_and_object(results):
     trust = (
         "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected after training on them 2 of 2; "
     )
-    trust += "cosine with what outer.certify measured 0.90, 0.90"
+    trust += "cosine with the response of training 0.90, 0.90"
     images = ("validation images, learned: 25.0", "without a box: 6")
     for word in ("ns", "learned", "matched", "distance to target", "60.0", "nan", *images, trust):
         assert word in text

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-
-from neural_sim.solver.newton import minimise
+from newton import minimise
 
 DOUBLE = torch.float64
 

@@ -91,12 +91,8 @@ def test_as_many_photographs_are_the_same_training_however_they_were_asked_for(m
     [
         (["training.real.mode=combined", "target.train_per_object=0"], "combined wants labelled photographs"),
         (["training.real.mode=pretrain", "target.train_per_object=0"], "pretrain wants labelled photographs"),
-        (
-            ["training.real.mode=combined", "outer.adjoint=implicit", "outer.certify=retrained",
-             "outer.certify_every=1"], "want outer.certify=response",
-        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused_before_any_stage(overrides, message):
     with pytest.raises(ValueError, match=message):
         graph_of(*overrides)

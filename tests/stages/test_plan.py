@@ -41,9 +41,6 @@ def test_the_papers_gradient_leaves_out_the_boxes_derivative_alone():
     found = left_out("gradient=pathwise")
     assert "the renderer's derivative" not in found and "renders of the loop" not in found
     assert "the boxes' derivative" in found
-    assert "the boxes' derivative" not in left_out(
-        "gradient=pathwise", "synthesis.label_gradient=differentiable"
-    )
 
 
 def test_a_loop_on_drafts_is_said_to_be_one():

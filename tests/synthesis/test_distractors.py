@@ -199,11 +199,3 @@ def test_files_without_an_alpha_channel_are_named(tmp_path):
     (tmp_path / "plain.png").write_bytes(b"no picture")
     with pytest.raises(ValueError, match=r"plain\.png: not a readable picture"):
         Distractors(tmp_path, count=(1, 1)).draw(1, 16, 24, seeded())
-
-
-def test_boxes_that_move_want_nothing_in_front(folder):
-    with pytest.raises(ValueError, match="no distractors in front"):
-        Synthesizer(ProceduralClutter(), label_gradient="differentiable", distractors=Distractors(folder))
-    Synthesizer(
-        ProceduralClutter(), label_gradient="differentiable", distractors=Distractors(folder, front=0.0)
-    )

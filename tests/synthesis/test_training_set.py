@@ -64,16 +64,6 @@ def test_composing_is_pure_and_labels_carry_no_gradient(synthesizer: Synthesizer
     assert first.bins.tolist() == [4, 5, 6]
 
 
-def test_boxes_move_with_opacity_where_their_derivative_is_wanted(synthesizer: Synthesizer) -> None:
-    rgb, opacity = (value.requires_grad_() for value in maps())
-    nuisance = synthesizer.draw_nuisance(3, CAMERA, torch.Generator().manual_seed(1))
-    bins = torch.zeros(3, dtype=torch.long)
-    plain = synthesizer.compose(rgb, opacity, nuisance, 0, bins)
-    moving = replace(synthesizer, label_gradient="differentiable").compose(rgb, opacity, nuisance, 0, bins)
-    assert torch.equal(plain.boxes, moving.boxes) and torch.equal(plain.images, moving.images)
-    assert moving.boxes.requires_grad and not plain.boxes.requires_grad
-
-
 def test_the_box_goes_with_the_shift_and_is_clipped() -> None:
     opacity = torch.zeros(4, 8, 10)
     opacity[:, 2:5, 3:7] = 1.0
@@ -123,7 +113,6 @@ def test_nuisance_is_reproducible_and_selectable(synthesizer: Synthesizer) -> No
         ("threshold", 1.0),
         ("minimum_area", -1.0),
         ("background", "clutter"),
-        ("label_gradient", "some"),
     ],
 )
 def test_bad_settings_are_refused_by_name(synthesizer: Synthesizer, key: str, value: object) -> None:

@@ -34,7 +34,7 @@ class Certificate:
     ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` the damped
     operator's condition number (nan without an estimated spectrum, inf where it is not positive definite).
     ``sensitivity`` is the hypergradient's relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``).
-    ``cosine`` is with the reference of ``outer.certify``, nan where that was not measured. ``doubts`` names the
+    ``cosine`` is with the response of training, nan where that was not measured. ``doubts`` names the
     conditions on the whole hypergradient that fail. ``p_values``, by object and factor, are those of the null that a
     derivative is zero: this iteration's, or, for checked steps, of the average over iterations that steps follow.
     ``actions`` has the learned objects; a step is kept if no condition fails and its derivative is significant. What
@@ -101,7 +101,7 @@ def certify(
         result: the hypergradient.
         p_values: of the derivatives that steps follow, by object and factor.
         names, factors: the learned objects and the factors of psi.
-        cosine: with the reference of ``outer.certify``, nan if not measured.
+        cosine: with the response of training, nan if not measured.
         trust, on_untrusted: the conditions, and what happens where they fail.
     """
     finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())

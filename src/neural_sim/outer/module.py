@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import Losses, ObjectImages, Probes
@@ -19,7 +19,6 @@ from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.response import agreement
-from neural_sim.outer.retrained import as_double, binned_problem, retrained_cosine
 from neural_sim.outer.unrolling import through_training
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
@@ -96,54 +95,32 @@ class SimulatorModule(GradientLoop):
         if not per_bin:
             return
         if self._probes is None:
-            self._probes = self._every_bin(per_bin, self.inner.generator, self._learned)
+            self._probes = self._every_bin(per_bin)
             return
         new = max(1, round(self.settings.refresh * per_bin))
-        fresh = self._every_bin(new, self.inner.generator, self._learned)
+        fresh = self._every_bin(new)
         self._probes = fresh if new == per_bin else self._probes.renewed(fresh, len(self.records))
 
-    def _every_bin(self, per_bin: int, generator: torch.Generator, objects: Sequence[int]) -> ProbeSet:
-        """``per_bin`` images of every bin of every factor of the objects, with their features."""
+    def _every_bin(self, per_bin: int) -> ProbeSet:
+        """``per_bin`` images of every bin of every factor of the learned objects, with their features."""
         inner = self.inner
         probed = ProbeSet.draw(
-            self.scene, inner.detector, inner.backbone, per_bin, self.psi, generator, objects, inner.pool
+            self.scene,
+            inner.detector,
+            inner.backbone,
+            per_bin,
+            self.psi,
+            inner.generator,
+            self._learned,
+            inner.pool,
         )
         inner.images += len(probed.cached)
         return probed
 
+    @override
     def _cosine(self, result: Hypergradient) -> float:
-        """Cosine with the response of training, averaged over objects and factors; or, for one object and factor in
-        turn, with finite differences of the retrained problem.
-        """
-        if self.settings.certify == "response":
-            return agreement(self.inner, self.psi, result, self._learned)
-        return self._retrained(result) if self.scene.distribution.binned else math.nan
-
-    def _retrained(self, result: Hypergradient) -> float:
-        """Cosine of one object's derivative by one factor with finite differences of the retrained problem.
-
-        That problem has this step's probes, and beside the detector's proximal term the one whose exact derivative
-        this step's damped solve takes: its lambda, anchored at this step's parameters. For estimators without probes,
-        images are drawn.
-        """
-        every, per_bin = self.settings.certify_every, self.settings.certify_per_bin
-        done = len(self.records) + 1
-        probed = self._probes
-        objects = range(len(self.scene.names))
-        if probed is None or probed.per_bin < per_bin or len(self._learned) < len(objects):
-            probed = self._every_bin(per_bin, self._check_generator, objects)
-        distribution = self.scene.distribution
-        turn, place = divmod(done // every - 1, len(self._learned))
-        label = self._learned[place]
-        factor = distribution.binned[turn % len(distribution.binned)]
-        trainable = self.inner.trainable
-        pulls = [(self.inner.detector.proximal, self.inner.warm_start), (result.damping.value, trainable)]
-        ordered = [part[factor.name] for part in probed.probes]
-        problem = binned_problem(probed.cached, ordered, per_bin, pulls, factor.log_probabilities)
-        validation = self.inner.objective.double().terms()
-        psi = distribution.split(self.psi.detach())[factor.name]
-        gradient = distribution.split(result.psi_gradients[self.scene.names[label]])[factor.name]
-        return retrained_cosine(problem, validation, psi, label, as_double(trainable), gradient)
+        """The cosine with the response of training, averaged over objects and factors."""
+        return agreement(self.inner, self.psi, result, self._learned)
 
 
 def curvature_rows(

@@ -20,7 +20,6 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.retrained import centred_cosine
 from neural_sim.parameter.factor import Factor
 from neural_sim.solver.damping import Damped
 from neural_sim.solver.solution import Solution, Status
@@ -93,6 +92,16 @@ def agreement(
             cosines.append(centred_cosine(gradient[factor.name] / scale, truth[factor.name][label] / scale))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
     return sum(known) / len(known) if known else math.nan
+
+
+def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
+    """Cosine of two gradients after subtracting their means (a constant added to logits does not change softmax).
+
+    Not a number where either vanishes.
+    """
+    left, right = (g.double() - g.double().mean() for g in (left, right))
+    size = float(left.norm() * right.norm())
+    return float(left @ right) / size if size > 0.0 else math.nan
 
 
 class ResponseLoop(GradientLoop):

@@ -16,7 +16,6 @@ from neural_sim.renderer.nerf import Quality
 ObjectiveKind = Literal["average_precision", "accuracy", "loss"]
 Start = Literal["previous", "warm", "fresh"]
 AdjointKind = Literal["implicit", "unrolled"]
-CertifyKind = Literal["response", "retrained"]
 StepKind = Literal["checked", "free"]
 OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 
@@ -31,7 +30,7 @@ class Trust:
         max_residual: relative residual of the adjoint solve (implicit adjoint).
         max_stationarity: ``|dL_train/dtheta|`` (implicit adjoint).
         max_sensitivity: relative change from lambda to 2 lambda (implicit adjoint; wants ``solver.sensitivity``).
-        min_cosine: cosine with the reference of ``outer.certify`` (wants ``outer.certify_every``).
+        min_cosine: cosine with the response of training (wants ``outer.certify_every``).
         level: significance level of the test that a derivative is zero (see ``gradient.significance``).
         shrink: fraction of an untrusted step that is taken under ``outer.on_untrusted=shrink``.
 
@@ -141,7 +140,7 @@ class Outer:
             bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
         train_first: train before the first hypergradient; otherwise that is taken at the warm start.
         adjoint: the hypergradient of a stationary point, by the solver (``implicit``, the paper's Eq. 2), or of the
-            training that was run (``unrolled``). The latter wants ``train_first``, epochs and no ``certify=retrained``.
+            training that was run (``unrolled``). The latter wants ``train_first`` and epochs.
         unrolled: settings of the unrolled adjoint.
         objective: L_val: one minus the smooth average precision of the validation images, or a classifier's smooth
             ``accuracy``, or their ``loss`` (the paper's).
@@ -163,11 +162,8 @@ class Outer:
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
             get no probes and no second derivatives.
         light_update: the optimiser of free steps, for weights of lights.
-        certify: reference of the hypergradient: the ``response`` of training at this psi, one training for each bin
-            (:mod:`outer.response`), or finite differences of a problem ``retrained`` to stationarity, for one object
-            in turn, 2 k - 1 trainings.
-        certify_every: iterations from one comparison to the next; 0: never.
-        certify_per_bin: images of every bin in the retrained problem.
+        certify_every: iterations from one comparison of the hypergradient with the response of training at this psi
+            (:mod:`outer.response`, one training for each bin) to the next; 0: never.
 
     Raises:
         ValueError: any of these out of its range, or a combination that cannot be, with the keys and the values.
@@ -198,13 +194,10 @@ class Outer:
     on_untrusted: OnUntrusted = "skip"
     learned: tuple[str, ...] | None = None
     light_update: Update = field(default_factory=lambda: Mirror(learning_rate=0.6, max_step=1.0))
-    certify: CertifyKind = "response"
     certify_every: int = 0
-    certify_per_bin: int = 1
 
     def __post_init__(self) -> None:
         at_least("outer", 1, iterations=self.iterations, images_per_object=self.images_per_object)
-        at_least("outer", 1, certify_per_bin=self.certify_per_bin)
         at_least(
             "outer", 0, epochs=self.epochs, learning_rate=self.learning_rate, least_steps=self.least_steps
         )
@@ -224,7 +217,7 @@ class Outer:
             raise ValueError(f"outer.final_step must lie in (0, 1], got {self.final_step}")
         for key, kinds in (
             ("start", Start), ("adjoint", AdjointKind), ("objective", ObjectiveKind), ("steps", StepKind),
-            ("certify", CertifyKind), ("on_untrusted", OnUntrusted),
+            ("on_untrusted", OnUntrusted),
         ):  # fmt: skip
             if getattr(self, key) not in get_args(kinds):
                 raise ValueError(
@@ -235,11 +228,10 @@ class Outer:
                 "outer.steps=checked compares trainings: want train_first=true, start=fresh or warm and epochs of at "
                 f"least 1, got {self.train_first}, {self.start} and {self.epochs}"
             )
-        retrained = self.certify_every > 0 and self.certify == "retrained"
-        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0 or retrained):
+        if self.adjoint == "unrolled" and (not self.train_first or self.epochs == 0):
             raise ValueError(
-                "outer.adjoint=unrolled wants train_first=true, epochs of at least 1 and no certify=retrained, got "
-                f"{self.train_first}, {self.epochs} and certify_every={self.certify_every} of {self.certify}"
+                "outer.adjoint=unrolled wants train_first=true and epochs of at least 1, got "
+                f"{self.train_first} and {self.epochs}"
             )
 
     @property

@@ -14,7 +14,7 @@ KEYS = ("scoring", "configuration", "test_set")
 """Of results.json, see :func:`identity`."""
 SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
 """Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
-METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint", "label_gradient")
+METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")
 """Keys of ``parameter.*`` and ``synthesis`` that say how a method draws, steps and differentiates; the rest says where
 it starts and what it aims at."""
 RUN_KEYS = ("seed", "score_at", "stages", "progress", "paths", "trainer")

@@ -188,7 +188,7 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
     if trust["judged"]:
         text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
     if trust["cosines"]:
-        text += "; cosine with what outer.certify measured " + ", ".join(f"{c:.2f}" for c in trust["cosines"])
+        text += "; cosine with the response of training " + ", ".join(f"{c:.2f}" for c in trust["cosines"])
     return text
 
 

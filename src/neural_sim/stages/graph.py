@@ -60,11 +60,6 @@ class Graph:
                 f"training.real.mode={real.mode} wants labelled photographs: set target.train_fraction (of a target of "
                 "photographs) or target.train_per_object (of a rendered one)"
             )
-        if real.combined and loop.outer.certify_every and loop.outer.certify == "retrained":
-            raise ValueError(
-                "outer.certify=retrained has a problem of synthesised images only; with training.real.mode=combined "
-                "want outer.certify=response"
-            )
 
     @cached_property
     def objects(self) -> Objects:

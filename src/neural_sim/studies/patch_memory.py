@@ -150,9 +150,7 @@ class _Image:
         images, first = rendered.images, torch.zeros(1, dtype=torch.long)
         targets = loop.detector.assign(images.boxes, images.labels)
         losses = image_losses(loop.detector, loop.backbone, targets)
-        pulled = image_cotangents(
-            losses, loop.trainable, loop.vector, images.images, first, torch.ones(1)
-        )
+        pulled = image_cotangents(losses, loop.trainable, loop.vector, images.images, first, torch.ones(1))
         path = rendered_path(scene, label, part, rendered.compose[0])
         return _Image(loop, label, seed, replace(part, tangents=None), map_cotangents(path, pulled))
 

@@ -37,10 +37,11 @@ class Quadratic:
         self.anchor = {"theta": torch.zeros(20, dtype=torch.float64)}
         self.b = torch.randn(20, generator=generator, dtype=torch.float64)
 
-    def at(self, psi, params):
+    @property
+    def inner(self):
         weights = torch.ones(1, dtype=torch.float64)
         return InnerProblem(
-            params, lambda p, rows: 0.5 * (p["theta"] @ self.hessian @ p["theta"]).expand(1), weights
+            self.anchor, lambda p, rows: 0.5 * (p["theta"] @ self.hessian @ p["theta"]).expand(1), weights
         )
 
     @property
@@ -50,7 +51,7 @@ class Quadratic:
 
 def test_the_oracle_is_the_dense_solve():
     problem = Quadratic()
-    oracle = Oracle.of(problem.at(None, problem.anchor).terms(), problem.anchor, problem.b)
+    oracle = Oracle.of(problem.inner.terms(), problem.anchor, problem.b)
     truth = torch.linalg.solve(problem.hessian + 0.5 * torch.eye(20, dtype=torch.float64), problem.b)
     assert relative(oracle.solve(0.5), truth) < 20 * 20 * 41 * 2.3e-16  # n^2 times condition times eps
     assert torch.allclose(oracle.values, torch.arange(1.0, 21.0, dtype=torch.float64), rtol=1e-12)
@@ -60,7 +61,7 @@ def test_the_oracle_is_the_dense_solve():
 def inverse():
     problem = Quadratic()
     measured = Solver(SOLVERS, steps=(4, 25), rtols=(1e-9,), conditions=())._inverse(
-        problem, problem.validation, Timing(1), 0
+        problem.inner, problem.validation, Timing(1), 0
     )
     return {series.name: series for series in measured}
 

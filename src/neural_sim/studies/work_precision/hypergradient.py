@@ -18,8 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.response import response
-from neural_sim.outer.retrained import centred_cosine
+from neural_sim.outer.response import centred_cosine, response
 from neural_sim.outer.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.identity import Identity

@@ -12,8 +12,9 @@ from neural_sim.detector.module import Optimisation
 from neural_sim.detector.protocol import Detector
 from neural_sim.detector.training import train_detector
 from neural_sim.field.grid import GridField
-from neural_sim.gradient.base import Probes
-from neural_sim.outer.retrained import BinnedProblem, as_double
+from neural_sim.gradient.base import Params
+from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.stratified import importance_weights
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
@@ -45,9 +46,10 @@ def small_scene() -> Scene:
     return Scene(("a", "b"), (block(1), block(2)), NerfRenderer(), camera, synthesizer, distribution)
 
 
-def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[BinnedProblem, list[Term]]:
-    """The detector after a training on ``images`` of each object, on one image of every bin and object; and L_val. Both
-    in float64. ``anchor`` has the trained parameters.
+def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[InnerProblem, list[Term]]:
+    """The detector after a training on ``images`` of each object, on one image of every bin and object; and L_val.
+
+    Both are in float64. An image has its bin's probability as weight, shared by the objects.
     """
     generator, scene = torch.Generator().manual_seed(0), small_scene()
     detector = make(num_classes=2, image_size=SIZE)
@@ -60,7 +62,13 @@ def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[Bi
     )  # fmt: skip
     backbone, warm = detector.split(params)
     held = CachedSet.of(detector, backbone, LabelledImages.concatenate(probes)).double()
-    bins = [Probes(torch.arange(BINS) + label * BINS, torch.arange(BINS)) for label in range(2)]
     factor = scene.distribution.binned[0]
-    problem = BinnedProblem(held.losses, bins, factor.log_probabilities, 0.0, as_double(warm))
+    p = [factor.log_probabilities(psi).exp() for psi in PSI]
+    weights = torch.cat([importance_weights(each, torch.arange(BINS), 0.5) for each in p])
+    problem = InnerProblem(as_double(warm), held.losses, weights)
     return problem, CachedSet.of(detector, backbone, validation).double().mean_terms()
+
+
+def as_double(params: Params) -> Params:
+    """The parameters in float64."""
+    return {name: value.double() for name, value in params.items()}

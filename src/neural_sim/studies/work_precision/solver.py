@@ -13,12 +13,11 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.hypergradient import InnerProblem
-from neural_sim.outer.retrained import as_double
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import FixedDamping
 from neural_sim.solver.exact import Exact
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
-from neural_sim.studies.work_precision.micro import PSI, trained_problem
+from neural_sim.studies.work_precision.micro import as_double, trained_problem
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.suite import World
 from neural_sim.types import LabelledImages
@@ -117,13 +116,11 @@ class Solver:
         if self.timed is not None:
             yield self._products(self.timed, timing, seed)
 
-    def _inverse(self, problem, validation: list[Term], timing: Timing, seed: int) -> Iterator[Series]:
-        params = problem.anchor
-        terms, b, own = (
-            problem.at(PSI, params).terms(),
-            gradient(validation, params),
-            self.solvers[self.default],
-        )
+    def _inverse(
+        self, problem: InnerProblem, validation: list[Term], timing: Timing, seed: int
+    ) -> Iterator[Series]:
+        params, terms, own = problem.params, problem.terms(), self.solvers[self.default]
+        b = gradient(validation, params)
         random = torch.Generator().manual_seed(seed)
         chosen = own.damping.choose(own.operator(terms, params), b, random).value
         spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))

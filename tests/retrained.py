@@ -6,24 +6,21 @@ the bins' weights alone, so that its minimiser is a smooth and deterministic fun
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from newton import Minimum, minimise
 from torch import Tensor
 
-from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params, Probes
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.stratified import importance_weights
 from neural_sim.solver.hvp import Term
-from neural_sim.solver.newton import Minimum, minimise
 
-logger = logging.getLogger(__name__)
 STEP = 0.05  # logits
 TOLERANCE = 1e-7  # of a retraining's gradient norm
 
@@ -122,83 +119,9 @@ def finite_difference(
     )
 
 
-def retrained_cosine(
-    problem: BinnedProblem,
-    validation: Sequence[Term],
-    psi: Float[Tensor, "objects k"],
-    label: int,
-    start: Params,
-    gradient: Float[Tensor, "k"],
-) -> float:
-    """Cosine of object ``label``'s ``gradient``, from any estimator, with the finite differences of ``problem``; nan
-    where a retraining does not converge.
-
-    The problem is first trained from ``start`` to its minimum. So a low cosine has one of several causes: an inner
-    problem far from its minimum in the loop, a solve ended early, or a noisy estimate.
-    """
-    minimum = problem.retrain(psi, start, TOLERANCE)
-    if not minimum.converged:
-        logger.warning("certificate: retraining stopped at a gradient of %.2g; no cosine", minimum.slope)
-        return math.nan
-    difference = finite_difference(problem, validation, psi, label, minimum.params)
-    if not difference.converged:
-        logger.warning("certificate: a retraining stopped at a gradient of %.2g; no cosine", difference.slope)
-        return math.nan
-    return centred_cosine(gradient, difference.gradient)
-
-
-def binned_problem(
-    images: CachedSet,
-    probes: Sequence[Probes],
-    per_bin: int,
-    pulls: Sequence[tuple[float, Params]],
-    log_probabilities: Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]],
-) -> BinnedProblem:
-    """The problem in float64 on the first ``per_bin`` ``images`` of every bin and object.
-
-    Each of ``pulls``, a weight lambda_i and a fixed theta_i, adds ``lambda_i/2 |theta - theta_i|^2``.
-    """
-    chosen = [first_of_every_bin(part, per_bin) for part in probes]
-    few = images.select(torch.cat([part.index for part in chosen])).double()
-    sizes = [len(part.index) for part in chosen]
-    rows = torch.arange(sum(sizes)).split(sizes)
-    renumbered = [Probes(row, part.bins) for row, part in zip(rows, chosen, strict=True)]
-    weight, centre = merged_anchor([(weight, as_double(anchor)) for weight, anchor in pulls])
-    return BinnedProblem(few.losses, renumbered, log_probabilities, weight, centre)
-
-
-def as_double(params: Params) -> Params:
-    """The parameters in float64."""
-    return {name: value.double() for name, value in params.items()}
-
-
-def first_of_every_bin(probes: Probes, per_bin: int) -> Probes:
-    """The first ``per_bin`` images of every bin."""
-    kept = torch.cat([(probes.bins == b).nonzero()[:per_bin, 0] for b in probes.bins.unique()])
-    return Probes(probes.index[kept], probes.bins[kept])
-
-
-def merged_anchor(parts: Sequence[tuple[float, Params]]) -> tuple[float, Params]:
-    """Several terms ``lambda_i/2 |theta - theta_i|^2`` as one: the sum of the lambdas, and the weighted mean anchor."""
-    total = math.fsum(weight for weight, _ in parts)
-    if total == 0.0:
-        return 0.0, dict(parts[0][1])
-    names = parts[0][1]
-    return total, {n: torch.stack([w / total * anchor[n] for w, anchor in parts]).sum(0) for n in names}
-
-
 def contrasts(k: int) -> Float[Tensor, "k-1 k"]:
     """Orthonormal rows that sum to zero (Helmert's): a basis of centred logits."""
     rows = torch.zeros(k - 1, k, dtype=torch.float64)
     for i in range(1, k):
         rows[i - 1, :i], rows[i - 1, i] = 1.0, -float(i)
     return rows / rows.norm(dim=-1, keepdim=True)
-
-
-def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
-    """Cosine of two gradients after subtracting their means (a constant added to logits does not change softmax); nan
-    where either vanishes.
-    """
-    left, right = (g.double() - g.double().mean() for g in (left, right))
-    size = float(left.norm() * right.norm())
-    return float(left @ right) / size if size > 0.0 else math.nan
