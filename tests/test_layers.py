@@ -12,8 +12,7 @@ ORDER = (
     "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TASKS_IN_STAGES = {
-    "methods", "side_by_side", "compare", "experiments", "interpolation", "samples_gallery", "detection_gallery",
-    "nerf_vs_mesh", "sfm_vs_nerf",
+    "compare", "experiments",
 }  # fmt: skip
 """Tasks and studies that still stand among the stages; the set only shrinks."""
 TORCH_ONLY = ("types", "cameras", "solver")

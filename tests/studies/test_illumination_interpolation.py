@@ -8,9 +8,9 @@ import torch
 from neural_sim import cameras
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.report import logged, tracking
+from neural_sim.report import logged
 from neural_sim.report.figures import save
-from neural_sim.report.interpolation import interpolate, interpolation_figure, report_interpolation
+from neural_sim.studies.illumination_interpolation import interpolate, interpolation_figure, publish
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(12, 12, math.radians(40.0))
@@ -67,14 +67,12 @@ def test_one_step_is_no_way(field):
         interpolate(field, NerfWRenderer(), CAMERA, POSE, (torch.eye(3)[0], torch.eye(3)[1]), 1)
 
 
-def test_the_report_says_how_much_opacity_and_colour_change(field, tmp_path):
+def test_the_report_says_how_much_opacity_and_colour_change(field, context):
     way = interpolate(field, NerfWRenderer(), CAMERA, POSE, (torch.eye(3)[0], torch.eye(3)[1]), 4)
-    uri = tracking.tracking_uri(str(tmp_path / "mlflow.db"))
-    folder = tmp_path / "run"
-    report_interpolation({"drill": way}, "Between two lights", "lights", {"seed": 3}, uri, folder, 5.0)
+    publish(context, {"drill": way}, "Between two lights")
     colour = float((way.images[-1] - way.images[0]).abs().mean())
-    text = (folder / "interpolation.md").read_text()
+    text = (context.folder / "interpolation.md").read_text()
     assert text.endswith(f"| drill | 0e+00 | {colour:.3f} |\n")
-    assert (folder / "figures" / "interpolation.png").stat().st_size > 1000
-    (run,) = logged.runs(uri, "lights")
-    assert run.name == "seed 3" and "interpolation.json" in run.files
+    assert (context.folder / "figures" / "interpolation.png").stat().st_size > 1000
+    (run,) = logged.runs(context.uri, "study")
+    assert run.name == "seed 4" and "interpolation.json" in run.files

@@ -1,10 +1,7 @@
-"""Stage ``nerf_vs_mesh``: fields against the mesh renderer as a source of training images, as
-conf/experiment/nerf_vs_mesh.yaml says.
-"""
+"""Fields against the mesh renderer as a source of training images (the paper's Sec. 4.1 and A.2)."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,18 +9,12 @@ from pathlib import Path
 
 from neural_sim.checks import at_least
 from neural_sim.report.run import write_training_set
-from neural_sim.report.side_by_side import report_side_by_side
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.meshes import Meshes
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
-from neural_sim.stages.side_by_side import (
-    compare_sources,
-    graphs_of_seeds,
-    pairs,
-    results_of_study,
-    sets_of_kinds,
-)
+from neural_sim.studies.graphs import graphs_of_seeds, results_of_study, sets_of_kinds
+from neural_sim.studies.sources import compare_sources, publish, training_images
 from neural_sim.target.coco import CocoTarget
 from neural_sim.tasks.context import Context
 
@@ -32,12 +23,14 @@ ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 
 
 @dataclass(frozen=True)
-class NerfVsMeshStep:
-    """The paper's Sec. 4.1: the same detector trained on images of the fields and of the meshes, at the same poses and
-    distances, scored on images of one and of several objects.
+class NerfVsMesh:
+    """``+experiment=nerf_vs_mesh``: one detector trained on images of the fields and of the meshes.
+
+    Both have the same poses and distances, and are scored on images of one and of several objects.
 
     Args:
-        single, multiple: fewest and most objects of a test image, of the two test sets.
+        single: fewest and most objects of a test image, in the first test set.
+        multiple: the same in the second.
         seeds: how many detectors of each kind, from the run's seed on.
         blenderproc: a folder of BlenderProc's COCO output, whose images take the place of the mesh renderer's; None:
             the mesh renderer.
@@ -81,13 +74,14 @@ class NerfVsMeshStep:
         return CocoTarget(found[0], categories=self.categories)
 
     def run(self, context: Context) -> None:
-        """Tables, figures, and the training images of the fields with their poses (``training_set``), from which
-        another program can render the same ones; to the run's folder and MLflow.
+        """Train, score and publish; write the training images of the fields with their poses (``training_set``).
+
+        From these another program can render the same images.
 
         Raises:
             ValueError: objects without meshes, or a target of photographs.
         """
-        x, begun = context.experiment, time.time()
+        x = context.experiment
         if not isinstance(context.graph.objects, Meshes):
             raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
         if not x.imaging.target.renders:
@@ -100,16 +94,13 @@ class NerfVsMeshStep:
         first, names = graphs[0], list(context.graph.names)
         drawn = self.sources(first)["nerf"].images(results)
         write_training_set(drawn, names, context.folder / "training_set")
-        shown = pairs(first, results, self.sources(first), self.shown)
+        shown = training_images(first, results, self.sources(first), self.shown)
         other = found.sources[1]
-        run = report_side_by_side(
-            found, shown, names, f"Detectors trained on images of fields (nerf) and of meshes ({other}).",
-            x.run.name, x.config, context.uri, context.folder, begun,
-        )  # fmt: skip
-        print(f"results: {context.folder}\n{run.where}")
+        heading = f"Detectors trained on images of fields (nerf) and of meshes ({other})."
+        publish(context, found, shown, names, heading)
 
     def sources(self, graph: Graph) -> dict[str, DetectorStage]:
-        """The detectors that are compared, by what their images show."""
+        """Return the detectors that are compared, by what their images show."""
         nerf = graph.synthetic(graph.psi("target"), "images of the fields")
         if self._rendered is not None:
             other = trained_on(nerf, CocoDetectorStage, source=self._rendered)

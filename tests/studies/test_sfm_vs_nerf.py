@@ -2,7 +2,7 @@
 
 import torch
 
-from neural_sim.report.reconstruction import HeldOut, held_out_figure, held_out_table
+from neural_sim.studies.sfm_vs_nerf import HeldOut, held_out_figure, held_out_table
 
 
 def held(name, psnr):

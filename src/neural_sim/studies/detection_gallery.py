@@ -1,11 +1,9 @@
-"""Detections of several methods on the same photographs, right and wrong: `+experiment=detection_gallery`."""
+"""Detections of several methods on the same photographs, right and wrong (the paper's Sec. C.2)."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +13,13 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 from torchvision.ops import box_iou
 
+from neural_sim.checks import at_least
 from neural_sim.detector.metrics import AveragePrecision
-from neural_sim.report import figures, tracking
+from neural_sim.documents import markdown_table
 from neural_sim.report.figures import INK
+from neural_sim.report.tracking import Run
+from neural_sim.studies.graphs import check_methods, graphs_of_methods, results_of_study
+from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages
 
 RIGHT, WRONG, MISSED = "#2ca25f", "#d7301f", "#ffd23f"
@@ -26,8 +28,10 @@ Detections = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Judged:
-    """Detections of one image, best first: ``kept`` are those that count, ``right`` which of them lie on a box of their
-    class, ``missed`` which true boxes have none.
+    """Detections of one image, best first.
+
+    ``kept`` are those that count, ``right`` says which of them lie on a box of their class, and ``missed`` which true
+    boxes have none.
     """
 
     kept: Int[Tensor, "d"]
@@ -37,17 +41,99 @@ class Judged:
 
 @dataclass(frozen=True)
 class Counts:
-    """Of one method over all test images."""
+    """One method's detections and missed boxes over all test images."""
 
     right: int
     wrong: int
     missed: int
 
 
+@dataclass(frozen=True)
+class Found:
+    """What one method's detector found on the test images, and its score there."""
+
+    detections: Sequence[Detections]
+    ap: AveragePrecision
+
+
+@dataclass(frozen=True)
+class DetectionGallery:
+    """``+experiment=detection_gallery``.
+
+    Args:
+        methods: baselines; the detector of each is trained on the distribution that it learned.
+        count: photographs, evenly spaced over the test images.
+        draw_above: smallest score of a detection that is drawn and counted.
+        overlap: smallest intersection over union of a right detection with a box of its class.
+
+    Raises:
+        ValueError: no method, or a number out of its range.
+    """
+
+    methods: Sequence[str] = ("ns", "neural_sim")
+    count: int = 6
+    draw_above: float = 0.3
+    overlap: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_methods(self.methods, "detection_gallery.methods")
+        at_least("detection_gallery", 1, count=self.count)
+        for key in ("draw_above", "overlap"):
+            if not 0.0 <= getattr(self, key) <= 1.0:
+                raise ValueError(f"detection_gallery.{key} must lie in [0, 1], got {getattr(self, key)}")
+
+    def run(self, context: Context) -> None:
+        """Train a detector on what every method learned, and publish the figure, counts and AP."""
+        context.experiment.check_boxes("detection_gallery")
+        graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
+        results = results_of_study(context)
+        test = results(context.graph.targets).test
+        found = {}
+        for method, graph in graphs.items():
+            scores = results(graph.scores(results(graph.learned).last, f"what {method} learned"))
+            found[method] = Found(scores.detections, scores.ap)
+        self.publish(context, test, found, context.graph.names)
+
+    def publish(
+        self, context: Context, test: LabelledImages, found: Mapping[str, Found], class_names: Sequence[str]
+    ) -> Run:
+        """Write detection_gallery.json, detection_gallery.md and the figure, and log counts and AP to MLflow."""
+        rows = torch.linspace(0, len(test) - 1, min(self.count, len(test))).round().long()
+        verdicts = {
+            method: judged(own.detections, test, self.draw_above, self.overlap)
+            for method, own in found.items()
+        }
+        counts = {method: count(every) for method, every in verdicts.items()}
+        methods = {
+            method: {**asdict(counts[method]), "ap": own.ap.ap, "ap50": own.ap.ap50}
+            for method, own in found.items()
+        }
+        note = (
+            f"{len(test)} test images; detections with a score of {self.draw_above:g} or more, right where they "
+            f"overlap a box of their class by {self.overlap:g} or more."
+        )
+        head = ["method", "right", "wrong", "missed boxes", "AP (0.50 to 0.95)", "AP50"]
+        cells = [
+            [method, each.right, each.wrong, each.missed]
+            + [f"{100 * value:.1f}" for value in (found[method].ap.ap, found[method].ap.ap50)]
+            for method, each in counts.items()
+        ]
+        detections = {method: own.detections for method, own in found.items()}
+        return context.publish(
+            "detection_gallery",
+            {"images": len(test), "shown": rows.tolist(), "methods": methods},
+            f"{note}\n\n{markdown_table(head, cells)}",
+            {"detections": detections_figure(test, detections, verdicts, class_names, rows)},
+            {f"{method}/{key}": value for method, own in methods.items() for key, value in own.items()},
+        )
+
+
 def judge(
     found: Detections, boxes: Float[Tensor, "b 4"], labels: Int[Tensor, "b"], above: float, overlap: float
 ) -> Judged:
-    """The best detection first, each takes the free box of its class that it overlaps most, by ``overlap`` or more; a
+    """Tell right detections of one image from wrong ones.
+
+    The best detection first, each takes the free box of its class that it overlaps most, by ``overlap`` or more; a
     second detection of a box is wrong.
     """
     order = found["scores"].argsort(descending=True, stable=True)
@@ -65,7 +151,7 @@ def judge(
 
 
 def judged(found: Sequence[Detections], test: LabelledImages, above: float, overlap: float) -> list[Judged]:
-    """Every test image."""
+    """Judge the detections of every test image."""
     truth = zip(test.boxes, test.labels, test.present, strict=True)
     return [
         judge(each, boxes[there], labels[there], above, overlap)
@@ -74,6 +160,7 @@ def judged(found: Sequence[Detections], test: LabelledImages, above: float, over
 
 
 def count(images: Sequence[Judged]) -> Counts:
+    """Count right and wrong detections, and missed boxes."""
     right = sum(int(each.right.sum()) for each in images)
     kept, missed = sum(len(each.kept) for each in images), sum(int(each.missed.sum()) for each in images)
     return Counts(right, kept - right, missed)
@@ -86,7 +173,7 @@ def detections_figure(
     class_names: Sequence[str],
     rows: Int[Tensor, "n"],
 ) -> Figure:
-    """A row for each method, a column for each of the test images ``rows``."""
+    """Draw a row for each method, a column for each of the test images ``rows``."""
     height, width = test.images.shape[-2:]
     side = 2.1
     figure = Figure(
@@ -149,61 +236,3 @@ def _box(axes: Any, box: Sequence[float], colour: str, dashed: bool) -> None:
     axes.add_patch(
         Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=width, linestyle=style)
     )
-
-
-def report_detections(
-    test: LabelledImages,
-    found: Mapping[str, Sequence[Detections]],
-    ap: Mapping[str, AveragePrecision],
-    class_names: Sequence[str],
-    rows: Int[Tensor, "n"],
-    above: float,
-    overlap: float,
-    experiment: str,
-    config: Mapping[str, Any],
-    uri: str,
-    folder: Path,
-    begun: float,
-) -> tracking.Run:
-    """The figure, detection_gallery.md and detection_gallery.json in ``folder``, and a run in MLflow that began at
-    ``begun`` (seconds since 1970).
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    verdicts = {method: judged(every, test, above, overlap) for method, every in found.items()}
-    counts = {method: count(every) for method, every in verdicts.items()}
-    drawn = detections_figure(test, found, verdicts, class_names, rows)
-    figures.save(drawn, folder / "figures" / "detections.png")
-    lines = [
-        f"{len(test)} test images; detections with a score of {above:g} or more, right where they overlap a box of "
-        f"their class by {overlap:g} or more.",
-        "",
-        "| method | right | wrong | missed boxes | AP (0.50 to 0.95) | AP50 |",
-        "|---|---|---|---|---|---|",
-    ]
-    for method, each in counts.items():
-        values = (
-            each.right,
-            each.wrong,
-            each.missed,
-            f"{100 * ap[method].ap:.1f}",
-            f"{100 * ap[method].ap50:.1f}",
-        )
-        lines.append(f"| {method} | " + " | ".join(map(str, values)) + " |")
-    text = "\n".join(lines)
-    (folder / "detection_gallery.md").write_text(text + "\n")
-    methods = {
-        method: {**asdict(each), **{key: _known(getattr(ap[method], key)) for key in ("ap", "ap50")}}
-        for method, each in counts.items()
-    }
-    document = {"images": len(test), "shown": rows.tolist(), "methods": methods}
-    (folder / "detection_gallery.json").write_text(json.dumps(document, indent=1, allow_nan=False))
-    print(text)
-    metrics = {f"{m}/{key}": v for m, each in methods.items() for key, v in each.items() if v is not None}
-    seed = str(config["seed"])
-    named = uri, experiment, f"seed {seed}", {"seed": seed}
-    return tracking.log_run(*named, tracking.flatten(config), metrics, {}, folder, begun)
-
-
-def _known(value: float) -> float | None:
-    """None for the AP of test images without a box."""
-    return value if value == value else None

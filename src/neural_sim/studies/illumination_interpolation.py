@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +13,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from neural_sim.cameras import orbit
+from neural_sim.documents import markdown_table
 from neural_sim.field.base import RadianceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.report import figures, tracking
 from neural_sim.report.figures import INK, MUTED
+from neural_sim.report.tracking import Run
+from neural_sim.tasks.context import Context
 from neural_sim.types import PinholeCamera
 
 UNCHANGED = 1e-6
@@ -42,7 +41,9 @@ class Interpolation:
         ends: numbers of the two anchor lights, from 1.
         steps: number of images, the ends included.
         image_size: in pixels.
-        phi_deg, rho_deg, distance: the camera's place; degrees and object radii.
+        phi_deg: the camera's first angle in degrees, see :func:`neural_sim.cameras.orbit`.
+        rho_deg: its second angle in degrees.
+        distance: its distance in object radii.
 
     Raises:
         ValueError: ends that are not two different lights, fewer than two steps or one pixel.
@@ -63,23 +64,27 @@ class Interpolation:
                 f"interpolation: want 2 steps and a pixel or more, got {self.steps} and {self.image_size}"
             )
 
-    def interpolated_views(
-        self,
-        fields: Mapping[str, RadianceField],
-        renderer: NerfWRenderer,
-        camera: PinholeCamera,
-        anchors: int,
-    ) -> dict[str, InterpolatedViews]:
-        """Every object's images, by name. Raises ``ValueError`` for a light that there is not."""
+    def run(self, context: Context) -> None:
+        """Render every object between the two lights, and publish the figure and how little opacity changed.
+
+        Raises:
+            ValueError: a light that is fixed, or one that does not exist.
+        """
+        views = context.experiment.imaging.views
+        if views.rig is None:
+            raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
+        anchors = views.rig.anchors
         if max(self.ends) > anchors:
             raise ValueError(f"interpolation.ends: there are {anchors} anchor lights, got {list(self.ends)}")
+        scene, camera = context.results(context.graph.scene), views.camera(self.image_size)
         place = [math.radians(self.phi_deg), math.radians(self.rho_deg), self.distance]
         pose = orbit(*(torch.tensor(value) for value in place))
         one, other = (torch.eye(anchors)[end - 1] for end in self.ends)
-        return {
-            name: interpolate(field, renderer, camera, pose, (one, other), self.steps)
-            for name, field in fields.items()
+        shown = {
+            name: interpolate(field, scene.lit_renderer, camera, pose, (one, other), self.steps)
+            for name, field in zip(scene.names, scene.fields, strict=True)
         }
+        publish(context, shown, "From light {} to light {}".format(*self.ends))
 
 
 def interpolate(
@@ -90,10 +95,11 @@ def interpolate(
     ends: tuple[Float[Tensor, "k"], Float[Tensor, "k"]],
     steps: int = 7,
 ) -> InterpolatedViews:
-    """Views over white from one camera under ``steps`` weights evenly spaced between two ends, these included.
+    """Render views over white from one camera under ``steps`` weights evenly spaced between two ends, these included.
 
-    Raises ``ValueError`` for fewer than two steps, and ``RuntimeError`` where opacity changes by more than
-    ``UNCHANGED``: the colour head must not reach the density.
+    Raises:
+        ValueError: fewer than two steps.
+        RuntimeError: opacity changes by more than ``UNCHANGED``, although the colour head must not reach the density.
     """
     if steps < 2:
         raise ValueError(f"interpolate: want at least 2 steps, got {steps}")
@@ -110,47 +116,29 @@ def interpolate(
     return InterpolatedViews(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
 
 
-def report_interpolation(
-    views: Mapping[str, InterpolatedViews],
-    title: str,
-    experiment: str,
-    config: Mapping[str, Any],
-    uri: str,
-    folder: Path,
-    begun: float,
-) -> tracking.Run:
-    """The figure, interpolation.md and interpolation.json in ``folder``, and a run in MLflow that began at ``begun``
-    (seconds since 1970).
-    """
-    figures.save(interpolation_figure(views, title), folder / "figures" / "interpolation.png")
+def publish(context: Context, views: Mapping[str, InterpolatedViews], title: str) -> Run:
+    """Write interpolation.json, interpolation.md and the figure, and log the changes of opacity to MLflow."""
     changes = {name: own.opacity_change for name, own in views.items()}
-    (folder / "interpolation.json").write_text(json.dumps({"opacity_change": changes}, indent=1))
-    text = table(views, title)
-    (folder / "interpolation.md").write_text(text + "\n")
-    print(text)
+    drawn = {"interpolation": interpolation_figure(views, title)}
     metrics = {f"{name}/opacity_change": change for name, change in changes.items()}
-    seed = str(config["seed"])
-    named = uri, experiment, f"seed {seed}", {"seed": seed}
-    return tracking.log_run(*named, tracking.flatten(config), metrics, {}, folder, begun)
+    document = {"opacity_change": changes}
+    return context.publish("interpolation", document, table(views, title), drawn, metrics)
 
 
 def table(views: Mapping[str, InterpolatedViews], title: str) -> str:
-    """Markdown: how much colour and opacity change on the way."""
+    """Return Markdown: how much colour and opacity change on the way."""
     count = len(next(iter(views.values())).images)
-    lines = [
-        f"{title} in {count} images from one camera. Colours are of 0 to 1.",
-        "",
-        "| object | largest change of opacity | mean change of colour from the first light to the last |",
-        "|---|---|---|",
+    head = ["object", "largest change of opacity", "mean change of colour from the first light to the last"]
+    rows = [
+        (name, f"{own.opacity_change:.0e}", f"{float((own.images[-1] - own.images[0]).abs().mean()):.3f}")
+        for name, own in views.items()
     ]
-    for name, own in views.items():
-        colour = float((own.images[-1] - own.images[0]).abs().mean())
-        lines.append(f"| {name} | {own.opacity_change:.0e} | {colour:.3f} |")
-    return "\n".join(lines)
+    note = f"{title} in {count} images from one camera. Colours are of 0 to 1."
+    return f"{note}\n\n{markdown_table(head, rows)}"
 
 
 def interpolation_figure(views: Mapping[str, InterpolatedViews], title: str) -> Figure:
-    """A row for each object, from its first light on the left to its second on the right."""
+    """Draw a row for each object, from its first light on the left to its second on the right."""
     count, height, width = next(iter(views.values())).images.shape[:3]
     canvas = np.concatenate(
         [np.concatenate(list(row.images.cpu().numpy()), axis=1) for row in views.values()], axis=0

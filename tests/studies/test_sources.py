@@ -9,7 +9,8 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.report.bootstrap import match
-from neural_sim.report.side_by_side import report_side_by_side, side_by_side, table
+from neural_sim.report.score_table import ScoreTable
+from neural_sim.studies.sources import SideBySide, publish, table
 from neural_sim.types import LabelledImages
 
 BOX = torch.tensor([[10.0, 10.0, 30.0, 30.0]])
@@ -36,9 +37,8 @@ def found(draws=200):
     images = truth(24)
     hits = ([True] * 24, [True] * 24, [i % 2 == 0 for i in range(24)])
     rows = [[match(detections(images, hit), images, label) for label in (0, 1)] for hit in hits]
-    return side_by_side(
-        {"single": [rows, rows]}, ["nerf", "mesh", "other"], ["can", "mug"], [0, 1], {"single": 48}, draws
-    )
+    outcomes = {source: [row, row] for source, row in zip(("nerf", "mesh", "other"), rows, strict=True)}
+    return SideBySide.of({"single": ScoreTable.of(outcomes, ["can", "mug"], draws)}, [0, 1], {"single": 48})
 
 
 def test_ap_and_paired_differences():
@@ -60,16 +60,15 @@ def test_the_interval_covers_the_spread_over_images():
         d if h else {k: v[:0] for k, v in d.items()}
         for d, h in zip(detections(images, hit), hit, strict=True)
     ]
-    rows = [[match(kept, images, label) for label in (0, 1)]] * 2
-    estimate = side_by_side(
-        {"single": [rows]}, ["nerf", "mesh"], ["can", "mug"], [0], {"single": 400}, 300
-    ).ap["single"]["nerf"]
+    row = [match(kept, images, label) for label in (0, 1)]
+    table_of_one = ScoreTable.of({"nerf": [row], "mesh": [row]}, ["can", "mug"], 300)
+    estimate = SideBySide.of({"single": table_of_one}, [0], {"single": 400}).ap["single"]["nerf"]
     # 101 recalls: AP is the fraction to within 1/101.
     assert estimate.value == pytest.approx(hit.mean(), abs=0.011)
     assert estimate.high - estimate.low == pytest.approx(2 * 1.96 * 0.025, rel=0.25)
 
 
-def test_the_table_and_the_files_have_every_source(tmp_path, uri):
+def test_the_table_and_the_files_have_every_source(context):
     result, shown = found(20), LabelledImages.concatenate([truth(4)] * 3)
     text = table(result, "A heading.")
     assert "| single | 48 | 100.0 (100.0 to 100.0) |" in text and "nerf ahead of other by" in text
@@ -77,13 +76,11 @@ def test_the_table_and_the_files_have_every_source(tmp_path, uri):
     assert "| **50.0** (" in text and "Differences in bold exceed the spread." in text
     one = table(replace(result, seeds=(0,)), "A heading.")
     assert "**" not in one and "bold" not in one and "intervals over test images; seed 0." in one
-    run = report_side_by_side(
-        result, shown, ["can", "mug"], "A heading.", "nerf_vs_mesh", {"seed": 0}, uri, tmp_path / "run", 0.0
-    )
-    document = json.loads((tmp_path / "run" / "nerf_vs_mesh.json").read_text())
+    run = publish(context, result, shown, ["can", "mug"], "A heading.")
+    document = json.loads((context.folder / "study.json").read_text())
     assert document["ap"]["single"]["other"]["value"] == pytest.approx(0.5)
-    assert {path.name for path in (tmp_path / "run" / "figures").iterdir()} == {
+    assert {path.name for path in (context.folder / "figures").iterdir()} == {
         "ap.png",
         "training_images.png",
     }
-    assert MlflowClient(uri).get_run(run.run_id).data.metrics["single/mesh/ap"] == pytest.approx(1.0)
+    assert MlflowClient(context.uri).get_run(run.run_id).data.metrics["single/mesh/ap"] == pytest.approx(1.0)

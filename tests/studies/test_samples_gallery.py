@@ -5,7 +5,7 @@ import json
 import torch
 from mlflow import MlflowClient
 
-from neural_sim.report.gallery import Samples, report_samples, samples_figure, table
+from neural_sim.studies.samples_gallery import Samples, publish, samples_figure, table
 from neural_sim.types import LabelledImages
 
 
@@ -31,17 +31,17 @@ def test_the_figure_has_a_panel_for_each_method_and_one_of_test_images():
     assert titles[0] == "neural_sim (total variation to the target: pose 0.25)" and titles[2] == "test images"
 
 
-def test_distances_are_tabled_where_the_target_is_known(tmp_path, uri):
+def test_distances_are_tabled_where_the_target_is_known(context):
     unknown = samples("mug", {"neural_sim": None, "auto_sim": None})
     assert "| pitcher, pose | 0.25 | 0.50 |" in table([samples(), unknown]) and "mug" not in table(
         [samples(), unknown]
     )
-    run = report_samples([samples(), unknown], 9, "samples_gallery", {"seed": 0}, uri, tmp_path / "run", 0.0)
-    document = json.loads((tmp_path / "run" / "samples_gallery.json").read_text())
+    run = publish(context, [samples(), unknown], 9)
+    document = json.loads((context.folder / "samples_gallery.json").read_text())
     assert (
         document["pitcher"]["images"] == {"neural_sim": 18, "auto_sim": 18} and document["mug"]["test"] == 7
     )
-    assert {path.stem for path in (tmp_path / "run" / "figures").iterdir()} == {"pitcher", "mug"}
-    assert MlflowClient(uri).get_run(run.run_id).data.metrics == {
+    assert {path.stem for path in (context.folder / "figures").iterdir()} == {"pitcher", "mug"}
+    assert MlflowClient(context.uri).get_run(run.run_id).data.metrics == {
         "pitcher/pose/neural_sim": 0.25, "pitcher/pose/auto_sim": 0.5,
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Studies with a stage of their own: what they need, which methods and images they compare."""
+"""What studies need, and which methods, seeds and images they compare."""
 
 import json
 from pathlib import Path
@@ -8,15 +8,15 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import UserError, _with, conf_directory, context_of
-from neural_sim.stages.nerf_vs_mesh import NerfVsMeshStep
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage
 from neural_sim.stages.reconstruction import ReconstructionStage
-from neural_sim.stages.side_by_side import graphs_of_seeds, sets_of_kinds
+from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
+from neural_sim.studies.nerf_vs_mesh import NerfVsMesh
 from neural_sim.synthesis.export.coco import write_coco
 from neural_sim.types import LabelledImages
 
 
-def context(*overrides):
+def command(*overrides):
     """Of a command, with its other methods."""
 
     def composed(more=()):
@@ -50,7 +50,7 @@ def context(*overrides):
 )
 def test_data_that_is_not_there_stops_the_run_with_one_line(overrides, keys):
     with pytest.raises(UserError) as caught:
-        context(*overrides)
+        command(*overrides)
     assert all(key in str(caught.value) for key in keys) and "\n" not in str(caught.value)
 
 
@@ -67,13 +67,13 @@ def test_data_that_is_not_there_stops_the_run_with_one_line(overrides, keys):
 )
 def test_bad_settings_are_refused_by_name(wrong):
     with pytest.raises(UserError, match=wrong[1].split("=")[0].split(".")[0]):
-        context(*wrong)
+        command(*wrong)
 
 
 def test_another_method_is_what_its_own_command_would_compose():
     """Apart from ``stages`` and the study's own node, which follow from the experiment."""
-    run, _ = context("+experiment=samples_gallery", "baseline=ns", "seed=3")
-    own, _ = context("+experiment=samples_gallery", "baseline=auto_sim", "seed=3")
+    run, _ = command("+experiment=samples_gallery", "baseline=ns", "seed=3")
+    own, _ = command("+experiment=samples_gallery", "baseline=auto_sim", "seed=3")
     assert run.of_method("auto_sim").config == own.config and run.config != own.config
     assert run.experiment.loop.method.name == "ns" and run.of_method("ns").config == run.config
     with pytest.raises(Exception, match="baseline/theirs"):
@@ -91,7 +91,7 @@ def test_choices_take_the_place_of_those_of_the_same_group():
 
 
 def test_nerf_and_mesh_share_all_but_what_is_rendered():
-    run, steps = context("+experiment=nerf_vs_mesh", "seed=5")
+    run, steps = command("+experiment=nerf_vs_mesh", "seed=5")
     first, second = graphs_of_seeds(run, 2)
     nerf, mesh = steps["nerf_vs_mesh"].sources(first).values()
     assert isinstance(mesh, MeshDetectorStage) and nerf.key != mesh.key
@@ -115,8 +115,8 @@ def test_blenderproc_images_take_the_place_of_the_mesh_renderers(tmp_path, folde
     images = LabelledImages(pixels, boxes, torch.tensor([[0], [1]]), torch.zeros(2, dtype=torch.long))
     (output / folder).mkdir(parents=True)
     write_coco(images, ["red mug", "can"], output / folder).rename(output / folder / "coco_annotations.json")
-    run, _ = context("+experiment=nerf_vs_mesh")
-    step = NerfVsMeshStep(blenderproc=str(output), categories={"red mug": "mug"})
+    run, _ = command("+experiment=nerf_vs_mesh")
+    step = NerfVsMesh(blenderproc=str(output), categories={"red mug": "mug"})
     stage = step.sources(run.graph)["blenderproc"]
     assert isinstance(stage, CocoDetectorStage)
 
@@ -127,12 +127,12 @@ def test_blenderproc_images_take_the_place_of_the_mesh_renderers(tmp_path, folde
     document = json.loads((output / folder / "coco_annotations.json").read_text())
     document["annotations"][0]["bbox"][0] += 1
     (output / folder / "coco_annotations.json").write_text(json.dumps(document))
-    other = NerfVsMeshStep(blenderproc=str(output), categories={"red mug": "mug"}).sources(run.graph)
+    other = NerfVsMesh(blenderproc=str(output), categories={"red mug": "mug"}).sources(run.graph)
     assert other["blenderproc"].key != key  # the contents are part of the key
 
 
 def test_objects_of_photographs_alone_are_refused_before_anything_is_rendered(tmp_path):
-    run, steps = context(
+    run, steps = command(
         "+experiment=nerf_vs_mesh", "target=coco", "target.annotations=" + str(_labels(tmp_path))
     )
     with pytest.raises(ValueError, match="want target=rendered"):
@@ -152,7 +152,7 @@ def _labels(folder):
 
 def test_a_reconstruction_is_what_the_store_gives_back(tmp_path):
     """From a cube's views without those held out, packed and unpacked."""
-    run, _ = context("+experiment=sfm_vs_nerf", "objects.names=[flat_box]", "views.held_out=2")
+    run, _ = command("+experiment=sfm_vs_nerf", "objects.names=[flat_box]", "views.held_out=2")
     stage = ReconstructionStage(run.graph.views[0], 32)
     views = run.graph.views[0].make(None)
 
@@ -176,4 +176,4 @@ def test_a_reconstruction_is_what_the_store_gives_back(tmp_path):
 )
 def test_bad_settings_of_the_reconstruction_are_refused(wrong):
     with pytest.raises(UserError, match=wrong.split("=")[0].split(".")[1]):
-        context("+experiment=sfm_vs_nerf", wrong)
+        command("+experiment=sfm_vs_nerf", wrong)

@@ -1,32 +1,33 @@
-"""Stage ``sfm_vs_nerf``: fields against meshes reconstructed from the same views, as conf/experiment/sfm_vs_nerf.yaml
-says.
-"""
+"""Fields against meshes reconstructed from the same views, on held-out views and as training images (Sec. A.5)."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from neural_sim.alpha import over_white, premultiplied
 from neural_sim.checks import at_least
+from neural_sim.documents import markdown_table
 from neural_sim.field.hull import COARSEST
 from neural_sim.field.scores import compare, where_known
 from neural_sim.objects.mesh import ObjectMesh, content_digest
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
-from neural_sim.report.reconstruction import HeldOut, held_out_figure, held_out_table
-from neural_sim.report.side_by_side import report_side_by_side
+from neural_sim.report.figures import INK
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.other_images import trained_on
 from neural_sim.stages.reconstruction import ReconstructionDetectorStage, ReconstructionStage
-from neural_sim.stages.side_by_side import compare_sources, graphs_of_seeds, pairs, results_of_study
 from neural_sim.stages.stage import Results
+from neural_sim.studies.graphs import graphs_of_seeds, results_of_study
+from neural_sim.studies.sources import More, compare_sources, publish, training_images
 from neural_sim.tasks.context import Context
 from neural_sim.types import PosedViews
 
@@ -35,8 +36,21 @@ UNLIT = Lighting(lights=(), ambient=1.0)
 
 
 @dataclass(frozen=True)
-class SfmVsNerfStep:
-    """The paper's Sec. A.5: what a reconstructed mesh lacks beside a field, on held-out views and as training images.
+class HeldOut:
+    """One object on views that neither its field nor its reconstruction has seen.
+
+    ``images`` are the first such view as it is (``view``) and by each source, over white; ``scores`` are each source's
+    ``psnr``, ``psnr_foreground`` (dB) and ``ssim`` on all of them.
+    """
+
+    object: str
+    images: Mapping[str, Float[Tensor, "h w 3"]]
+    scores: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class SfmVsNerf:
+    """``+experiment=sfm_vs_nerf``: what a reconstructed mesh lacks that a field has.
 
     Args:
         resolution: cells of the reconstruction along the unit sphere's diameter, a power of two from 32.
@@ -62,12 +76,12 @@ class SfmVsNerfStep:
             )
 
     def run(self, context: Context) -> None:
-        """PSNR on held-out views, AP, and figures of both; to the run's folder and MLflow.
+        """Score on held-out views and by detectors, and publish.
 
         Raises:
             ValueError: no held-out view.
         """
-        x, begun, results = context.experiment, time.time(), results_of_study(context)
+        x, results = context.experiment, results_of_study(context)
         graphs, names = graphs_of_seeds(context, self.seeds), list(context.graph.names)
         if not x.imaging.views.held_out:
             raise ValueError("sfm_vs_nerf: want views.held_out of at least 1, got 0")
@@ -81,14 +95,14 @@ class SfmVsNerfStep:
             return {"nerf": nerf, "sfm": trained_on(nerf, ReconstructionDetectorStage, **more)}
 
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)
-        scores = {each.object: dict(each.scores) for each in objects}
-        run = report_side_by_side(
-            found, pairs(graphs[0], results, sources(graphs[0]), self.shown), names,
-            "Detectors trained on images of fields (nerf) and of meshes reconstructed from the same views (sfm).",
-            x.run.name, x.config, context.uri, context.folder, begun,
-            {"held_out": scores}, held_out_table(objects), {"held_out": held_out_figure(objects)},
-        )  # fmt: skip
-        print(f"results: {context.folder}\n{run.where}")
+        shown = training_images(graphs[0], results, sources(graphs[0]), self.shown)
+        heading = "Detectors trained on images of fields (nerf) and of meshes reconstructed from the same views (sfm)."
+        more = More(
+            {"held_out": {each.object: dict(each.scores) for each in objects}},
+            held_out_table(objects),
+            {"held_out": held_out_figure(objects)},
+        )
+        publish(context, found, shown, names, heading, more)
 
     def _meshes(
         self, graph: Graph, stages: tuple[ReconstructionStage, ...], results: Results
@@ -102,7 +116,7 @@ class SfmVsNerfStep:
         )
 
     def _held_out(self, graph: Graph, results: Results, label: int, mesh: Subject) -> HeldOut:
-        """Held-out views of an object, as they are, by its field, and by its reconstruction."""
+        """Render the held-out views of an object by its field and by its reconstruction, and score them."""
         views = results(graph.views[label])
         unseen = views.select(torch.arange(len(views) - graph.views[label].held_out, len(views)))
         renderer = graph.experiment.imaging.renderer
@@ -114,5 +128,40 @@ class SfmVsNerfStep:
         return HeldOut(mesh.name, {name: over_white(image[0]) for name, image in rendered.items()}, scores)
 
 
-def _as_seen(subject: Subject, views: PosedViews) -> torch.Tensor:
+def _as_seen(subject: Subject, views: PosedViews) -> Float[Tensor, "views h w 4"]:
     return where_known(premultiplied(subject.render(views.camera, views.camera_to_world)), views)
+
+
+def held_out_table(objects: Sequence[HeldOut]) -> str:
+    """Return Markdown: PSNR of whole images and of the object's pixels, by object and their mean."""
+    sources = list(objects[0].scores)
+    rows = {
+        each.object: [each.scores[s][key] for s in sources for key in ("psnr", "psnr_foreground")]
+        for each in objects
+    }
+    rows["mean"] = np.mean(list(rows.values()), 0).tolist()
+    head = ["object", *(name for source in sources for name in (source, f"{source}, object"))]
+    cells = [[name, *(f"{value:.1f}" for value in row)] for name, row in rows.items()]
+    note = "PSNR on held-out views in dB, whole images over white, and of the pixels that show the object."
+    return f"{note}\n\n{markdown_table(head, cells)}"
+
+
+def held_out_figure(objects: Sequence[HeldOut]) -> Figure:
+    """Draw a column for each object, a row for its view and for each source."""
+    rows = list(objects[0].images)
+    figure = Figure(figsize=(1.6 * len(objects) + 0.5, 1.75 * len(rows) + 0.5), layout="constrained")
+    grid = figure.subplots(len(rows), len(objects), squeeze=False)
+    for column, each in enumerate(objects):
+        for line, name in enumerate(rows):
+            axes = grid[line, column]
+            axes.imshow(each.images[name].clamp(0.0, 1.0).cpu().numpy())
+            axes.set(xticks=[], yticks=[])
+            for spine in axes.spines.values():
+                spine.set_visible(False)
+            if name in each.scores:
+                axes.set_xlabel(f"{each.scores[name]['psnr']:.1f} dB", color=INK, fontsize=8)
+        grid[0, column].set_title(each.object, color=INK, fontsize=9)
+    for line, name in enumerate(rows):
+        grid[line, 0].set_ylabel(name, color=INK, fontsize=9)
+    figure.suptitle("A held-out view; PSNR over all of them", color=INK, fontsize=11)
+    return figure

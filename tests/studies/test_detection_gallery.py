@@ -7,13 +7,14 @@ import torch
 from mlflow import MlflowClient
 
 from neural_sim.detector.metrics import AveragePrecision
-from neural_sim.report.detection_gallery import (
+from neural_sim.studies.detection_gallery import (
     Counts,
+    DetectionGallery,
+    Found,
     count,
     detections_figure,
     judge,
     judged,
-    report_detections,
 )
 from neural_sim.types import LabelledImages
 
@@ -90,16 +91,14 @@ def test_a_caption_stays_in_its_image(box):
     assert image.y0 - 1 <= words.y0 and words.y1 <= image.y1 + 1
 
 
-def test_the_files_and_the_run_have_every_method(tmp_path, uri):
+def test_the_files_and_the_run_have_every_method(context):
     test, found = gallery()
-    ap = {m: AveragePrecision(0.25, 0.5, {"can": 0.5, "mug": 0.0}, {"can": 1.0, "mug": 0.0}) for m in found}
-    run = report_detections(
-        test, found, ap, ["can", "mug"], torch.tensor([0, 2]), 0.3, 0.5, "detection_gallery", {"seed": 1}, uri,
-        tmp_path / "run", 0.0,
-    )  # fmt: skip
-    document = json.loads((tmp_path / "run" / "detection_gallery.json").read_text())
+    ap = AveragePrecision(0.25, 0.5, {"can": 0.5, "mug": 0.0}, {"can": 1.0, "mug": 0.0})
+    found = {method: Found(every, ap) for method, every in found.items()}
+    run = DetectionGallery(count=2).publish(context, test, found, ["can", "mug"])
+    document = json.loads((context.folder / "detection_gallery.json").read_text())
     assert document["methods"]["neural_sim"] == {"right": 2, "wrong": 1, "missed": 3, "ap": 0.25, "ap50": 0.5}
     assert document["shown"] == [0, 2]
-    assert "| ns | 0 | 3 | 5 | 25.0 | 50.0 |" in (tmp_path / "run" / "detection_gallery.md").read_text()
-    assert (tmp_path / "run" / "figures" / "detections.png").stat().st_size > 5000
-    assert MlflowClient(uri).get_run(run.run_id).data.metrics["ns/wrong"] == 3.0
+    assert "| ns | 0 | 3 | 5 | 25.0 | 50.0 |" in (context.folder / "detection_gallery.md").read_text()
+    assert (context.folder / "figures" / "detections.png").stat().st_size > 5000
+    assert MlflowClient(context.uri).get_run(run.run_id).data.metrics["ns/wrong"] == 3.0

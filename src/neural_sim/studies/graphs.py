@@ -1,0 +1,59 @@
+"""The experiments that a study compares: the same one with other seeds, with other methods, with other target sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Results
+from neural_sim.stages.store import Store
+from neural_sim.stages.target_sets import TargetSetsStage
+from neural_sim.tasks.context import Context
+from neural_sim.tasks.walk import STEPS
+
+
+def check_methods(methods: Sequence[str], key: str) -> None:
+    """Refuse a list of methods, the setting ``key``, that is empty or names one twice.
+
+    Raises:
+        ValueError: for such a list.
+    """
+    if not methods or len(set(methods)) < len(methods):
+        raise ValueError(f"{key}: want different names of baselines, got {list(methods)}")
+
+
+def graphs_of_methods(context: Context, methods: Sequence[str], key: str) -> dict[str, Graph]:
+    """Compose the same command with each ``baseline=...``; all are built here, so that bad ones are refused at once.
+
+    Raises:
+        ValueError: an unknown method, or a context that cannot compose; ``key`` is the setting's name.
+    """
+    if context.of_method is None:
+        raise ValueError(f"{key}: this context composes no other method's configuration")
+    return {method: Graph(context.of_method(method)) for method in methods}
+
+
+def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
+    """Return the experiment's stages for the run's seed and those that follow it.
+
+    Raises:
+        ValueError: a task other than detection.
+    """
+    x = context.experiment
+    x.check_boxes("a comparison of sources of images")
+    return [Graph(replace(x, run=replace(x.run, seed=x.run.seed + i))) for i in range(seeds)]
+
+
+def results_of_study(context: Context) -> Results:
+    """Return the context's results, which also computes what a study compares and ``stages`` does not list."""
+    return Results(Store(context.experiment.run.store), {*context.stages, *STEPS}, context.account.reused)
+
+
+def sets_of_kinds(graph: Graph, kinds: Mapping[str, Sequence[int]]) -> dict[str, TargetSetsStage]:
+    """Return the target sets with other numbers of objects an image, by the name of each kind."""
+    synthesis = graph.experiment.imaging.synthesis
+    return {
+        kind: replace(graph.targets, synthesizer=replace(synthesis, objects_per_image=tuple(count)))
+        for kind, count in kinds.items()
+    }

@@ -1,0 +1,179 @@
+"""Training images drawn from what each method learned, and test images (the paper's Sec. C.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from neural_sim.checks import at_least
+from neural_sim.documents import markdown_table
+from neural_sim.parameter.distributions import total_variation
+from neural_sim.report.figures import INK
+from neural_sim.report.tracking import Run
+from neural_sim.stages.graph import Graph, Psi
+from neural_sim.stages.stage import Results
+from neural_sim.studies.graphs import check_methods, graphs_of_methods, results_of_study
+from neural_sim.tasks.context import Context
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class Samples:
+    """One object: images by method, and test images.
+
+    ``distances`` are by method the total variation of each factor's learned distribution to the target's, None where
+    the target's is unknown.
+    """
+
+    object: str
+    images: Mapping[str, LabelledImages]
+    test: LabelledImages
+    distances: Mapping[str, Mapping[str, float] | None]
+
+
+@dataclass(frozen=True)
+class SamplesGallery:
+    """``+experiment=samples_gallery``.
+
+    Args:
+        methods: baselines whose psi is learned, with the settings that each would have in a run of its own.
+        count: images of each object.
+        columns: images in a row.
+        objects: names of the objects that are shown; None: those with a biased start.
+
+    Raises:
+        ValueError: no method, or a number below 1.
+    """
+
+    methods: Sequence[str] = ("neural_sim", "auto_sim")
+    count: int = 18
+    columns: int = 9
+    objects: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        check_methods(self.methods, "samples_gallery.methods")
+        at_least("samples_gallery", 1, count=self.count, columns=self.columns)
+
+    def run(self, context: Context) -> None:
+        """Draw from what every method learned, and publish a figure for each object and the distances.
+
+        Raises:
+            ValueError: an unknown object.
+        """
+        graph = context.graph
+        names = tuple(self.objects or context.experiment.imaging.distribution.biased)
+        if not names or set(names) - set(graph.names):
+            raise ValueError(f"samples_gallery.objects: want some of {list(graph.names)}, got {list(names)}")
+        graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
+        results = results_of_study(context)
+        learned = {method: results(other.learned).last for method, other in graphs.items()}
+        drawn = {method: self._drawn(graphs[method], results, psi) for method, psi in learned.items()}
+        test = results(graph.targets).test
+        samples = []
+        for name in names:
+            label = graph.names.index(name)
+            images = {method: parts[label] for method, parts in drawn.items()}
+            distances = {method: _distance(graphs[method], psi, label) for method, psi in learned.items()}
+            samples.append(Samples(name, images, self._shown(test, label), distances))
+        publish(context, samples, self.columns)
+
+    def _drawn(self, graph: Graph, results: Results, psi: Psi) -> list[LabelledImages]:
+        """Draw ``count`` images of every object from its learned distribution."""
+        generator = torch.Generator().manual_seed(graph.experiment.run.seed)
+        rendered = results(graph.scene).training_set(psi, self.count, generator)
+        images = rendered.images.to("cpu")
+        # Where an image shows several objects, these are the ones drawn for this object.
+        return [
+            images.select(torch.arange(label * self.count, (label + 1) * self.count))
+            for label in range(len(graph.names))
+        ]
+
+    def _shown(self, test: LabelledImages, label: int) -> LabelledImages:
+        """Choose test images that show an object, evenly spaced."""
+        rows = (test.labels == label).any(-1).nonzero().squeeze(-1)
+        chosen = torch.linspace(0, len(rows) - 1, min(self.count, len(rows))).round().long()
+        return test.select(rows[chosen])
+
+
+def _distance(graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
+    """Return the total variation to the target by factor; None where the target's p is not known."""
+    imaging, target = graph.experiment.imaging, graph.target_psi
+    if target is None:
+        return None
+    found, wanted = (imaging.distribution.probabilities(p) for p in (psi, target))
+    return {name: float(total_variation(found[name][label], wanted[name][label])) for name in wanted}
+
+
+def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run:
+    """Write samples_gallery.json, samples_gallery.md and a figure for each object, and log the distances to MLflow."""
+    document = {
+        each.object: {
+            "images": {method: len(images) for method, images in each.images.items()},
+            "test": len(each.test),
+            "total_variation": dict(each.distances),
+        }
+        for each in samples
+    }
+    metrics = {
+        f"{each.object}/{factor}/{method}": value
+        for each in samples
+        for method, distances in each.distances.items()
+        for factor, value in (distances or {}).items()
+    }
+    drawn = {each.object: samples_figure(each, columns) for each in samples}
+    return context.publish("samples_gallery", document, table(samples), drawn, metrics)
+
+
+def table(samples: Sequence[Samples]) -> str:
+    """Return Markdown: distances by object and factor."""
+    methods = list(samples[0].images)
+    rows = [
+        [
+            f"{each.object}, {factor}",
+            *(f"{(each.distances[method] or {})[factor]:.2f}" for method in methods),
+        ]
+        for each in samples
+        for factor in dict.fromkeys(factor for known in each.distances.values() for factor in known or {})
+    ]
+    note = "Total variation of the learned distribution to the target's; figures/ has images of each."
+    return f"{note}\n\n{markdown_table(['object, factor', *methods], rows)}"
+
+
+def samples_figure(samples: Samples, columns: int) -> Figure:
+    """Draw a panel for each method and one of test images, each of rows of ``columns`` images."""
+    panels = {
+        method: (images, _caption(samples.distances[method])) for method, images in samples.images.items()
+    }
+    panels["test images"] = (samples.test, "")
+    heights = [0.4 + 1.05 * -(-len(images) // columns) for images, _ in panels.values()]
+    total = sum(heights) + 0.35
+    figure = Figure(figsize=(1.05 * columns + 0.2, total))
+    top = total - 0.35
+    for (name, (images, caption)), height in zip(panels.items(), heights, strict=True):
+        axes = figure.add_axes((0.01, (top - height) / total, 0.98, (height - 0.4) / total))
+        axes.imshow(_canvas(images, columns))
+        axes.set_axis_off()
+        axes.set_title(name + caption, loc="left", color=INK, fontsize=9)
+        top -= height
+    figure.suptitle(f"{samples.object}: images drawn from what was learned", color=INK, fontsize=11)
+    return figure
+
+
+def _caption(distances: Mapping[str, float] | None) -> str:
+    parts = [f"{factor} {value:.2f}" for factor, value in (distances or {}).items()]
+    return f" (total variation to the target: {', '.join(parts)})" if parts else ""
+
+
+def _canvas(images: LabelledImages, columns: int) -> np.ndarray:
+    """Lay images out row by row with white gaps."""
+    height, width = images.images.shape[-2:]
+    gap, rows = max(1, width // 32), max(1, -(-len(images) // columns))
+    canvas = np.ones((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), dtype=np.float32)
+    for i, image in enumerate(images.images.clamp(0.0, 1.0).movedim(1, -1).cpu().numpy()):
+        y, x = i // columns * (height + gap), i % columns * (width + gap)
+        canvas[y : y + height, x : x + width] = image
+    return canvas

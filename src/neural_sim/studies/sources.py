@@ -1,0 +1,210 @@
+"""AP of detectors trained on images of several sources, seed by seed: what nerf_vs_mesh and sfm_vs_nerf share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from neural_sim.documents import markdown_table
+from neural_sim.report import figures
+from neural_sim.report.bootstrap import Outcomes, match
+from neural_sim.report.compare import points
+from neural_sim.report.figures import CLASS_COLOURS, GRID, INK
+from neural_sim.report.intervals import Estimate
+from neural_sim.report.score_table import ScoreTable
+from neural_sim.report.tracking import Run
+from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.evaluate import ScoresStage
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Results
+from neural_sim.stages.target_sets import TargetSetsStage
+from neural_sim.tasks.context import Context
+from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Scores of every source's detectors, by test set.
+
+    Attributes:
+        sources: names of the sources of training images.
+        seeds: of the detectors.
+        images: the number of test images, of all seeds together.
+        ap: every source's mean over classes and seeds.
+        ahead: by how much the first source exceeds each other one.
+        per_class: every source's AP by class, the mean over seeds.
+    """
+
+    sources: tuple[str, ...]
+    seeds: tuple[int, ...]
+    images: Mapping[str, int]
+    ap: Mapping[str, Mapping[str, Estimate]]
+    ahead: Mapping[str, Mapping[str, Estimate]]
+    per_class: Mapping[str, Mapping[str, Mapping[str, float]]]
+
+    @staticmethod
+    def of(tables: Mapping[str, ScoreTable], seeds: Sequence[int], images: Mapping[str, int]) -> SideBySide:
+        """Summarise the score table of every test set."""
+        first, *others = sources = next(iter(tables.values())).detectors
+        return SideBySide(
+            sources,
+            tuple(seeds),
+            images,
+            {kind: {source: table.mean(source) for source in sources} for kind, table in tables.items()},
+            {kind: {other: table.ahead(first, other) for other in others} for kind, table in tables.items()},
+            {kind: {source: table.by_class(source) for source in sources} for kind, table in tables.items()},
+        )
+
+
+def compare_sources(
+    graphs: list[Graph],
+    results: Results,
+    sources: Callable[[Graph], Mapping[str, DetectorStage]],
+    tests: Callable[[Graph], Mapping[str, TargetSetsStage]],
+    draws: int,
+) -> SideBySide:
+    """Score every source's detector of every seed on every test set; the others are compared with the first source.
+
+    All sources of a seed are scored on the same test images, so that differences are paired.
+
+    Args:
+        graphs: one a seed.
+        results: of stages.
+        sources: a graph's detectors by the source of their images.
+        tests: a graph's target sets by kind.
+        draws: of the bootstrap over test images.
+    """
+    outcomes: dict[str, dict[str, list[list[Outcomes]]]] = {}
+    images: dict[str, int] = {}
+    names = list(graphs[0].names)
+    for graph in graphs:
+        for kind, targets in tests(graph).items():
+            test = results(targets).test
+            images[kind] = images.get(kind, 0) + len(test)
+            for source, stage in sources(graph).items():
+                found = results(ScoresStage(stage, targets)).detections
+                of_classes = [match(found, test, label) for label in range(len(names))]
+                outcomes.setdefault(kind, {}).setdefault(source, []).append(of_classes)
+    tables = {kind: ScoreTable.of(rows, names, draws) for kind, rows in outcomes.items()}
+    return SideBySide.of(tables, [graph.experiment.run.seed for graph in graphs], images)
+
+
+def training_images(
+    graph: Graph, results: Results, sources: Mapping[str, DetectorStage], count: int
+) -> LabelledImages:
+    """Return ``count`` training images of every source, source by source, spread evenly over those of each.
+
+    Where the sources share their draws, the images show the same scenes.
+    """
+    parts = []
+    for stage in sources.values():
+        images = stage.images(results).images.to("cpu")
+        rows = torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
+        parts.append(images.select(rows))
+    return LabelledImages.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class More:
+    """What a study adds to the tables and figures of its sources."""
+
+    document: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    text: str = ""
+    figures: Mapping[str, Figure] = dataclasses.field(default_factory=dict)
+
+
+def publish(
+    context: Context,
+    found: SideBySide,
+    shown: LabelledImages,
+    classes: Sequence[str],
+    heading: str,
+    more: More | None = None,
+) -> Run:
+    """Write the table, the document and the figures, and log every source's AP to MLflow.
+
+    Args:
+        context: the study's.
+        found: the scores.
+        shown: training images of every source, source by source.
+        classes: names of the classes.
+        heading: what the sources are.
+        more: what is added.
+    """
+    more = more or More()
+    rows = "; ".join(f"row {i + 1}: {source}" for i, source in enumerate(found.sources))
+    grid = figures.image_grid(
+        shown, classes, len(shown) // len(found.sources), title=f"Training images, {rows}"
+    )
+    metrics = {
+        f"{kind}/{source}/ap": estimate.value
+        for kind, row in found.ap.items()
+        for source, estimate in row.items()
+    }
+    return context.publish(
+        context.config["name"],
+        {**dataclasses.asdict(found), **more.document},
+        "\n\n".join(part for part in (table(found, heading), more.text) if part),
+        {"ap": ap_figure(found, heading), **more.figures, "training_images": grid},
+        metrics,
+    )
+
+
+def table(found: SideBySide, heading: str) -> str:
+    """Return Markdown: AP by test set with the leads of the first source, and AP by class."""
+    first, *others = found.sources
+    several = len(found.seeds) > 1
+    over = "seeds and test images" if several else "test images"
+    introduction = (
+        f"{heading} AP (0.50 to 0.95) in points, mean of all classes, with 95 % intervals over {over}; "
+        f"seed{'s' if several else ''} {', '.join(map(str, found.seeds))}."
+        + (" Differences in bold exceed the spread." if several else "")
+    )
+    head = ["test images", "number", *found.sources, *(f"{first} ahead of {other} by" for other in others)]
+    rows = [
+        [kind, found.images[kind]]
+        + [points(row[source]) for source in found.sources]
+        + [points(found.ahead[kind][other], sure=several) for other in others]
+        for kind, row in found.ap.items()
+    ]
+    by_class = [
+        [f"{kind}, {name}", *(f"{100 * by_source[source][name]:.1f}" for source in found.sources)]
+        for kind, by_source in found.per_class.items()
+        for name in by_source[first]
+    ]
+    tables = [
+        markdown_table(head, rows),
+        markdown_table(["test images, class", *found.sources], by_class),
+    ]
+    return "\n\n".join([introduction, *tables])
+
+
+def ap_figure(found: SideBySide, title: str) -> Figure:
+    """Draw a group of bars for each test set, one bar a source, with the intervals."""
+    kinds = list(found.ap)
+    figure = Figure(figsize=(1.9 * len(kinds) + 3.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    width = 0.8 / len(found.sources)
+    for column, source in enumerate(found.sources):
+        values = [found.ap[kind][source] for kind in kinds]
+        x = np.arange(len(kinds)) + (column - (len(found.sources) - 1) / 2) * width
+        height = [100 * value.value for value in values]
+        reach = [[100 * (v.value - (v.value if v.low is None else v.low)) for v in values],
+                 [100 * ((v.value if v.high is None else v.high) - v.value) for v in values]]  # fmt: skip
+        axes.bar(x, height, 0.92 * width, color=CLASS_COLOURS[column], label=source)
+        axes.errorbar(x, height, np.maximum(reach, 0.0), fmt="none", ecolor=INK, elinewidth=1, capsize=3)
+        for at, value, above in zip(x, height, reach[1], strict=True):
+            axes.text(at, value + max(above, 0.0) + 1.5, f"{value:.1f}", ha="center", fontsize=8, color=INK)
+    axes.set_xticks(range(len(kinds)), kinds)
+    axes.set(ylabel="AP on the test images (%)", ylim=(0, 105))
+    axes.set_title(title, color=INK, fontsize=10)
+    axes.yaxis.grid(color=GRID)
+    axes.set_axisbelow(True)
+    figures.style(axes)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, title="trained on")
+    return figure
