@@ -1,4 +1,4 @@
-"""Sessions that set up all they need, such as ``nox -s demo``; ``nox -l`` lists them."""
+"""Run the project in environments of its own: ``nox -s demo``, for example; ``nox -l`` lists the sessions."""
 
 import nox
 
@@ -8,7 +8,7 @@ nox.options.sessions = ["lint", "types", "tests"]
 
 
 def _install(session: nox.Session, editable: bool = True) -> None:
-    """The locked environment, extras included, then the project itself without resolving again."""
+    """Install the locked environment, extras included, then the project itself without resolving again."""
     session.install("-r", "requirements.lock")
     session.install("--no-deps", *(["-e"] if editable else []), ".")
     session.env["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -17,14 +17,14 @@ def _install(session: nox.Session, editable: bool = True) -> None:
 
 @nox.session
 def demo(session: nox.Session) -> None:
-    """Learn which poses to render for the embedded objects; minutes on two cores."""
+    """Learn which poses to render for the embedded objects; takes minutes on two cores."""
     _install(session)
     session.run("python", "-m", "src.main", "+experiment=pose_gap", "scale=quick", *session.posargs)
 
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """The fast suite, one run through the command line included; up to four processes of one thread."""
+    """Run the fast tests, in up to four processes of one thread."""
     _install(session)
     session.env["OMP_NUM_THREADS"] = "1"
     session.run("python", "-m", "pytest", "-n", "auto", "--maxprocesses", "4", *session.posargs)
@@ -32,7 +32,7 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def slow(session: nox.Session) -> None:
-    """The tests that take minutes, every documented command among them; one process a core."""
+    """Run the tests that take minutes, every documented command among them, in one process per core."""
     _install(session)
     session.env["OMP_NUM_THREADS"] = "1"
     session.run("python", "-m", "pytest", "-m", "slow", "-n", "auto", "--dist", "worksteal", *session.posargs)
@@ -40,22 +40,33 @@ def slow(session: nox.Session) -> None:
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Style and format; no part of the project is imported."""
-    session.install("-r", "requirements.lock")
+    """Check style, format and spelling; nothing of the project is imported."""
+    session.install("-c", "requirements.lock", "ruff", "codespell")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
+    session.run("codespell")
+
+
+@nox.session
+def lock(session: nox.Session) -> None:
+    """Resolve requirements.lock anew from pyproject.toml; ``nox -s lock -- --upgrade`` takes newer releases."""
+    session.install("uv")
+    session.run(
+        "uv", "pip", "compile", "pyproject.toml", "--all-extras", "--group", "dev", "--universal",
+        "--no-annotate", "--no-header", "-o", "requirements.lock", *session.posargs,
+    )  # fmt: skip
 
 
 @nox.session
 def types(session: nox.Session) -> None:
-    """Static types."""
+    """Check static types."""
     _install(session)
     session.run("pyright")
 
 
 @nox.session
 def docs(session: nox.Session) -> None:
-    """The documentation as a site, in outputs/site; a warning is an error."""
+    """Build the documentation as a site in outputs/site; a warning is an error."""
     session.install("-r", "requirements.lock")
     session.run(
         "python", "-m", "mkdocs", "build", "--strict", *session.posargs, env={"NO_MKDOCS_2_WARNING": "1"}
@@ -64,7 +75,7 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Error against run time, and the other benchmarks: tables on the screen, JSON under outputs."""
+    """Measure error against run time, and run the other benchmarks; JSON goes to outputs."""
     _install(session)
     if not session.posargs:
         session.run("python", "-m", "src.main", "+experiment=work_precision")

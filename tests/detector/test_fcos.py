@@ -12,12 +12,13 @@ from torchvision.ops import generalized_box_iou_loss
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.fcos import Fcos, generalised_iou
 from neural_sim.detector.module import Optimisation
-from neural_sim.detector.onnx_export import TOLERANCE, check_packages, export, largest_difference
+from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.settings import Backbone, Detections, Head, Points
 from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.detector.targets import BACKGROUND
 from neural_sim.detector.training import train_detector
+from neural_sim.extras import require
 from neural_sim.solver.flatten import flatten, unflatten
 
 SIZE = 64
@@ -252,6 +253,6 @@ def test_a_model_file_and_onnx_give_the_same(tools, generator, tmp_path):
         assert len(ours["scores"]) and all(torch.equal(ours[key], theirs[key]) for key in ours)
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
-    check_packages("model.onnx")
+    require("onnx", "model.onnx")
     path = export(saved, tmp_path / "model.onnx")
     assert 0.0 < largest_difference(saved, path, images) <= TOLERANCE

@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from neural_sim.detector import onnx_export
+from neural_sim import extras
 from neural_sim.detector.fcos import Fcos
 from neural_sim.detector.onnx_export import TOLERANCE, Decoded, export, largest_difference
 from neural_sim.detector.retinanet import RetinaNet
@@ -119,7 +119,7 @@ def test_without_detections_the_outputs_are_empty(tmp_path):
 def test_a_missing_package_is_one_line(monkeypatch, tmp_path):
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        onnx_export.importlib.util, "find_spec", lambda name: None if name == "onnxruntime" else found(name)
+        extras.importlib.util, "find_spec", lambda name: None if name == "onnxruntime" else found(name)
     )
     with pytest.raises(
         ValueError, match=r"^model\.onnx: onnxruntime not installed; pip install 'neural-sim\[onnx\]'$"

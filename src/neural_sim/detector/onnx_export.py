@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 import os
@@ -18,18 +17,11 @@ from torch import Tensor, nn
 
 from neural_sim.detector.onnx_nms import INPUTS, with_nms
 from neural_sim.detector.saved import SavedDetector
+from neural_sim.extras import require
 
-PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18
 TOLERANCE = 1e-4
 """Of scores, and of boxes as fractions of the image's longer side."""
-
-
-def check_packages(key: str) -> None:
-    """Raises ``ValueError`` where a package is missing that the extra ``onnx`` installs; ``key`` asked for it."""
-    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(f"{key}: {', '.join(missing)} not installed; pip install 'neural-sim[onnx]'")
 
 
 class Decoded(nn.Module):
@@ -62,7 +54,7 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
     Raises:
         ValueError: a package that is missing, or a detector that cannot decode the boxes of all anchors.
     """
-    check_packages("model.onnx")
+    require("onnx", "model.onnx")
     if not callable(getattr(saved.detector, "decode", None)):
         raise ValueError(
             f"model.onnx: want a detector with a method decode(deltas) -> boxes in pixels, {saved.make} has none"

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
-from skimage.measure import marching_cubes
 from torch import Tensor
 from torch.nn import functional
 
 from neural_sim.alpha import premultiplied
 from neural_sim.cameras import focal_lengths, principal_point
+from neural_sim.extras import require
 from neural_sim.field.hull import visual_hull
 from neural_sim.types import PosedViews
 
@@ -47,6 +47,9 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     if not bool((volume > LEVEL).any()):
         raise ValueError(f"reconstruct: no point lies within the masks of all {len(views)} views")
     padded = functional.pad(volume, (1, 1, 1, 1, 1, 1)).cpu().double().numpy()  # closed where the grid ends
+    require("photos", "meshes from silhouettes")
+    from skimage.measure import marching_cubes
+
     vertices, faces, _, _ = marching_cubes(padded, LEVEL, spacing=(cell,) * 3)
     vertices += origin.cpu().double().numpy() - 0.5 * cell  # of the padding's first centre
     # Alpha falls from the inside out, so that the surface has to be turned for its normals to point outwards.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from neural_sim.extras import require
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.objects.transforms_json import image_size
 
@@ -46,6 +47,7 @@ def read_colmap(folder: Path, name: str) -> Capture:
         raise ValueError(
             f"{folder}: holds no COLMAP model; want one of {', '.join(MODELS)} with cameras.bin or .txt"
         )
+    require("photos", str(model))
     import pycolmap
 
     try:

@@ -9,8 +9,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.detector.onnx_export import TOLERANCE, check_packages, export, largest_difference
+from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
+from neural_sim.extras import require
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ class ModelFiles:
                 f"model.registered_name wants model.pyfunc=true and a name, got {self.registered_name!r}"
             )
         if self.onnx:
-            check_packages("model.onnx")
+            require("onnx", "model.onnx")
 
     def write(self, saved: SavedDetector, images: Float[Tensor, "n 3 h w"], folder: Path) -> Path:
         """The files in ``folder``, whose ``model.safetensors`` is returned. ONNX is checked on ``images``."""

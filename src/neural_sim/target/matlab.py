@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import h5py
 import numpy as np
 import scipy.io
 from scipy.io.matlab import MatReadError
+
+from neural_sim.extras import require
 
 
 def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -20,6 +21,9 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: a file that is missing or no MATLAB file, or lacks a name.
     """
+    require("bop", str(path))
+    import h5py
+
     try:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
