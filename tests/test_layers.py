@@ -7,21 +7,14 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
-<<<<<<< HEAD
-    "types", "alpha", "checks", "digests", "documents", "randomness", "configuration", "ranges", "cameras", "devices",
-    "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline",
-    "outer", "report", "stages", "tasks", "studies", "main",
+    "types", "alpha", "checks", "digests", "documents", "extras", "randomness", "configuration", "ranges", "cameras",
+    "devices", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient",
+    "baseline", "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TASKS_IN_STAGES = {
     "compare", "experiments",
 }  # fmt: skip
 """Tasks and studies that still stand among the stages; the set only shrinks."""
-=======
-    "types", "alpha", "checks", "digests", "documents", "extras", "randomness", "configuration", "cameras", "devices",
-    "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline",
-    "outer", "report", "stages", "tasks", "studies", "main",
-)  # fmt: skip
->>>>>>> 2708404 (Make COLMAP, MATLAB files and silhouette meshes extras; check spelling; run lint and types in CI)
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
