@@ -30,7 +30,6 @@ PAPER = [
     ("bin_mean", "linear", EVERY, r"l. 514: b = \sum_i y_i B_i"),
     ("gradient._target_", "neural_sim.gradient.pathwise.PathwiseEstimator", EVERY, "l. 443, Eq. 3"),
     ("gradient.mode", "reverse", EVERY, 'l. 598: "two forward passes over NeRF rendering"'),
-    ("gradient.relaxation", "gumbel_softmax", EVERY, "l. 494, Eq. 4"),
     (
         "solver.linear._target_",
         "neural_sim.solver.cg.ConjugateGradient",

@@ -49,6 +49,10 @@ def own_folder(wanted: Path) -> Path:
 
 GONE: dict[str, str] = {
     "baseline=none": "it meant Neural-Sim with its optimisation; want baseline=neural_sim, or baseline=ns for none",
+    "gradient.relaxation": "draws of gradient=pathwise are always Gumbel-softmax's; leave it out",
+    "gradient.conditional_draws": "it was a setting of gradient.relaxation=gumbel_rao; leave it out",
+    "gradient.antithetic": "it lowered no error; for less noise want gradient=stratified",
+    "gradient.common_backgrounds": "it lowered no error; for less noise want gradient=stratified",
     "solver=neumann": "want solver=cg, or solver=minres for indefinite systems",
     "solver=nystrom": "want solver=cg, or solver=minres for indefinite systems",
     "outer.update._target_=neural_sim.parameter.update.Adam": "want neural_sim.parameter.update.Mirror or SGD",

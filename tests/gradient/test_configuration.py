@@ -18,10 +18,6 @@ def experiment(*overrides):
     [
         ("gradient.mode=forward", RelaxedDraws(tangents=True)),
         ("gradient.mode=reverse", RelaxedDraws()),
-        ("gradient.relaxation=straight_through", RelaxedDraws("straight_through", tangents=True)),
-        ("gradient.relaxation=gumbel_rao", RelaxedDraws("gumbel_rao", tangents=True)),
-        ("gradient.antithetic=true", RelaxedDraws(antithetic=True, tangents=True)),
-        ("gradient.common_backgrounds=true", RelaxedDraws(common_backgrounds=True, tangents=True)),
     ],
 )
 def test_each_choice_is_one_override(override, expected):
@@ -35,7 +31,7 @@ def test_the_papers_method_is_its_plain_form():
     assert paper.imaging.distribution.factors[0].bin_mean == "linear"
 
 
-@pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.relaxation=concrete"])
+@pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.theta_mode=sideways"])
 def test_other_choices_are_refused_by_name(override):
     with pytest.raises(UserError, match=override.split("=")[0]):
         experiment("gradient=pathwise", override)

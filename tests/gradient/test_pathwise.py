@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from neural_sim.gradient.base import from_contributions, group_sums
+from neural_sim.gradient.base import from_contributions
 from neural_sim.gradient.pathwise import (
     PathwiseEstimator,
     contract,
@@ -115,24 +115,12 @@ def test_standard_error_is_that_of_a_sum():
     assert from_contributions(rows[:1]).standard_error.tolist() == [torch.inf, torch.inf]
 
 
-def test_standard_error_counts_pairs_as_one():
-    """Draws a, a, b, b, ... know no more than a, b, ... do, twice as large; plain counting would say less."""
-    once = torch.tensor([[1.0], [3.0], [2.0], [6.0]], dtype=DOUBLE)
-    twice = from_contributions(group_sums(once.repeat_interleave(2, 0), 2))
-    expected = from_contributions(2.0 * once)
-    assert twice.value == expected.value and twice.standard_error == expected.standard_error
-    with pytest.raises(ValueError, match="multiple of the group of 2, got 3"):
-        group_sums(once[:3], 2)
-
-
 @pytest.mark.parametrize(
     "bad",
     [
         {"patch_size": 0},
         {"chunk_size": 0},
-        {"conditional_draws": 0},
         {"mode": "sideways"},
-        {"relaxation": "none"},
     ],
 )
 def test_bad_settings_name_their_key(bad):

@@ -86,16 +86,8 @@ def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
     assert torch.equal(again.images, images.images) and torch.equal(again.boxes, images.boxes)
 
 
-@pytest.mark.parametrize(
-    ("bin_mean", "settings"),
-    [
-        ("linear", {}),
-        ("circular", {"antithetic": True, "common_backgrounds": True}),
-        ("circular", {"relaxation": "straight_through"}),
-        ("linear", {"relaxation": "gumbel_rao", "conditional_draws": 3}),
-    ],
-)
-def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean, settings):
+@pytest.mark.parametrize("bin_mean", ["linear", "circular"])
+def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean):
     """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
     fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
     distribution = SceneDistribution.of([Pose(bins=4, temperature=1.0, bin_mean=bin_mean)])
@@ -108,7 +100,7 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin
         name: torch.randn(value.shape, generator=generator).double() for name, value in trainable.items()
     }
     psi = torch.randn(2, 4, generator=generator, dtype=torch.float64)
-    forward = PathwiseEstimator(mode="forward", **settings)
+    forward = PathwiseEstimator(mode="forward")
     rendered = wide.training_set(psi, 4, generator, forward.draws)
     assert all(set(part.tangents) == {"phi"} for part in rendered.objects)
     losses = bound_losses(CachedSet.of(detector, backbone, rendered.images), backbone, None)
@@ -116,44 +108,13 @@ def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin
     for held in object_images(wide, rendered, psi, weights).values():
         bare = dataclasses.replace(held, path=dataclasses.replace(held.path, tangents=None))
         for patch_size in (64, 10**6):
-            reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size, **settings)
+            reverse = PathwiseEstimator(mode="reverse", patch_size=patch_size)
             found = [
                 estimator.estimate(losses, trainable, vector, batch, {}).value
                 for estimator, batch in ((forward, held), (reverse, bare))
             ]
             assert found[0].dtype == torch.float64 and float(found[1].norm()) > 0.0
             assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-8
-
-
-def test_pairs_share_what_they_are_asked_to_share(scene):
-    psi = torch.tensor([0.5, -0.2, 0.1, 0.0]).expand(2, -1)
-    paired = RelaxedDraws(antithetic=True, common_backgrounds=True)
-    rendered = scene.training_set(psi, 6, torch.Generator().manual_seed(0), paired)
-    part = rendered.objects[0]
-    # Without the object what is left is the background; with the same maps, what differs is background and shift.
-    empty = rendered.compose[0](torch.zeros_like(part.rgb), torch.zeros_like(part.opacity))
-    backgrounds = empty.images.unflatten(0, (3, 2))
-    assert torch.equal(backgrounds[:, 0], backgrounds[:, 1])
-    assert not torch.equal(backgrounds[0, 0], backgrounds[1, 0])
-    same = rendered.compose[0](part.rgb[:1].expand(6, -1, -1, -1), part.opacity[:1].expand(6, -1, -1))
-    assert torch.equal(same.boxes[::2], same.boxes[1::2]) and len(same.boxes.unique(dim=0)) > 1
-    uniform = torch.exp(-torch.exp(-part.noise.bins["pose"].gumbel.double())).unflatten(0, (3, 2))
-    torch.testing.assert_close(uniform.sum(1), torch.ones(3, 4, dtype=torch.float64), rtol=0.0, atol=1e-5)
-    held = object_images(scene, rendered, psi, torch.full((12,), 1 / 12))
-    assert held["a"].group == 2
-    for odd in (RelaxedDraws(antithetic=True), RelaxedDraws(common_backgrounds=True)):
-        with pytest.raises(ValueError, match=r"even outer\.images_per_object, got 5"):
-            scene.training_set(psi, 5, torch.Generator(), odd)
-
-
-def test_straight_through_images_are_those_of_independent_hard_draws(scene):
-    psi = torch.tensor([0.5, -0.2, 0.1, 0.0]).expand(2, -1)
-    hard, through = (
-        scene.training_set(psi, 4, torch.Generator().manual_seed(2), how).images
-        for how in (HardDraws(explore=True), RelaxedDraws("straight_through", tangents=True))
-    )
-    torch.testing.assert_close(through.images, hard.images, rtol=0.0, atol=1e-5)
-    assert torch.equal(through.boxes, hard.boxes)
 
 
 @pytest.mark.parametrize("pooled", [True, False])

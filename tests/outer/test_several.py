@@ -12,7 +12,7 @@ from neural_sim.outer.binding import object_images
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD, RelaxedDraws
+from neural_sim.synthesis.draws import HARD
 from neural_sim.synthesis.training_set import Synthesizer
 
 DOUBLE = torch.float64
@@ -166,8 +166,6 @@ def test_images_are_made_again_of_one_objects_maps(several):
     assert derivative == pytest.approx(float((along(1e-6) - along(-1e-6)).detach()) / 2e-6, rel=1e-6)
 
 
-def test_pairs_want_one_object_an_image(several):
-    with pytest.raises(ValueError, match="pair images of one object"):
-        several((1, 2)).training_set(PSI, 4, torch.Generator(), RelaxedDraws(antithetic=True))
+def test_an_image_shows_each_object_once_at_most(several):
     with pytest.raises(ValueError, match="at most the 3 objects"):
         several((1, 4)).training_set(PSI, 4, torch.Generator())

@@ -138,37 +138,3 @@ def test_circular_mean_derivative_against_central_differences(generator):
 def test_one_bin_always_wins(generator):
     y = binned.gumbel_softmax(torch.zeros(1), binned.gumbel((5, 1), generator, torch.float32), 0.1)
     assert (y == 1).all()
-
-
-def test_antithetic_noise_pairs_u_with_its_complement(generator):
-    noise = binned.gumbel((2_000, 3), generator, torch.float64, antithetic=True)
-    uniform = torch.exp(-torch.exp(-noise)).unflatten(0, (-1, 2))
-    torch.testing.assert_close(uniform.sum(1), torch.ones(1_000, 3, dtype=torch.float64))
-    # both halves alone are uniform: the variance 1/12 and the mean 1/2 within five standard errors
-    assert ((uniform.mean(0) - 0.5).abs() < 5 * (1 / 12 / 1_000) ** 0.5).all()
-    with pytest.raises(ValueError, match="even number of draws, got 5"):
-        binned.gumbel((5, 3), generator, torch.float64, antithetic=True)
-
-
-def test_noise_given_the_winner_makes_it_win_and_is_plain_gumbel_on_average(generator):
-    log_p = torch.tensor([0.6, 0.3, 0.08, 0.02], dtype=torch.float64).log()
-    count = 40_000
-    chosen = (log_p + binned.gumbel((count, 4), generator, torch.float64)).argmax(-1)
-    exponential = torch.empty(count, 2, 4, dtype=torch.float64).exponential_(generator=generator)
-    noise = binned.conditional_gumbel(log_p, chosen, exponential)
-    assert ((log_p + noise).argmax(-1) == chosen[:, None]).all()
-    one = noise[:, 0]
-    variance, kurtosis = math.pi**2 / 6, 5.4  # of the standard Gumbel distribution
-    assert ((one.mean(0) - 0.5772156649).abs() < 5 * (variance / count) ** 0.5).all()
-    assert ((one.var(0) - variance).abs() < 5 * variance * (kurtosis / count) ** 0.5).all()
-    # the bins' noises are independent of each other once the winner is averaged over
-    off = torch.corrcoef(one.T) - torch.eye(4, dtype=torch.float64)
-    assert (off.abs() < 5 / count**0.5).all()
-
-
-def test_noise_given_the_winner_at_a_probability_near_zero_stays_finite(generator):
-    log_p = torch.log_softmax(torch.tensor([0.0, -200.0, -800.0], dtype=torch.float64), -1)
-    exponential = torch.empty(3, 5, 3, dtype=torch.float64).exponential_(generator=generator)
-    noise = binned.conditional_gumbel(log_p, torch.arange(3), exponential)
-    assert torch.isfinite(noise).all()
-    assert ((log_p + noise).argmax(-1) == torch.arange(3)[:, None]).all()

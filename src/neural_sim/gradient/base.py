@@ -75,8 +75,7 @@ class ObjectImages:
 
     ``psi`` is the object's part of all factors of ``distribution``, p_psi. ``index`` are the images' rows in
     the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
-    ``draw`` is where they were rendered. ``images`` and ``path`` are needed by the pathwise estimator only. Each
-    ``group`` of consecutive images shares randomness (1: all are independent).
+    ``draw`` is where they were rendered. ``images`` and ``path`` are needed by the pathwise estimator only.
     """
 
     psi: Float[Tensor, "K"]
@@ -86,7 +85,6 @@ class ObjectImages:
     weights: Float[Tensor, "n"]
     draw: SceneDraw
     path: RenderedPath | None = None
-    group: int = 1
 
 
 @dataclass(frozen=True)
@@ -103,19 +101,9 @@ class MixedDerivative:
     p_values: Mapping[str, float] = field(default_factory=dict)
 
 
-def group_sums(contributions: Float[Tensor, "n K"], group: int) -> Float[Tensor, "groups K"]:
-    """Contributions summed over every ``group`` of consecutive images.
-
-    Raises ``ValueError`` for a number of images that does not divide into groups.
-    """
-    if len(contributions) % group:
-        raise ValueError(f"contributions: want a multiple of the group of {group}, got {len(contributions)}")
-    return contributions.unflatten(0, (-1, group)).sum(1)
-
-
-def from_contributions(sums: Float[Tensor, "n K"]) -> MixedDerivative:
-    """The sum of independent contributions, those of an image or a group of images, and its standard error."""
-    value, count = sums.sum(0), len(sums)
+def from_contributions(contributions: Float[Tensor, "n K"]) -> MixedDerivative:
+    """Sum the independent contributions of images, and estimate the sum's standard error."""
+    value, count = contributions.sum(0), len(contributions)
     if count < 2:
         return MixedDerivative(value, torch.full_like(value, torch.inf))
-    return MixedDerivative(value, sums.std(0) * count**0.5)
+    return MixedDerivative(value, contributions.std(0) * count**0.5)

@@ -29,12 +29,11 @@ from neural_sim.gradient.base import (
     Probes,
     RenderedPath,
     from_contributions,
-    group_sums,
 )
 from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.significance import zero_mean
 from neural_sim.gradient.unrolled import Wanted
-from neural_sim.parameter.factor import COORDINATES, Relaxation
+from neural_sim.parameter.factor import COORDINATES
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -50,11 +49,6 @@ class PathwiseEstimator:
     Args:
         mode: how images are differentiated by V. ``forward``: along with the first render; ``reverse``: the paper's
             second forward, patch by patch.
-        relaxation: how draws depend on psi, see :meth:`BinnedFactor.relaxed`: ``gumbel_softmax`` (the paper's),
-            ``straight_through`` or ``gumbel_rao``.
-        conditional_draws: Gumbel noises averaged for each image of ``gumbel_rao``.
-        antithetic: draw Gumbel noise in pairs from uniforms u and 1 - u.
-        common_backgrounds: the images of a pair share background and shift.
         patch_size: rays in a patch of the reverse mode.
         chunk_size: images whose losses are differentiated at a time.
 
@@ -64,20 +58,13 @@ class PathwiseEstimator:
 
     wanted: ClassVar[Wanted] = "inputs"
     mode: Mode = "forward"
-    relaxation: Relaxation = "gumbel_softmax"
-    conditional_draws: int = 8
-    antithetic: bool = False
-    common_backgrounds: bool = False
     patch_size: int = 4096
     chunk_size: int = 16
 
     def __post_init__(self) -> None:
-        for key, choice in (("mode", Mode), ("relaxation", Relaxation)):
-            if getattr(self, key) not in get_args(choice):
-                raise ValueError(
-                    f"gradient.{key} must be one of {get_args(choice)}, got {getattr(self, key)!r}"
-                )
-        for key in ("conditional_draws", "patch_size", "chunk_size"):
+        if self.mode not in get_args(Mode):
+            raise ValueError(f"gradient.mode must be one of {get_args(Mode)}, got {self.mode!r}")
+        for key in ("patch_size", "chunk_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
 
@@ -89,13 +76,7 @@ class PathwiseEstimator:
     @property
     def draws(self) -> RelaxedDraws:
         """How this estimator's images are drawn."""
-        return RelaxedDraws(
-            self.relaxation,
-            self.conditional_draws,
-            self.antithetic,
-            self.common_backgrounds,
-            tangents=self.mode == "forward",
-        )
+        return RelaxedDraws(tangents=self.mode == "forward")
 
     def estimate(
         self,
@@ -106,7 +87,7 @@ class PathwiseEstimator:
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
         """See :class:`~neural_sim.gradient.estimators.Estimator`. Tangents of the first render are used in either mode;
-        p-values are those of :func:`significance.zero_mean` for the groups' contributions.
+        p-values are those of :func:`significance.zero_mean` for the images' contributions.
 
         Raises:
             ValueError: images without a path.
@@ -140,11 +121,11 @@ class PathwiseEstimator:
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
         # From here on a few numbers per image, on the CPU like psi and the draws.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
-        sums = group_sums(psi_contributions(path.relaxed, images.psi, along_draw), images.group)
+        contributions = psi_contributions(path.relaxed, images.psi, along_draw)
         # An offset common to a factor's components changes neither its distribution nor its weights of lights.
-        parts = images.distribution.split(sums).items()
+        parts = images.distribution.split(contributions).items()
         p_values = {name: zero_mean(part - part.mean(-1, keepdim=True)) for name, part in parts}
-        return replace(from_contributions(sums), p_values=p_values)
+        return replace(from_contributions(contributions), p_values=p_values)
 
 
 def _path(images: ObjectImages) -> RenderedPath:

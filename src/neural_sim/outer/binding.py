@@ -34,15 +34,15 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
     Raises:
         ValueError: images of hard draws.
     """
-    noise, relaxed = part.noise, part.relaxed
-    if noise is None or relaxed is None:
+    noise = part.noise
+    if noise is None or part.relaxed is None:
         raise ValueError("pathwise: these images were not drawn from psi by a relaxed draw")
 
     # All of an object's images are under psi's light.
     light = {} if part.draw.weights is None else {"weights": part.draw.weights[0]}
 
     def replay(psi: Tensor) -> SceneDraw:
-        return scene.distribution.relaxed(psi, noise, relaxed.relaxation)
+        return scene.distribution.relaxed(psi, noise)
 
     return RenderedPath(
         relaxed=replay,
@@ -72,6 +72,5 @@ def object_images(
             weights=weights[rows],
             draw=part.draw,
             path=rendered_path(scene, label, part, rendered.compose[label]) if part.relaxed else None,
-            group=part.relaxed.group if part.relaxed else 1,
         )
     return bound

@@ -68,23 +68,9 @@ def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Te
     return log_p - log_p.mean(-1, keepdim=True)
 
 
-def gumbel(
-    shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtype, antithetic: bool = False
-) -> Tensor:
-    """Standard Gumbel noise; the uniform is kept off 0 and 1 so that it is finite in every dtype.
-
-    ``antithetic``: rows come in pairs from uniforms u and 1 - u, each row alone as random as ever.
-
-    Raises:
-        ValueError: an odd number of antithetic rows.
-    """
-    if not antithetic:
-        uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
-    else:
-        if shape[0] % 2:
-            raise ValueError(f"antithetic noise comes in pairs: want an even number of draws, got {shape[0]}")
-        half = torch.rand((shape[0] // 2, *shape[1:]), generator=generator, dtype=torch.float64)
-        uniform = torch.stack([half, 1.0 - half], 1).flatten(0, 1)
+def gumbel(shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
+    """Draw standard Gumbel noise from uniforms that are kept off 0 and 1, so that it is finite in every dtype."""
+    uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
     return -(-(uniform.clamp(1e-12, 1.0 - 1e-12)).log()).log().to(dtype)
 
 
@@ -115,30 +101,6 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
         have[into] += 1
         chosen[row] = into
     return chosen
-
-
-def exponential(shape: tuple[int, int, int], generator: torch.Generator, dtype: torch.dtype) -> Tensor | None:
-    """Standard exponential noise of (draws, conditional, bins) for :func:`conditional_gumbel`; None for none of it."""
-    if not shape[1]:
-        return None
-    empty = torch.empty(shape, dtype=torch.float64)
-    return empty.exponential_(generator=generator).clamp_min(1e-30).to(dtype)
-
-
-def conditional_gumbel(
-    log_p: Float[Tensor, "k"], chosen: Int[Tensor, "n"], exponential: Float[Tensor, "n draws k"]
-) -> Float[Tensor, "n draws k"]:
-    """Gumbel noise given that bin ``chosen`` wins, from standard exponentials (Paulus et al. 2021, Eq. 6).
-
-    The winner's perturbed log-probability is Gumbel about log sum p; any other's is cut off there, that is
-    -log(E_j / p_j + E_winner / sum p). Averaged over winners drawn from p this is plain Gumbel noise.
-    """
-    winner = chosen[:, None, None]
-    total = torch.logsumexp(log_p, -1)
-    first = exponential.gather(-1, winner.expand(-1, exponential.shape[1], 1)).log()
-    others = torch.logaddexp(exponential.log() - log_p, first - total)
-    is_winner = torch.arange(log_p.shape[-1], device=log_p.device) == winner
-    return -torch.where(is_winner, first - total, others) - log_p
 
 
 def gumbel_softmax(

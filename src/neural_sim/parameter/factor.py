@@ -19,8 +19,6 @@ Coordinate = Literal["phi", "rho", "distance", "magnification"]
 COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
 """The numbers of a :class:`SceneDraw` that images depend on smoothly."""
 Gap = Literal["disjoint", "uniform", "same"]
-Relaxation = Literal["gumbel_softmax", "straight_through", "gumbel_rao"]
-"""How a draw depends on psi, see :meth:`BinnedFactor.relaxed`."""
 
 
 @dataclass(frozen=True)
@@ -221,39 +219,18 @@ class BinnedFactor:
         return self._place(self._centres(within)[bins], within)
 
     def relaxed(
-        self,
-        psi: Float[Tensor, "k"],
-        noise: BinNoise,
-        within: Float[Tensor, "n"],
-        relaxation: Relaxation = "gumbel_softmax",
+        self, psi: Float[Tensor, "k"], noise: BinNoise, within: Float[Tensor, "n"]
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """The coordinate, differentiable in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
+        """Draw the coordinate differentiably in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
 
-        ``gumbel_softmax`` is the paper's: at small tau most draws have next to no derivative, and the few near a tie
-        between two bins have nearly all of it. ``straight_through`` samples exactly from p_psi, as ``hard`` does, and
-        takes the relaxed draw's derivative there (Bengio et al. 2013; Jang et al. 2017); its mean is the derivative of
-        no expectation in general. ``gumbel_rao`` has that same mean at lower variance: the relaxed derivative is
-        averaged over noise that selects the same bin (Paulus et al. 2021).
-
-        Raises:
-            ValueError: ``gumbel_rao`` without the noise for it.
+        At small tau most draws have next to no derivative, and the few near a tie between two bins have nearly all of
+        it.
         """
         log_p = self.log_probabilities(psi)
-        given = noise.gumbel
-        centres = self._centres(given)
+        weights = binned.gumbel_softmax(log_p, noise.gumbel, self.temperature)
         mean = binned.circular_mean if self.bin_mean == "circular" else binned.linear_mean
-        chosen = (log_p.detach() + given).argmax(-1)
-        if relaxation == "gumbel_rao":
-            if noise.exponential is None:
-                raise ValueError(
-                    f"parameter.{self.name}: gumbel_rao wants noise drawn with conditional >= 1, got none"
-                )
-            given = binned.conditional_gumbel(log_p.detach(), chosen, noise.exponential)
-        centre = mean(binned.gumbel_softmax(log_p, given, self.temperature), centres)
-        if relaxation != "gumbel_softmax":
-            centre = centre.mean(-1) if relaxation == "gumbel_rao" else centre
-            centre = centres[chosen] + (centre - centre.detach())
-        return self._place(centre, within), chosen
+        centre = mean(weights, self._centres(noise.gumbel))
+        return self._place(centre, within), (log_p.detach() + noise.gumbel).argmax(-1)
 
     def bin_of(self, values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
         """The bin of each value. Values outside a range that is not periodic belong to the bin at that end."""

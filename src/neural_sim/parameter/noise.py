@@ -11,18 +11,18 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class BinNoise:
-    """Noise that selects the bins of n draws. ``exponential``, for ``gumbel_rao`` only: standard exponential noise, for
-    further Gumbel noise that selects the same bins. ``offset``: uniform in [0, 1), for exact draws that are balanced
-    over the bins, see :func:`~neural_sim.parameter.bins.balanced`; None: independent draws.
+    """Noise that selects the bins of n draws.
+
+    ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see
+    :func:`~neural_sim.parameter.bins.balanced`; None: independent draws.
     """
 
     gumbel: Float[Tensor, "n k"]
-    exponential: Float[Tensor, "n draws k"] | None = None
     offset: float | None = None
 
     def select(self, index: Int[Tensor, "m"]) -> BinNoise:
-        """The draws ``index``, which may repeat; not balanced, which is a property of all draws together."""
-        return BinNoise(self.gumbel[index], None if self.exponential is None else self.exponential[index])
+        """Select the draws ``index``, which may repeat; not balanced, which is a property of all draws together."""
+        return BinNoise(self.gumbel[index])
 
 
 @dataclass(frozen=True)

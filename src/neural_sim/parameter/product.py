@@ -15,7 +15,7 @@ from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.distances import Unit, radii_in_metres
 from neural_sim.parameter.distributions import distribution
-from neural_sim.parameter.factor import COORDINATES, BinnedFactor, Factor, Relaxation
+from neural_sim.parameter.factor import COORDINATES, BinnedFactor, Factor
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.noise import BinNoise, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
@@ -163,27 +163,27 @@ class SceneDistribution:
         n: int,
         generator: torch.Generator,
         dtype: torch.dtype = torch.float32,
-        antithetic: bool = False,
-        conditional: int = 0,
+        *,
         explore: bool = False,
         balanced: bool = False,
     ) -> SceneNoise:
-        """Randomness of n draws; independent of psi.
+        """Draw the randomness of n draws, which does not depend on psi.
 
-        ``antithetic``: Gumbel noise in pairs from uniforms u and 1 - u. ``conditional``: draws of the noise given the
-        bin, for ``gumbel_rao``. ``explore``: lights around psi's, for estimators that need a density.
-        ``balanced``: exact draws have n p, rounded, in every factor's bins. Raises ``ValueError`` for an odd number of
-        antithetic draws.
+        Args:
+            n: number of draws.
+            generator: of all of it.
+            dtype: of the noise.
+            explore: lights around psi's, for estimators that need a density.
+            balanced: exact draws have n p, rounded, in every factor's bins.
         """
-        gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype, antithetic) for f in self.binned}
+        gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype) for f in self.binned}
         learned = {f.coordinate for f in self.binned}
         drawn = [c for c in COORDINATES if c != "magnification" or c in learned]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
         noise = {}
         for f in self.binned:
-            exponential = binned.exponential((n, conditional, f.bins), generator, dtype)
             offset = float(torch.rand((), generator=generator, dtype=torch.float64)) if balanced else None
-            noise[f.name] = BinNoise(gumbel[f.name], exponential, offset)
+            noise[f.name] = BinNoise(gumbel[f.name], offset)
         light = None
         if explore and self.lights:
             light = torch.randn((n, self.lights), generator=generator, dtype=torch.float64).to(dtype)
@@ -212,16 +212,12 @@ class SceneDistribution:
         drawn = self._light.explore(weights, noise)
         return replace(draw, weights=drawn.weights, explored=drawn.unprojected)
 
-    def relaxed(
-        self, psi: Float[Tensor, "K"], noise: SceneNoise, relaxation: Relaxation = "gumbel_softmax"
-    ) -> SceneDraw:
-        """Samples that are differentiable in psi, see :meth:`BinnedFactor.relaxed`."""
+    def relaxed(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
+        """Draw samples that are differentiable in psi, see :meth:`BinnedFactor.relaxed`."""
         parts, placed, bins = self.split(psi), {}, {}
         for f in self.binned:
             within = noise.uniform[f.coordinate]
-            placed[f.coordinate], bins[f.name] = f.relaxed(
-                parts[f.name], noise.bins[f.name], within, relaxation
-            )
+            placed[f.coordinate], bins[f.name] = f.relaxed(parts[f.name], noise.bins[f.name], within)
         return self.lit(self._draw(placed, bins, noise), psi)
 
     def probes(

@@ -144,7 +144,7 @@ class Scene:
         noise = relaxed.noise(self.distribution, count, generator, self.dtype(label))
 
         def replay(psi: Tensor) -> SceneDraw:
-            return self.distribution.relaxed(psi, noise, relaxed.relaxation)
+            return self.distribution.relaxed(psi, noise)
 
         with torch.no_grad():
             draw = self._sized(label, replay(logits))
@@ -165,20 +165,14 @@ class Scene:
         how: Draws = HARD,
         source: Source | None = None,
     ) -> RenderedImages:
-        """``count`` images of every object, which ``source`` (None: this scene) draws and renders.
-
-        Raises:
-            ValueError: for draws in pairs with several objects an image.
-        """
+        """``count`` images of every object, which ``source`` (None: this scene) draws and renders."""
         source, labels = source or self, range(len(self.names))
         if self.synthesizer.several:
             return self._of_several(psi, count, generator, how, source)
-        group = how.background_group if isinstance(how, RelaxedDraws) else 1
         objects, nuisances = [], []
         for label in labels:
             objects.append(source.drawn(label, psi[label], count, generator, how))
-            nuisance = self._nuisance(count // group, generator)
-            nuisances.append(nuisance if group == 1 else nuisance.select(torch.arange(count) // group))
+            nuisances.append(self._nuisance(count, generator))
         return one_each(objects, nuisances, labels, self._bins(objects), self.synthesizer)
 
     def _of_several(
@@ -189,11 +183,6 @@ class Scene:
         how: Draws,
         source: Source,
     ) -> RenderedImages:
-        if isinstance(how, RelaxedDraws) and how.group > 1:
-            raise ValueError(
-                "gradient.antithetic and gradient.common_backgrounds pair images of one object: want "
-                f"synthesis.objects_per_image=[1, 1], got {list(self.synthesizer.objects_per_image)}"
-            )
         classes = len(self.names)
         layout = draw_layout(own_labels([count] * classes), classes, self.synthesizer.count, generator)
         return self._around(layout, psi, generator, how, source).composed()

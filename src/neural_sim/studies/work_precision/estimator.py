@@ -44,10 +44,6 @@ PATHWISE = {
     "paper (reverse, linear)": Variant(PathwiseEstimator("reverse"), "linear"),
     "linear": Variant(PathwiseEstimator(), "linear"),
     "circular": Variant(PathwiseEstimator()),
-    "antithetic": Variant(PathwiseEstimator(antithetic=True)),
-    "common backgrounds": Variant(PathwiseEstimator(common_backgrounds=True)),
-    "straight-through": Variant(PathwiseEstimator(relaxation="straight_through")),
-    "Gumbel-Rao": Variant(PathwiseEstimator(relaxation="gumbel_rao", conditional_draws=16)),
 }
 
 
