@@ -31,7 +31,7 @@ def test_the_papers_method_is_its_plain_form():
     assert paper.imaging.distribution.factors[0].bin_mean == "linear"
 
 
-@pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.theta_mode=sideways"])
+@pytest.mark.parametrize("override", ["gradient.mode=sideways", "gradient.patch_size=0"])
 def test_other_choices_are_refused_by_name(override):
     with pytest.raises(UserError, match=override.split("=")[0]):
         experiment("gradient=pathwise", override)
