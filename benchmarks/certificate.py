@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from worlds import make_world
 
+from neural_sim.documents import replace_section
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import psi_contributions
@@ -28,7 +29,6 @@ from neural_sim.gradient.significance import no_association, no_difference, zero
 from neural_sim.gradient.stratified import stratified
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.report.section import replace_section
 from neural_sim.studies.frozen import FrozenLoop
 
 DOUBLE = torch.float64

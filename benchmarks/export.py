@@ -23,7 +23,7 @@ from neural_sim.cameras import reframed
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.report.machine import machine
+from neural_sim.report.provenance import machine
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export.dataset import ImageWriter
 from neural_sim.synthesis.export.images import ImageSource

@@ -26,7 +26,7 @@ from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB
 from neural_sim.renderer.views import choose_mesh_renderer, render_views
-from neural_sim.report.machine import gpu, machine
+from neural_sim.report.provenance import gpu, machine
 from neural_sim.types import PinholeCamera, PosedViews
 
 PAPER_OBJECTS = ["002", "003", "009", "019", "025", "035"]

@@ -22,11 +22,11 @@ from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.documents import replace_section
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import centred_cosine, response
-from neural_sim.report.machine import machine
-from neural_sim.report.section import replace_section
+from neural_sim.report.provenance import machine
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.tasks.context import Context
 

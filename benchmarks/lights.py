@@ -17,12 +17,12 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.documents import replace_section
 from neural_sim.gradient.base import MixedDerivative
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
-from neural_sim.report.machine import machine
-from neural_sim.report.section import replace_section
+from neural_sim.report.provenance import machine
 from neural_sim.studies.frozen import FrozenLoop, State
 from neural_sim.tasks.context import Context
 

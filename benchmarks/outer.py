@@ -27,7 +27,7 @@ from neural_sim.devices import placed, synchronise
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.report.machine import gpu, machine
+from neural_sim.report.provenance import gpu, machine
 from neural_sim.synthesis.scene import Scene
 from neural_sim.tasks.context import Context
 

@@ -19,7 +19,7 @@ import torch
 from field import HELD_OUT, load_objects, quick_psnr, training_views
 
 from neural_sim.renderer.pose_refinement import PoseRefinement, moved, rotation_angle
-from neural_sim.report.machine import machine
+from neural_sim.report.provenance import machine
 from neural_sim.types import PosedViews
 
 

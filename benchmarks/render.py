@@ -21,7 +21,7 @@ from machine import add_device
 from neural_sim.devices import peak_bytes, synchronise
 from neural_sim.field.base import RadianceField
 from neural_sim.renderer.nerf import NerfRenderer, Quality
-from neural_sim.report.machine import machine
+from neural_sim.report.provenance import machine
 from neural_sim.studies.work_precision.renderer import left_out
 from neural_sim.types import PinholeCamera, PosedViews
 

@@ -29,7 +29,7 @@ from neural_sim.objects.photos import Photos
 from neural_sim.objects.pictures import Pictures
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB
-from neural_sim.report.machine import machine
+from neural_sim.report.provenance import machine
 
 HELD_OUT = 4
 

@@ -28,12 +28,12 @@ from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.real import shuffled_passes
 from neural_sim.detector.training import TrainingHistory, train_detector
 from neural_sim.detector.trajectory import MEGABYTE, Recording, Trajectory
+from neural_sim.documents import replace_section
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.unrolled import Examples, Product, reversed_steps
 from neural_sim.main import build, conf_directory
-from neural_sim.report.machine import machine
-from neural_sim.report.section import replace_section
+from neural_sim.report.provenance import machine
 from neural_sim.solver.hvp import gradient
 from neural_sim.synthesis.pool import ImagePool
 from neural_sim.tasks.context import Context

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from neural_sim.report.bootstrap import THRESHOLDS, Matches
-from neural_sim.report.finished import FinishedRun
-from neural_sim.report.object_scores import object_scores
-from neural_sim.report.selection import Group
-from neural_sim.report.settings import Setting
+from neural_sim.report.runs import FinishedRun, Group
+from neural_sim.studies.experiments.settings import Setting
 
 IMAGES = 60
 BUDGET = {
@@ -61,15 +59,15 @@ def results(experiment, method, seed, gap="disjoint", initial=4, target=1, learn
 def finished(ap, **arguments):
     """A run by AP: ``ap`` maps ns, learned and matched to that of can and of mug."""
     made = results(**arguments)
-    return FinishedRun(made, {w: [matches(f, i) for i, f in enumerate(each)] for w, each in ap.items()})
+    outcomes = {w: [matches(f, i) for i, f in enumerate(each)] for w, each in ap.items()}
+    return FinishedRun(made, read=lambda: outcomes)
 
 
 def setting(experiment="gap", gap="disjoint", target=1, methods=(("neural_sim", 0.75),), seeds=(0,), **more):
     """A setting whose methods have an AP each; ns has 0.25 (can) and 0.5 (mug), matched 0.9."""
-    runs = [
+    runs = tuple(
         finished({"ns": (0.25, 0.5), "learned": (ap, ap), "matched": (0.9, 0.9)},
                  experiment=experiment, gap=gap, target=target, method=method, seed=seed, **more)
         for method, ap in methods for seed in seeds
-    ]  # fmt: skip
-    group = Group(experiment, f"{experiment}, {gap}", "", tuple(seeds), ())
-    return Setting(group, runs, object_scores(runs, "neural_sim", draws=20))
+    )  # fmt: skip
+    return Setting.of(Group(experiment, f"{experiment}, {gap}", "", runs), "neural_sim", draws=20)

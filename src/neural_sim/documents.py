@@ -1,4 +1,4 @@
-"""What studies, reports and exports write: JSON by the standard, and Markdown tables."""
+"""What studies, reports and exports write: JSON by the standard, Markdown tables and sections."""
 
 from __future__ import annotations
 
@@ -57,3 +57,29 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
 
 def _line(cells: Sequence[object]) -> str:
     return "| " + " | ".join(str(cell).replace("|", r"\|") for cell in cells) + " |"
+
+
+def replace_section(path: Path, name: str, markdown: str) -> None:
+    """Write one section, ``## name``, of a Markdown file, which is made where there is none; the rest stays as it is.
+
+    The section stands between ``<!-- begin: name -->`` and ``<!-- end: name -->``; a new one goes to the end.
+
+    Raises:
+        ValueError: where the file has one marker without the other, out of order, or more than once.
+    """
+    begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+    body = markdown.rstrip().lstrip("\n")  # spaces at the beginning make a code block
+    block = f"{begin}\n## {name}\n\n{body}\n\n{end}\n"
+    text = path.read_text() if path.exists() else ""
+    counts = text.count(begin), text.count(end)
+    if counts == (0, 0):
+        gap = "" if not text else "\n" if text.endswith("\n") else "\n\n"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + gap + block)
+        return
+    first, last = text.find(begin), text.find(end)
+    if counts != (1, 1) or last < first:
+        raise ValueError(
+            f"{path}: section {name!r} wants one begin and one end marker in order, got {counts}"
+        )
+    path.write_text(text[:first] + block + text[last + len(end) :].removeprefix("\n"))

@@ -2,7 +2,7 @@
 
 from finished_runs import finished
 
-from neural_sim.report.costs import HEAD, costs, costs_table
+from neural_sim.report.costs import SECONDS, costs, costs_table
 
 AP = {"ns": (0.2, 0.2), "learned": (0.5, 0.5), "matched": (0.9, 0.9)}
 
@@ -26,7 +26,7 @@ def test_seconds_by_phase_add_up_to_what_the_method_is_charged():
     assert found.seconds == {
         "warm start": 20.0, "images": 12.0, "training": 10.0, "derivative": 7.0, "scores": 2.0, "in all": 51.0
     }  # fmt: skip
-    assert sum(found.seconds[column] for column in HEAD[:-1]) == found.seconds["in all"]
+    assert sum(found.seconds[column] for column in SECONDS[:-1]) == found.seconds["in all"]
 
 
 def test_runs_of_a_method_are_averaged_but_for_their_memory_which_is_the_largest():

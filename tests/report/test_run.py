@@ -7,9 +7,9 @@ import pytest
 import torch
 from mlflow import MlflowClient
 
-from neural_sim.report import logged
-from neural_sim.report.figures import image_grid, psi_figure
-from neural_sim.report.run import RunResults, write_figures, write_results
+from neural_sim.report import tracking
+from neural_sim.report.figures import image_grid, psi_figure, write_figures
+from neural_sim.report.run import Learned, RunResults, write_results
 from neural_sim.report.run_tracking import live_run
 from neural_sim.types import LabelledImages
 
@@ -54,13 +54,14 @@ def test_results_are_json_by_the_standard(results, tmp_path):
 def test_bins_that_look_the_same_are_scored_as_one(results):
     one = dataclasses.replace(results, symmetric_bins={"a": {"pose": [[1, 3], [2], [4]]}})
     # p is 0.25 in each bin, the target 0.85, 0.05, 0.05, 0.05: over the groups 0.5, 0.25, 0.25 to 0.9, 0.05, 0.05.
-    assert one.total_variations()["a"]["pose"]["initial"] == pytest.approx(0.4)
-    assert one.total_variations()["b"] == results.total_variations()["b"]
+    a, b = one.of_factor("pose")
+    assert a.distances["initial"] == pytest.approx(0.4) and b == results.of_factor("pose")[1]
 
 
 def test_bins_that_look_the_same_are_drawn_as_one():
-    history, target = {"a": [[0.25] * 4, [0.4, 0.1, 0.4, 0.1]]}, {"a": [0.4, 0.1, 0.4, 0.1]}
-    axes = psi_figure(history, target, "title", "pose", {"a": [[1, 3], [2], [4]]}).axes[0]
+    last = [0.4, 0.1, 0.4, 0.1]
+    learned = Learned("a", "pose", [[1, 3], [2], [4]], {"target": last}, [[0.25] * 4, last], {})
+    axes = psi_figure([learned], "title").axes[0]
     assert axes.get_title() == "a (1=3)" and [text.get_text() for text in axes.texts] == ["1=3"]
     heights = [bar.get_height() for bar in axes.patches]
     assert heights == pytest.approx([0.8, 0.1, 0.1]) and len(axes.collections) == 3
@@ -85,7 +86,8 @@ def test_nothing_is_said_of_a_target_that_nobody_knows(results, tmp_path):
 
 
 def test_a_panel_without_a_target_has_no_bar():
-    (axes,) = psi_figure({"a": [[0.25] * 4, [0.4, 0.1, 0.4, 0.1]]}, None, "title", "pose").axes
+    history = [[0.25] * 4, [0.4, 0.1, 0.4, 0.1]]
+    (axes,) = psi_figure([Learned("a", "pose", [[1], [2], [3], [4]], {}, history, {})], "title").axes
     assert not axes.patches and len(axes.collections) == 4 and axes.get_xlim() == (0.0, 1.0)
     assert "target" not in [label.get_text() for label in axes.get_xticklabels()]
 
@@ -120,7 +122,7 @@ def test_a_classification_run_says_accuracy_where_others_say_ap(results, uri, tm
     assert json.loads(write_results(results, tmp_path / "other").read_text())["score"] == "AP"
     with live(uri, found) as run:
         run.finish(found, tmp_path / "run")
-    (tracked,) = logged.runs(uri, "pose_gap")
+    (tracked,) = tracking.logged_runs(uri, "pose_gap")
     metrics = MlflowClient(uri).get_run(tracked.run_id).data.metrics
     assert metrics["evaluate/learned/accuracy"] == 0.5 and metrics["evaluate/learned/accuracy_a"] == 0.6
     assert steps(uri, tracked.run_id, "curve/biased_accuracy_by_images") == {9: 0.6}
@@ -171,7 +173,7 @@ def test_a_run_lands_in_mlflow_with_metrics_by_step(results, uri, tmp_path):
     write_results(results, tmp_path / "run")
     with live(uri, results) as run:
         run.finish(results, tmp_path / "run")
-    (found,) = logged.runs(uri, "pose_gap")
+    (found,) = tracking.logged_runs(uri, "pose_gap")
     held = MlflowClient(uri).get_run(found.run_id)
     assert held.info.status == "FINISHED" and held.data.tags["method"] == "neural_sim"
     assert held.data.params["parameter.pose.bins"] == "4" and held.info.run_name == "neural_sim seed 3"
@@ -191,7 +193,7 @@ def test_iterations_and_stages_are_there_when_they_end_and_are_written_once(resu
     first, second = ({**results.records[0], "validation_loss": loss} for loss in (0.5, 0.25))
     write_results(results, tmp_path / "run")
     with live(uri, results) as run:
-        (found,) = logged.runs(uri, "pose_gap")
+        (found,) = tracking.logged_runs(uri, "pose_gap")
         assert found.status == "RUNNING"
         run.fields({"a": [{"psnr": 29.0}, {"psnr": 30.0}]})
         run.stage("field", 7.5)
@@ -216,7 +218,7 @@ def test_what_was_reached_charts_by_what_was_spent(results, uri, tmp_path):
     (tmp_path / "run").mkdir()
     with live(uri, results) as run:
         run.finish(dataclasses.replace(results, curve=points), tmp_path / "run")
-    (found,) = logged.runs(uri, "pose_gap")
+    (found,) = tracking.logged_runs(uri, "pose_gap")
     for name, expected in (
         ("ap_by_iteration", {0: 0.0, 4: 0.4}),
         ("ap_by_images", {0: 0.0, 1200: 0.4}),

@@ -7,7 +7,7 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
-from neural_sim.report import logged, tracking
+from neural_sim.report import tracking
 
 
 def opened(uri, **more):
@@ -127,7 +127,7 @@ def test_the_address_of_a_run_and_of_a_table(uri):
     found = MlflowClient(uri).get_experiment_by_name("gap").experiment_id
     base = f"http://127.0.0.1:5000/#/experiments/{found}/runs"
     assert address == f"{base}/{run.run_id}?workflowType=machine_learning"
-    assert logged.where_runs(uri, "gap").endswith(f"\n{base}?workflowType=machine_learning")
+    assert tracking.where_runs(uri, "gap").endswith(f"\n{base}?workflowType=machine_learning")
     assert tracking.where("https://host:80/", "3", "ab") == (
         "https://host:80/#/experiments/3/runs/ab?workflowType=machine_learning"
     )
@@ -150,14 +150,14 @@ def test_runs_come_back_with_their_files_the_latest_first(uri, tmp_path):
         tracking.log_run(uri, "gap", f"run {number}", {}, {}, {}, {}, folder, begun=100.0 + number)
     with pytest.raises(KeyError), opened(uri, begun=1.0):
         {}["views"]
-    found = logged.runs(uri, "gap")
+    found = tracking.logged_runs(uri, "gap")
     assert [(run.name, run.status, set(run.files)) for run in found] == [
         ("run 1", "FINISHED", {"a.json"}), ("run 0", "FINISHED", {"a.json", "b.json"}),
         ("ours seed 0", "FAILED", set()),
     ]  # fmt: skip
     assert found[1].fetch("b.json").read_text() == "0"
     with pytest.raises(ValueError, match=r"no experiment 'other', only \['gap'\]"):
-        logged.runs(uri, "other")
+        tracking.logged_runs(uri, "other")
 
 
 WORKER = """
@@ -180,7 +180,7 @@ def test_workers_that_start_together_share_a_new_database(tmp_path):
         _, errors = worker.communicate(timeout=300)
         assert worker.returncode == 0, errors
         assert "metrics wait" not in errors
-    found = logged.runs(uri, "gap")
+    found = tracking.logged_runs(uri, "gap")
     assert sorted(run.name for run in found) == ["0", "1", "2"] and {run.status for run in found} == {
         "FINISHED"
     }

@@ -8,7 +8,7 @@ import torch
 from neural_sim import cameras
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.report import logged
+from neural_sim.report import tracking
 from neural_sim.report.figures import save
 from neural_sim.studies.illumination_interpolation import interpolate, interpolation_figure, publish
 from neural_sim.types import PinholeCamera
@@ -74,5 +74,5 @@ def test_the_report_says_how_much_opacity_and_colour_change(field, context):
     text = (context.folder / "interpolation.md").read_text()
     assert text.endswith(f"| drill | 0e+00 | {colour:.3f} |\n")
     assert (context.folder / "figures" / "interpolation.png").stat().st_size > 1000
-    (run,) = logged.runs(context.uri, "study")
+    (run,) = tracking.logged_runs(context.uri, "study")
     assert run.name == "seed 4" and "interpolation.json" in run.files

@@ -16,7 +16,7 @@ from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.training import train_detector
 from neural_sim.main import conf_directory, context_of
 from neural_sim.randomness import stream
-from neural_sim.report import logged
+from neural_sim.report import tracking
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.report.tracking import tracking_uri
 from neural_sim.stages.target_sets import TargetSets
@@ -189,7 +189,7 @@ def test_the_report_leaves_the_detector_that_was_scored_as_learned(
     uri = tracking_uri(str(folder / "mlflow.db"))
     (version,) = MlflowClient(uri).search_model_versions("name='shelf'")
     assert f"model: models:/{version.source.split('/')[-1]}\n" in capsys.readouterr().out
-    assert {"model.safetensors", "model.json", "model.onnx"} <= logged.runs(uri, "pose_gap")[0].files
+    assert {"model.safetensors", "model.json", "model.onnx"} <= tracking.logged_runs(uri, "pose_gap")[0].files
 
     made = run / "training_set"
     words = [
@@ -215,7 +215,7 @@ def uri(folder):
 
 def _seen(uri):
     """The latest run, and the losses that it shows by iteration."""
-    run = logged.runs(uri, "pose_gap")[0]
+    run = tracking.logged_runs(uri, "pose_gap")[0]
     history = MlflowClient(uri).get_metric_history(run.run_id, "psi/validation_loss")
     return run, {point.step: point.value for point in history}
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any
 
-from neural_sim.report.finished import FinishedRun
+from neural_sim.documents import markdown_table
+from neural_sim.report.runs import FinishedRun
 from neural_sim.report.tracking import UNKNOWN
 
 PHASES: Mapping[str, tuple[str, ...]] = {
@@ -18,7 +19,9 @@ PHASES: Mapping[str, tuple[str, ...]] = {
     "scores": ("judge", "reward", "certify"),
 }
 """Phases of an iteration of the psi loop, as its records have them, by the columns of a table."""
-HEAD = ("warm start", *PHASES, "in all")
+SECONDS = ("warm start", *PHASES, "in all")
+HEAD = (*(f"{column}, s" for column in SECONDS), "MB", "images", "error of the gradient")
+"""Of the columns of :func:`cells`."""
 NOTE = (
     "Seconds on the wall, of the warm start and of the psi loop by phase. MB: the most that the process of a run had "
     "in memory. Images: those rendered for both. Error of the gradient: its standard error over images relative to "
@@ -28,9 +31,13 @@ NOTE = (
 
 @dataclass(frozen=True)
 class Costs:
-    """Of one method. ``seconds``, by column of ``HEAD``, and ``images`` are means over runs, ``memory`` is the largest
-    of any run in MB (None: not recorded), ``error`` the median standard error of a gradient relative to its length
-    (None: the method has no gradient, or its error is not known).
+    """What one method costs.
+
+    Args:
+        seconds: by column of ``SECONDS``, means over runs.
+        images: rendered, the mean over runs.
+        memory: the largest of any run in MB; None: not recorded.
+        error: the median standard error of a gradient relative to its length; None: no gradient, or not known.
     """
 
     seconds: Mapping[str, float]
@@ -40,7 +47,7 @@ class Costs:
 
 
 def costs(runs: Sequence[FinishedRun]) -> dict[str, Costs]:
-    """By method, in the order of the runs."""
+    """Return what every method costs, in the order of the runs."""
     by_method: dict[str, list[Mapping[str, Any]]] = {}
     for run in runs:
         by_method.setdefault(run.method, []).append(run.results)
@@ -52,7 +59,7 @@ def _costs(runs: Sequence[Mapping[str, Any]]) -> Costs:
     memory = [run["peak_memory_mb"] for run in runs if "peak_memory_mb" in run]
     errors = [error for run in runs for error in _errors(run["iterations"])]
     return Costs(
-        {column: fmean(each[column] for each in spent) for column in HEAD},
+        {column: fmean(each[column] for each in spent) for column in SECONDS},
         fmean(run["curve"][-1]["images"] for run in runs),
         max(memory, default=None),
         median(errors) if errors else None,
@@ -60,7 +67,7 @@ def _costs(runs: Sequence[Mapping[str, Any]]) -> Costs:
 
 
 def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
-    """By column of ``HEAD``; phases ``hypergradient_*`` are parts of ``hypergradient``."""
+    """Seconds by column of ``SECONDS``; phases ``hypergradient_*`` are parts of ``hypergradient``."""
     loop = {
         column: sum(record["seconds"].get(phase, 0.0) for record in run["iterations"] for phase in phases)
         for column, phases in PHASES.items()
@@ -71,8 +78,9 @@ def _seconds(run: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
-    """Of every object's gradient in every iteration; a gradient that is zero, or of unknown error, has none, nor
-    has one of a run from before errors were recorded.
+    """Relative errors of every object's gradient in every iteration.
+
+    A gradient that is zero or whose error is not known has none, nor have those of older runs, which did not record it.
     """
     pairs = [
         pair
@@ -86,22 +94,14 @@ def _errors(records: Iterable[Mapping[str, Any]]) -> list[float]:
 
 
 def costs_table(runs: Sequence[FinishedRun]) -> str:
-    """Markdown, a method a row."""
-    lines = [
-        "| cost | "
-        + " | ".join(f"{column}, s" for column in HEAD)
-        + " | MB | images | error of the gradient |",
-        "|---" * (len(HEAD) + 4) + "|",
-    ]
-    for method, cost in costs(runs).items():
-        lines.append("| " + " | ".join([method, *cells(cost)]) + " |")
+    """Return a Markdown table with a row a method."""
+    table = markdown_table(["cost", *HEAD], [[method, *cells(cost)] for method, cost in costs(runs).items()])
     commits = sorted({run.results.get("commit") or UNKNOWN for run in runs})
-    of = f"Of {len(runs)} run{'s' * (len(runs) > 1)}, commit {', '.join(commits)}."
-    return "\n".join([*lines, "", f"{of} {NOTE}"])
+    return f"{table}\n\nOf {len(runs)} run{'s' * (len(runs) > 1)}, commit {', '.join(commits)}. {NOTE}"
 
 
 def cells(cost: Costs) -> list[str]:
-    """A row's numbers as text, after the method's name."""
-    seconds = [f"{cost.seconds[column]:.0f}" for column in HEAD]
+    """Return a row's numbers as text, under ``HEAD``."""
+    seconds = [f"{cost.seconds[column]:.0f}" for column in SECONDS]
     memory = "" if cost.memory is None else f"{cost.memory:.0f}"
     return [*seconds, memory, f"{cost.images:.0f}", "" if cost.error is None else f"{cost.error:.2f}"]

@@ -1,4 +1,4 @@
-"""The figures a run leaves, as matplotlib figures that the caller saves."""
+"""The figures that a run leaves, and what all figures have in common."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from matplotlib.patches import Rectangle
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.parameter.distributions import merged
+from neural_sim.report.run import Learned, RunResults
 from neural_sim.types import LabelledImages
 
 matplotlib.use("Agg")
@@ -29,7 +30,7 @@ CLASS_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00
 
 
 def style(axes: Any) -> None:
-    """The frame of all figures."""
+    """Give axes the frame that all figures have."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -44,31 +45,18 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def psi_figure(
-    history: Mapping[str, Sequence[Sequence[float]]],
-    target: Mapping[str, Sequence[float]] | None,
-    title: str,
-    factor: str,
-    groups: Mapping[str, Sequence[Sequence[int]]] | None = None,
-) -> Figure:
-    """P over the bins at every iteration, stacked, with the target distribution as a bar beside it.
-
-    ``history`` maps an object to [iterations + 1][k] probabilities, ``target`` to k of them (None: not known).
-    ``factor`` names what the bins are of; only a pose's colours close the circle. ``groups`` are an object's bins (from
-    1) that look the same: stacked as one, in the colour of the first.
-    """
-    names = list(history)
-    columns = min(3, len(names))
-    rows = -(-len(names) // columns)
+def psi_figure(learned: Sequence[Learned], title: str) -> Figure:
+    """Draw P over a factor's bins at every iteration, stacked, with the target's next to it, a panel an object."""
+    columns = min(3, len(learned))
+    rows = -(-len(learned) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.5 * rows + 0.9), layout="constrained")
-    bins = len(history[names[0]][0])
+    factor, bins = learned[0].factor, len(learned[0].history[0])
     colours = bin_colours(factor, bins)
     figure.suptitle(title, color=INK, fontsize=11)
-    for place, name in enumerate(names, 1):
-        joined = groups[name] if groups is not None else [[b] for b in range(1, bins + 1)]
+    for place, one in enumerate(learned, 1):
         axes = figure.add_subplot(rows, columns, place)
-        psi_panel(axes, history[name], None if target is None else target[name], joined, colours)
-        axes.set_title(_titled(name, joined), fontsize=9)
+        psi_panel(axes, one)
+        axes.set_title(_titled(one), fontsize=9)
     handles = [Rectangle((0, 0), 1, 1, color=colours[b]) for b in range(bins)]
     figure.legend(
         handles, [str(b + 1) for b in range(bins)], loc="outside lower center", ncols=min(bins, 16),
@@ -78,23 +66,20 @@ def psi_figure(
 
 
 def bin_colours(factor: str, bins: int) -> Any:
-    """A colour a bin; only a pose's close the circle."""
+    """Return a colour a bin; only a pose's close the circle."""
     return matplotlib.colormaps["twilight_shifted" if factor == "pose" else "viridis"](
         np.linspace(0.08, 0.92, bins)
     )
 
 
-def psi_panel(
-    axes: Any,
-    history: Sequence[Sequence[float]],
-    target: Sequence[float] | None,
-    groups: Sequence[Sequence[int]],
-    colours: Any,
-) -> None:
-    """One object's probabilities, stacked, by iteration, and its target's beside them; arguments as in
-    :func:`psi_figure`.
+def psi_panel(axes: Any, learned: Learned) -> None:
+    """Draw one object's probabilities, stacked, by iteration, and its target's next to them.
+
+    Bins that look the same are stacked as one, in the colour of the first.
     """
-    p = merged(torch.tensor(history), groups).numpy()
+    groups = learned.groups
+    colours = bin_colours(learned.factor, len(learned.history[0]))
+    p = merged(torch.tensor(learned.history), groups).numpy()
     shades = [colours[group[0] - 1] for group in groups]
     steps = np.arange(len(p))
     width = max(1.0, 0.12 * len(p))
@@ -102,9 +87,9 @@ def psi_panel(
     ticks = range(0, len(p), max(1, -(-(len(p) - 1) // 6)))
     style(axes)
     axes.set(xlim=(0, max(1, len(p) - 1)), ylim=(0, 1), xticks=ticks)
-    if target is None:
+    if "target" not in learned.p:
         return
-    wanted, bottom = merged(torch.tensor(target), groups).numpy(), 0.0
+    wanted, bottom = merged(torch.tensor(learned.p["target"]), groups).numpy(), 0.0
     for group, mass, shade in zip(groups, wanted, shades, strict=True):
         axes.bar(len(p) - 1 + 1.1 * width, mass, width, bottom=bottom, color=shade, linewidth=0)
         if mass > 0.25:
@@ -115,16 +100,16 @@ def psi_panel(
     axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
 
 
-def _titled(name: str, groups: Sequence[Sequence[int]]) -> str:
-    """The object's name, and which of its bins are one."""
-    same = ["=".join(map(str, group)) for group in groups if len(group) > 1]
-    return f"{name} ({', '.join(same)})" if same else name
+def _titled(learned: Learned) -> str:
+    """Write the object's name, and which of its bins are one."""
+    same = ["=".join(map(str, group)) for group in learned.groups if len(group) > 1]
+    return f"{learned.name} ({', '.join(same)})" if same else learned.name
 
 
 def ap_figure(
     ap: Mapping[str, Mapping], class_names: Sequence[str], emphasised: Sequence[str], score: Score = "AP"
 ) -> Figure:
-    """AP (or accuracy) of every class for each training distribution; biased classes stand first, in bold."""
+    """Draw AP (or accuracy) of every class for each training distribution; biased classes stand first, in bold."""
     order = [n for n in class_names if n in emphasised] + [n for n in class_names if n not in emphasised]
     labels = [*order, "mean"]
     figure = Figure(figsize=(1.1 * len(labels) + 1.6, 3.2), layout="constrained")
@@ -155,7 +140,7 @@ def image_grid(
     predictions: Sequence[Mapping[str, torch.Tensor]] | None = None,
     title: str = "",
 ) -> Figure:
-    """Images with their boxes (solid), or with the best prediction solid over dashed true boxes.
+    """Draw images with their boxes (solid), or with the best prediction solid over dashed true boxes.
 
     A caption names one object, and how many more there are. All images go on one canvas: an axes each would take a
     hundred times as long to lay out.
@@ -204,14 +189,46 @@ def _box(axes: Any, box: Sequence[float], origin: tuple[int, int], label: int, d
     x0, y0, x1, y1 = box
     left, top = origin
     colour = "white" if dashed else CLASS_COLOURS[label % len(CLASS_COLOURS)]
+    width, line = (0.9, "--") if dashed else (1.4, "-")
+    corner = (left + x0 - 0.5, top + y0 - 0.5)
     axes.add_patch(
-        Rectangle(
-            (left + x0 - 0.5, top + y0 - 0.5),
-            x1 - x0,
-            y1 - y0,
-            fill=False,
-            edgecolor=colour,
-            linewidth=0.9 if dashed else 1.4,
-            linestyle="--" if dashed else "-",
-        )
+        Rectangle(corner, x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=width, linestyle=line)
     )
+
+
+def write_figures(
+    results: RunResults,
+    drawn: LabelledImages,
+    test: LabelledImages,
+    detections: Sequence[Mapping[str, torch.Tensor]],
+    folder: Path,
+) -> list[Path]:
+    """Write a run's figures as PNG files.
+
+    Args:
+        results: of the run.
+        drawn: training images of the learned distribution.
+        test: the test images.
+        detections: on these, of the detector trained on the learned distribution; empty without.
+        folder: where the files go.
+    """
+    made: dict[str, Figure] = {}
+    names = list(results.names)
+    for factor in results.factors if results.records else ():
+        title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
+        made[f"psi_{factor}"] = psi_figure(results.of_factor(factor), title)
+    if results.ap:
+        made["ap"] = ap_figure(results.ap, names, results.biased, results.score)
+    title = "Training images drawn from the learned distribution"
+    made["training_images"] = image_grid(drawn.select(_spread(drawn, 32)), names, title=title)
+    if detections:
+        chosen = _spread(test, 32)
+        found = [detections[int(i)] for i in chosen]
+        title = "Detections on the test set (dashed: truth)"
+        made["detections"] = image_grid(test.select(chosen), names, predictions=found, title=title)
+    return [save(figure, folder / f"{name}.png") for name, figure in made.items()]
+
+
+def _spread(images: LabelledImages, count: int) -> torch.Tensor:
+    """Return indices of up to ``count`` images spread over the set."""
+    return torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neural_sim.digests import digest, tensor_digest
-from neural_sim.report.commit import commit
+from neural_sim.report.provenance import commit
 from neural_sim.report.tracking import flatten
 from neural_sim.types import LabelledImages
 
 KEYS = ("scoring", "configuration", "test_set")
-"""Of results.json, see :func:`identity`."""
+"""Digests in results.json, see :func:`identity`."""
 SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
 """Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
 METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")
@@ -26,7 +26,7 @@ SHOWN = 3
 def identity(
     config: Mapping[str, Any], files: Mapping[str, Any], code: Mapping[str, str], test: LabelledImages
 ) -> dict[str, Any]:
-    """What results.json carries for a comparison.
+    """Return what results.json carries for a comparison.
 
     Args:
         config: the resolved configuration.
@@ -54,15 +54,18 @@ def identity(
 
 
 def at_scale(then: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether a run's budget says what today's says, of every key that the run's has. One that came later had no part
-    in the run. Values are compared as text, as MLflow has them.
+    """Whether all budget keys of the run match today's; keys added later are ignored.
+
+    Args:
+        then: the run's budget; values are compared as text, as MLflow has them.
+        now: today's.
     """
     had, have = ({key: str(value) for key, value in flatten(budget).items()} for budget in (then, now))
     return bool(had) and had.items() <= have.items()
 
 
 def scored_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a configuration that AP depends on, whichever method is scored. Objects go by their contents."""
+    """Return what scores depend on, whichever method is scored; objects go by their contents."""
     parameters = {name: _without_choices(node) for name, node in config["parameter"].items()}
     return {**{group: _without_choices(config[group]) for group in SCORED}, "parameter": parameters}
 
@@ -72,35 +75,35 @@ def _without_choices(node: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scored_values(results: Mapping[str, Any]) -> dict[str, Any]:
-    """All that goes into the digest ``scoring``, flat, by the names that a reader of a comparison sees."""
+    """Return all that goes into the digest ``scoring``, flat, by the names that a reader of a comparison sees."""
     config = {**scored_config(results["config"]), "objects": results["config"]["objects"]}
     files = {f"contents of {key}": _short(value) for key, value in flatten(results["files"]).items()}
     return {**flatten(config), **files, "code that trains and scores": results["code"]["scoring"][:8]}
 
 
 def all_values(results: Mapping[str, Any]) -> dict[str, Any]:
-    """All that goes into the digests ``configuration`` and ``scoring``, flat."""
+    """Return all that goes into the digests ``configuration`` and ``scoring``, flat."""
     config = {key: value for key, value in results["config"].items() if key not in RUN_KEYS}
     method = {"code of the method": results["code"]["method"][:8]}
     return {**flatten(config), **scored_values(results), **method}
 
 
 def differing(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names whose values are not the same in all mappings; ``_target_``, the class that a group names, comes first."""
+    """Return names whose values differ between mappings; ``_target_``, the class that a group names, comes first."""
     names = list(dict.fromkeys(name for values in all_of for name in values))
     different = [n for n in names if any(v.get(n, _ABSENT) != all_of[0].get(n, _ABSENT) for v in all_of)]
     return sorted(different, key=lambda name: not name.endswith("_target_"))
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
-    """The first few differences in words, with both values: ``views.count is 8, not 100; ... and 4 more``."""
+    """Write the first few differences with both values: ``views.count is 8, not 100; ... and 4 more``."""
     names = differing([here, there])
     parts = [f"{n} is {_shown(here, n)}, not {_shown(there, n)}" for n in names[:SHOWN]]
     return "; ".join(parts) + _more(names)
 
 
 def headings(all_of: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How each mapping differs from the others: ``views.count=8, ... and 4 more``; empty for a single one."""
+    """Write how each mapping differs from the others: ``views.count=8, ... and 4 more``; empty for a single one."""
     names = differing(all_of)
     return [", ".join(f"{n}={_shown(v, n)}" for n in names[:SHOWN]) + _more(names) for v in all_of]
 

@@ -33,19 +33,53 @@ class Estimate:
 
     @property
     def certain(self) -> bool:
-        """Whether there is an interval, and leaves 0 out."""
+        """Whether there is an interval that leaves 0 out."""
         return self.low is not None and self.high is not None and (self.low > 0.0 or self.high < 0.0)
 
     @property
+    def negated(self) -> Estimate:
+        """Minus the value, with its interval."""
+        low, high = (None if bound is None else -bound for bound in (self.high, self.low))
+        return Estimate(-self.value, low, high)
+
+    @property
     def as_fraction(self) -> Estimate:
-        """Of a number in [0, 1], such as a score: the part of the interval that lies there."""
+        """The same with the part of the interval that lies in [0, 1], where the number must lie."""
         if self.low is None or self.high is None:
             return self
         return Estimate(self.value, max(self.low, 0.0), min(self.high, 1.0))
 
 
+def points(estimate: Estimate, unit: str = "", sure: bool = False) -> str:
+    """Write a fraction in points with its interval: ``61.2 (50.0 to 70.3)``.
+
+    Args:
+        estimate: the fraction.
+        unit: follows the value, which then has no decimals.
+        sure: set the value in bold where the interval excludes 0.
+    """
+    digits = 0 if unit else 1
+    text = _hundredfold(estimate.value, digits) + (f" {unit}" if unit else "")
+    if estimate.low is None or estimate.high is None:
+        return text
+    text = f"**{text}**" if sure and estimate.certain else text
+    return f"{text} ({_hundredfold(estimate.low, digits)} to {_hundredfold(estimate.high, digits)})"
+
+
+def bounds(estimate: Estimate) -> str:
+    """Write an interval in points: ``20.1 to 27.3``."""
+    if estimate.low is None or estimate.high is None:
+        return "no interval"
+    return f"{100.0 * estimate.low:.1f} to {100.0 * estimate.high:.1f}"
+
+
+def _hundredfold(value: float, digits: int) -> str:
+    """In hundredths, never as a negative zero."""
+    return f"{100 * value:z.{digits}f}"
+
+
 def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
-    """The mean with Student's interval; that of one seed has none."""
+    """Return the mean with Student's interval; that of one seed has none."""
     value, n = float(np.mean(values)), len(values)
     if n == 1:
         return Estimate(value)
@@ -56,7 +90,7 @@ def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
 def over_seeds_and_images(
     values: Float[np.ndarray, "seeds"], resampled: Float[np.ndarray, "draws seeds"]
 ) -> Estimate:
-    """The mean over seeds of a :data:`Sample`, given by its two parts.
+    """Return the mean over seeds of a :data:`Sample`, given by its two parts.
 
     One seed's interval is from the 2.5 % to the 97.5 % quantile over images.
     """
@@ -68,13 +102,13 @@ def over_seeds_and_images(
 
 
 def over_images(value: float, resampled: Float[np.ndarray, "draws"]) -> Estimate:
-    """A value with the 2.5 % and 97.5 % quantiles of its resampled ones, nan left out."""
+    """Return a value with the 2.5 % and 97.5 % quantiles of its resampled ones, nan left out."""
     low, high = np.nanquantile(resampled, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
 
 def ratio(numerator: Sample, denominator: Sample) -> Estimate:
-    """The mean numerator by the mean denominator, both over seeds and resampled test images.
+    """Return the mean numerator by the mean denominator, both over seeds and resampled test images.
 
     The interval is Fieller's: all ratios r for which the mean of numerator - r denominator is not told from 0. It is
     unbounded, and None here, where the denominator is not told from 0.
@@ -94,12 +128,12 @@ def ratio(numerator: Sample, denominator: Sample) -> Estimate:
 
 
 def _quantile(seeds: int) -> float:
-    """By which a standard deviation between seeds becomes half of their mean's interval; 0 of one seed."""
+    """Half-width of a mean's 95 % interval per standard deviation between seeds (Student's t); 0 for one seed."""
     return float(stdtrit(seeds - 1, 0.975)) / math.sqrt(seeds) if seeds > 1 else 0.0
 
 
 def _covariance(a: Sample, b: Sample) -> float:
-    """Of two means over seeds, its parts times the squares of their quantiles; of a = b, half an interval's square."""
+    """Covariance of two means, its parts times their squared quantiles: for a = b, half an interval squared."""
     seeds = len(a[0])
     of_seeds = float(np.cov(a[0], b[0])[0, 1]) if seeds > 1 else 0.0
     pair = np.stack([resampled.mean(1) for _, resampled in (a, b)])

@@ -1,46 +1,72 @@
-"""What a run leaves in its folder: results.json, figures, the final training set in COCO form."""
+"""What a run has found: results.json, and the summary that is printed."""
 
 from __future__ import annotations
 
-import json
-import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from neural_sim.cameras import orbit
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
+from neural_sim.documents import finite, write_json
 from neural_sim.outer.certificate import untrusted
 from neural_sim.parameter.distributions import merged, total_variation
-from neural_sim.report import figures
-from neural_sim.synthesis.assembly import RenderedImages
-from neural_sim.synthesis.export.coco import write_coco
-from neural_sim.types import LabelledImages
 
-_log = logging.getLogger(__name__)
+
+@dataclass(frozen=True)
+class Learned:
+    """The distribution of one factor of one object: what it was at first, became and should be.
+
+    Args:
+        name: of the object.
+        factor: of the parameters, for instance ``pose``.
+        groups: bins (from 1) that look the same; a bin each where nothing is known. They are scored and drawn as one.
+        p: probabilities of the bins: ``initial``, ``learned`` and, where it is known, ``target``.
+        history: those at the start of every iteration, and the learned ones; one row where nothing was learned.
+        distances: total variation of ``initial`` and ``learned`` from the target, over groups; empty where it is not
+            known.
+    """
+
+    name: str
+    factor: str
+    groups: Sequence[Sequence[int]]
+    p: Mapping[str, Sequence[float]]
+    history: Sequence[Sequence[float]]
+    distances: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class RunResults:
-    """Everything the report shows. ``probabilities`` are those of initial, learned and target, by factor, [objects, k];
-    ``ap`` maps ns, learned, matched to scores on the test set. Photographs whose distribution is not known have neither
-    target nor matched. ``validation_ap`` is that of the learned distribution's
-    detector on the validation images, which steered psi too: settings are chosen by it, nothing is reported by it.
-    ``curve`` has what the method had spent (images, detector_steps, products, seconds) and what its psi was worth
-    (``ap``) at every iteration that was scored.
+    """Everything the report shows.
 
-    ``memory`` is the largest so far in MB by name, see :func:`devices.peak_memory_mb`. ``symmetric_bins`` groups bins
-    (from 1), by object and angle, whose views an object's symmetry makes the same; they are scored and drawn as one.
-    ``real`` says how photographs trained (``mode``) and how many (``photographs``); empty without. ``ap`` then also has
-    the scores of synthetic_only, real_only and views_only.
-    ``score`` is what detectors are scored by: AP, or accuracy, which ``ap`` then has.
-    ``identity`` says which runs this one can be compared with, see :func:`identity.identity`.
+    Args:
+        experiment: its name.
+        method: what chose the training images.
+        seed: of the run.
+        names: of the objects, in the order of their labels.
+        biased: objects that start from another distribution than the target's.
+        probabilities: ``initial``, ``learned`` and ``target`` by factor, [objects, k]. Photographs whose distribution
+            is not known have neither target nor ``matched`` in ``ap``.
+        records: iterations of the psi loop.
+        ap: scores on the test set of ns, learned and matched, and where photographs train too, of synthetic_only,
+            real_only and views_only.
+        fields: scores of every object's field while it was fitted.
+        seconds: by stage.
+        memory: the largest so far in MB by name, see :func:`devices.peak_memory_mb`.
+        left_out: work that was not done, and why.
+        config: the whole configuration.
+        validation_ap: the score of the detector of ``learned`` on the validation images, the outer objective's:
+            settings are chosen by it, nothing is reported by it.
+        curve: what the method had spent (images, detector_steps, products, seconds) and what its psi was worth (``ap``)
+            at every iteration that was scored.
+        symmetric_bins: groups of bins (from 1), by object and angle, whose views an object's symmetry makes the same.
+        identity: which runs this one can be compared with, see :func:`identity.identity`.
+        real: how photographs trained (``mode``) and how many (``photographs``); empty without.
+        score: what detectors are scored by: AP, or accuracy, which ``ap`` then has.
     """
 
     experiment: str
@@ -63,77 +89,78 @@ class RunResults:
     real: Mapping[str, Any] = field(default_factory=dict)
     score: Score = "AP"
 
-    def document(self) -> dict[str, Any]:
-        """The content of results.json; numbers that do not exist (the score of an absent class) are null."""
-        psi = {
-            name: {
-                factor: {which: p[factor][label].tolist() for which, p in self.probabilities.items()}
-                for factor in self.factors
-            }
-            for label, name in enumerate(self.names)
-        }
-        return _finite(
-            {
-                "experiment": self.experiment,
-                "method": self.method,
-                "seed": self.seed,
-                "gap": self.config.get("gap", "disjoint"),
-                "biased": list(self.biased),
-                "psi": psi,
-                "total_variation": self.total_variations(),
-                "symmetric_bins": dict(self.symmetric_bins),
-                "score": self.score,
-                "ap": dict(self.ap),
-                "validation_ap": self.validation_ap,
-                "real": dict(self.real),
-                "curve": list(self.curve),
-                "certificates": untrusted(self.records),
-                "images_without_box": self.images_without_box(),
-                "iterations": list(self.records),
-                "fields": {name: history[-1] for name, history in self.fields.items() if history},
-                "seconds": dict(self.seconds),
-                **self.memory,
-                "left_out": list(self.left_out),
-                **self.identity,
-            }
-        )
-
-    def images_without_box(self) -> int:
-        """Training images of the psi loop in which the object was out of frame or too small to get a box."""
-        return sum(record["images_without_box"] for record in self.records)
-
     @property
     def factors(self) -> tuple[str, ...]:
         """Names of what is learned, in order."""
         return tuple(self.probabilities["learned"])
 
-    def groups(self, name: str, factor: str) -> Sequence[Sequence[int]]:
-        """Groups of a factor's bins (from 1) that look the same for an object; a bin each where nothing is known."""
-        bins = self.probabilities["learned"][factor].shape[-1]
-        return self.symmetric_bins.get(name, {}).get(factor) or [[b] for b in range(1, bins + 1)]
-
-    def total_variations(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Distance of the initial and the learned distribution from the target, by object and factor, over groups;
-        empty for every object where the target is not known.
-        """
-        distances: dict[str, dict[str, dict[str, float]]] = {name: {} for name in self.names}
-        if "target" not in self.probabilities:
-            return distances
+    @cached_property
+    def learned(self) -> tuple[Learned, ...]:
+        """The distributions of every object and factor, object by object."""
+        found = []
         for label, name in enumerate(self.names):
             for factor in self.factors:
-                groups = self.groups(name, factor)
-                p = {which: merged(p[factor][label], groups) for which, p in self.probabilities.items()}
-                distances[name][factor] = {
-                    which: float(total_variation(p[which], p["target"])) for which in ("initial", "learned")
-                }
-        return distances
+                p = {which: values[factor][label] for which, values in self.probabilities.items()}
+                bins = [[b] for b in range(1, len(p["learned"]) + 1)]
+                groups = self.symmetric_bins.get(name, {}).get(factor) or bins
+                listed = {which: values.tolist() for which, values in p.items()}
+                steps = [record["probabilities"][factor][label] for record in self.records]
+                history = [*steps, listed["learned"]]
+                found.append(Learned(name, factor, groups, listed, history, _distances(p, groups)))
+        return tuple(found)
+
+    def of_factor(self, factor: str) -> list[Learned]:
+        """Return a factor's distributions of all objects."""
+        return [one for one in self.learned if one.factor == factor]
+
+    @property
+    def target_known(self) -> bool:
+        """Whether the target's distribution is known."""
+        return "target" in self.probabilities
+
+    @property
+    def images_without_box(self) -> int:
+        """Training images of the psi loop in which the object was out of frame or too small to get a box."""
+        return sum(record["images_without_box"] for record in self.records)
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of results.json; numbers that do not exist (the score of an absent class) are null."""
+        psi: dict[str, dict[str, Any]] = {name: {} for name in self.names}
+        away: dict[str, dict[str, Any]] = {name: {} for name in self.names}
+        for one in self.learned:
+            psi[one.name][one.factor] = one.p
+            if one.distances:
+                away[one.name][one.factor] = one.distances
+        return finite(
+            {
+                "experiment": self.experiment,
+                "method": self.method,
+                "seed": self.seed,
+                "gap": self.config.get("gap", "disjoint"),
+                "biased": self.biased,
+                "psi": psi,
+                "total_variation": away,
+                "symmetric_bins": self.symmetric_bins,
+                "score": self.score,
+                "ap": self.ap,
+                "validation_ap": self.validation_ap,
+                "real": self.real,
+                "curve": self.curve,
+                "certificates": untrusted(self.records),
+                "images_without_box": self.images_without_box,
+                "iterations": self.records,
+                "fields": {name: history[-1] for name, history in self.fields.items() if history},
+                "seconds": self.seconds,
+                **self.memory,
+                "left_out": self.left_out,
+                **self.identity,
+            }
+        )
 
     def summary(self) -> str:
-        """The table printed at the end of a run."""
-        head = f"{f'{self.score} on the test set':<24}" + "".join(
-            f"{name[:12]:>13}" for name in (*self.names, "mean")
-        )
-        lines = [head]
+        """Return the table printed at the end of a run."""
+        columns = "".join(f"{name[:12]:>13}" for name in (*self.names, "mean"))
+        lines = [f"{f'{self.score} on the test set':<24}{columns}"]
         for method, scores in self.ap.items():
             values = [*(scores["per_class"][name] for name in self.names), mean_of(scores)]
             lines.append(f"{method:<24}" + "".join(f"{100 * value:>13.1f}" for value in values))
@@ -144,30 +171,34 @@ class RunResults:
         if self.validation_ap is not None:
             score = f"{100 * self.validation_ap:.1f}"
             lines.append(f"{self.score} on the validation images, learned: {score} (to choose settings by)")
-        distances = self.total_variations()
-        for factor in self.factors if "target" in self.probabilities else ():
+        for factor in self.factors if self.target_known else ():
             lines.append(f"distance to target, {factor}")
             for which in ("initial", "learned"):
-                row = "".join(f"{distances[name][factor][which]:>13.2f}" for name in self.names)
+                row = "".join(f"{one.distances[which]:>13.2f}" for one in self.of_factor(factor))
                 lines.append(f"  {which:<22}{row}")
         trust = untrusted(self.records)
         if trust["steps"]:
             lines.append(_trust_line(trust))
-        if self.images_without_box():
-            lines.append(f"images of the psi loop without a box: {self.images_without_box()}")
+        if self.images_without_box:
+            lines.append(f"images of the psi loop without a box: {self.images_without_box}")
         spent = ", ".join(f"{name} {value:.1f}" for name, value in self.seconds.items())
         gpu = self.memory.get("peak_gpu_memory_mb")
-        memory = f"{self.memory['peak_memory_mb']:.0f} MB" + (
-            "" if gpu is None else f", on the GPU {gpu:.0f} MB"
-        )
-        lines.append(f"seconds: {spent}; peak memory {memory}")
+        on_gpu = "" if gpu is None else f", on the GPU {gpu:.0f} MB"
+        lines.append(f"seconds: {spent}; peak memory {self.memory['peak_memory_mb']:.0f} MB{on_gpu}")
         if self.left_out:
             lines.append(_left_out_line(self.left_out))
         return "\n".join(lines)
 
 
+def _distances(p: Mapping[str, Tensor], groups: Sequence[Sequence[int]]) -> dict[str, float]:
+    if "target" not in p:
+        return {}
+    one = {which: merged(values, groups) for which, values in p.items()}
+    return {which: float(total_variation(one[which], one["target"])) for which in ("initial", "learned")}
+
+
 def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
-    """Fractions of the work that was left out, and the results that the store had."""
+    """Write fractions of the work that was left out, and the results that the store had."""
     stored = [o for o in left_out if o["why"] == "found in the store"]
     others = [o for o in left_out if o not in stored and o["fraction"] is not None]
     parts = [f"{o['what']} {o['fraction']:.0%}" for o in others]
@@ -178,7 +209,7 @@ def _left_out_line(left_out: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _trust_line(trust: Mapping[str, Any]) -> str:
-    """How many psi steps of objects and factors were not trusted, why, and what became of them."""
+    """Write how many psi steps of objects and factors were not trusted, why, and what became of them."""
     text = f"untrusted psi steps of objects: {trust['untrusted']} of {trust['steps']}"
     for part in ("actions", "doubts"):
         if trust[part]:
@@ -193,105 +224,5 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
 
 
 def write_results(results: RunResults, folder: Path) -> Path:
-    """results.json in ``folder``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "results.json"
-    path.write_text(json.dumps(results.document(), indent=1, allow_nan=False))
-    return path
-
-
-def write_figures(
-    results: RunResults,
-    drawn: LabelledImages,
-    test: LabelledImages,
-    detections: Sequence[Mapping[str, Tensor]],
-    folder: Path,
-) -> list[Path]:
-    """The run's figures as PNG files."""
-    names, paths = list(results.names), []
-    for factor in results.factors if results.records else ():
-        target = results.probabilities.get("target")
-        wanted = None if target is None else dict(zip(names, target[factor].tolist(), strict=True))
-        steps = [*(r["probabilities"][factor] for r in results.records)]
-        steps.append(results.probabilities["learned"][factor].tolist())
-        history = {name: [p[i] for p in steps] for i, name in enumerate(names)}
-        title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
-        groups = {name: results.groups(name, factor) for name in names}
-        drawn_psi = figures.psi_figure(history, wanted, title, factor, groups)
-        paths.append(figures.save(drawn_psi, folder / f"psi_{factor}.png"))
-    if results.ap:
-        paths.append(
-            figures.save(
-                figures.ap_figure(results.ap, names, results.biased, results.score), folder / "ap.png"
-            )
-        )
-    chosen = _spread(drawn, 32)
-    grid = figures.image_grid(
-        drawn.select(chosen), names, title="Training images drawn from the learned distribution"
-    )
-    paths.append(figures.save(grid, folder / "training_images.png"))
-    if detections:
-        chosen = _spread(test, 32)
-        shown = [detections[int(i)] for i in chosen]
-        title = "Detections on the test set (dashed: truth)"
-        grid = figures.image_grid(test.select(chosen), names, predictions=shown, title=title)
-        paths.append(figures.save(grid, folder / "detections.png"))
-    return paths
-
-
-def write_training_set(rendered: RenderedImages, names: Sequence[str], folder: Path) -> Path:
-    """The final training set as COCO: images and a JSON that holds the pose of every object in them."""
-    poses: list[list[dict[str, Any]]] = [[] for _ in range(len(rendered))]
-    for label, (part, rows) in enumerate(zip(rendered.objects, rendered.rows, strict=True)):
-        draw, distance = part.draw, part.draw.distance / part.draw.radius  # object radii
-        values = {name: getattr(draw, name) for name in ("phi", "rho", "magnification", "bins")}
-        values |= {"distance": distance, "camera_to_world": orbit(draw.phi, draw.rho, distance)}
-        listed = {key: value.tolist() for key, value in values.items() if value is not None}
-        for place, row in enumerate(rows.tolist()):
-            pose = {key: value[place] for key, value in listed.items()}
-            poses[row].append({"category_id": label + 1, **pose})
-    return write_coco(rendered.images, list(names), folder, poses)
-
-
-def write_detections(
-    test: LabelledImages, detections: Mapping[str, Sequence[Mapping[str, Tensor]]], folder: Path
-) -> Path:
-    """detections.json: the test set's boxes (``truth``) and every detector's detections, as COCO result rows."""
-    truth = [
-        {"boxes": b[k], "labels": n[k]} for b, n, k in zip(test.boxes, test.labels, test.present, strict=True)
-    ]
-    rows = {"images": len(test), "truth": _rows(truth)}
-    rows |= {which: _rows(images) for which, images in detections.items()}
-    path = folder / "detections.json"
-    path.write_text(json.dumps(rows))
-    return path
-
-
-def _rows(images: Sequence[Mapping[str, Tensor]]) -> list[dict[str, Any]]:
-    """One row a box: image_id from 0, category_id from 1, bbox as (x, y, width, height) in pixels, score."""
-    rows = []
-    for index, image in enumerate(images):
-        scores = image.get("scores", torch.ones(len(image["labels"])))
-        for box, label, score in zip(
-            image["boxes"].tolist(), image["labels"].tolist(), scores.tolist(), strict=True
-        ):
-            x0, y0, x1, y1 = (round(side, 3) for side in box)
-            row = {"image_id": index, "category_id": label + 1, "bbox": [x0, y0, x1 - x0, y1 - y0]}
-            rows.append({**row, "score": round(score, 5)})
-    return rows
-
-
-def _spread(images: LabelledImages, count: int) -> Tensor:
-    """Indices of up to ``count`` images spread over the set."""
-    return torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
-
-
-def _finite(tree: Any) -> Any:
-    """NaN and infinities as None, so that the file is JSON by the standard."""
-    if isinstance(tree, Mapping):
-        return {key: _finite(value) for key, value in tree.items()}
-    if isinstance(tree, (list, tuple)):
-        return [_finite(value) for value in tree]
-    if isinstance(tree, float) and not math.isfinite(tree):
-        return None
-    return tree
+    """Write results.json."""
+    return write_json(folder / "results.json", results.document())

@@ -112,9 +112,9 @@ def _final(results: RunResults) -> dict[str, float]:
         metrics |= {
             f"evaluate/{which}/{_key(results)}_{name}": value for name, value in scores["per_class"].items()
         }
-    for name, factors in results.total_variations().items():
-        for factor, distances in factors.items():
-            metrics |= {f"psi/{name}/{factor}/distance_{which}": value for which, value in distances.items()}
+    for one in results.learned:
+        own = f"psi/{one.name}/{one.factor}"
+        metrics |= {f"{own}/distance_{which}": value for which, value in one.distances.items()}
     return metrics
 
 

@@ -1,4 +1,4 @@
-"""Runs in MLflow: opened when work begins, and written to while it goes on."""
+"""Runs in MLflow: opened when work begins, written to while it goes on, and read back."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.report.commit import commit
+from neural_sim.report.provenance import commit
 
 _log = logging.getLogger(__name__)
 
 KIND = ("mlflow.experimentKind", "custom_model_development")
 """The tag by which versions of MLflow that go by tags show an experiment as model training."""
 TRAINING = "workflowType=machine_learning"
-"""What an address says for versions whose pages go by a switch, which stands at GenAI in a new browser: without it they
-show an empty page of traces."""
+"""URL query that opens MLflow's view of training; newer versions default to GenAI and would show an empty page."""
 COMMIT = "mlflow.source.git.commit"
 """The tag from which MLflow shows the commit of a run's code, or ``UNKNOWN``."""
 UNKNOWN = "unknown"
@@ -30,7 +30,7 @@ BATCH = 100
 
 
 def tracking_uri(location: str) -> str:
-    """The URI of a tracking store: a URI as it is, a path as a SQLite file with an absolute path.
+    """Return the URI of a tracking store: a URI as it is, a path as a SQLite file with an absolute path.
 
     Raises:
         ValueError: an empty location.
@@ -43,7 +43,7 @@ def tracking_uri(location: str) -> str:
 
 
 def where(uri: str, experiment_id: str, run_id: str | None = None) -> str:
-    """How to look at a run, or at an experiment's table of runs: an address, after the command that serves it."""
+    """Return how to look at a run or at an experiment's table of runs: an address, after the command that serves it."""
     path = f"/#/experiments/{experiment_id}/runs" + (f"/{run_id}" if run_id else "") + f"?{TRAINING}"
     if uri.startswith(("http://", "https://")):
         return uri.rstrip("/") + path
@@ -90,8 +90,9 @@ class Run:
 
     @contextmanager
     def fluent(self) -> Iterator[Any]:
-        """The module ``mlflow`` with this run's store and experiment as its own, for what a client cannot write, which
-        are models. It keeps the experiment, which nothing else here reads.
+        """Give the module ``mlflow`` with this run's store and experiment as its own, to log models: clients cannot.
+
+        The experiment stays set afterwards; nothing else here reads it.
         """
         with quiet(), _guard(self.uri):
             import mlflow
@@ -105,8 +106,11 @@ class Run:
                 mlflow.set_tracking_uri(before)
 
     def close(self, status: str, error: BaseException | None = None) -> None:
-        """Send what waits and end the run. ``error``, its cause, becomes a tag; then what the store refuses is a
-        warning.
+        """Send what waits and end the run.
+
+        Args:
+            status: FINISHED, FAILED or KILLED.
+            error: the cause, which becomes a tag; then what the store refuses is a warning.
         """
         if error is None:
             self._send()
@@ -155,10 +159,18 @@ def opened(
     begun: float | None = None,
     clock: Callable[[], float] = time.time,
 ) -> Iterator[Run]:
-    """A run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after Ctrl-C.
+    """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after Ctrl-C.
 
-    ``begun`` is when the work began if that was before now, in seconds since 1970. A new SQLite store is created, and
-    every store written to, under a lock, so that the workers of a sweep can share it.
+    A new SQLite store is created, and every store written to, under a lock, so that workers of a sweep can share it.
+
+    Args:
+        uri: of the store.
+        experiment: its name; made where there is none.
+        name: of the run.
+        tags: of the run.
+        parameters: the configuration, flat.
+        begun: when the work began if that was before now, in seconds since 1970.
+        clock: gives the time in seconds since 1970.
 
     Raises:
         ValueError: a store that cannot be written to.
@@ -209,7 +221,7 @@ def log_run(
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as dotted keys, as MLflow's parameters are filtered by."""
+    """Return nested mappings with dotted keys, by which MLflow's parameters are filtered."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
@@ -232,7 +244,7 @@ def _interrupted(error: BaseException) -> bool:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the noise that MLflow and its database make when they are imported and when a store is created."""
+    """Silence what MLflow and its database say when they are imported and when a store is created."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -254,7 +266,7 @@ def _guard(uri: str) -> AbstractContextManager[Any]:
 
 
 def connect(uri: str) -> Any:
-    """A client of a store, which is created if it is a SQLite file that is not there yet."""
+    """Return a client of a store, which is created if it is a SQLite file that does not exist yet."""
     from mlflow import MlflowClient
 
     if (database := _database(uri)) is not None:
@@ -266,7 +278,7 @@ def connect(uri: str) -> Any:
 
 
 def _experiment_id(client: Any, uri: str, name: str) -> str:
-    """The experiment, created if it does not exist, with the tag of model training unless it has another kind's."""
+    """Return the experiment, created if it does not exist, tagged as model training unless it has another tag."""
     from mlflow.exceptions import MlflowException
 
     experiment = client.get_experiment_by_name(name)
@@ -283,3 +295,79 @@ def _experiment_id(client: Any, uri: str, name: str) -> str:
     if KIND[0] not in experiment.tags:
         client.set_experiment_tag(experiment.experiment_id, *KIND)
     return experiment.experiment_id
+
+
+@dataclass(frozen=True)
+class LoggedRun:
+    """A run in the tracking store.
+
+    Args:
+        run_id: in MLflow.
+        name: in MLflow.
+        status: FINISHED, FAILED, ...
+        commit: of its code, or ``UNKNOWN``.
+        parameters: its configuration as MLflow keeps it, flat and as text.
+        files: names of its artifacts.
+        fetch: brings one of these here.
+    """
+
+    run_id: str
+    name: str
+    status: str
+    commit: str
+    parameters: Mapping[str, str]
+    files: frozenset[str]
+    fetch: Callable[[str], Path]
+
+
+def logged_runs(uri: str, experiment: str) -> list[LoggedRun]:
+    """Read all runs of an experiment that are not deleted, the latest first.
+
+    Raises:
+        ValueError: no experiment of that name.
+    """
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    with quiet():
+        client = connect(uri)
+        order, found, token = ["attributes.start_time DESC"], [], None
+        experiment_id = _known_id(client, uri, experiment)
+        while token != "":
+            page = client.search_runs([experiment_id], order_by=order, page_token=token)
+            found += [_logged(client, run) for run in page]
+            token = page.token or ""
+    return found
+
+
+def experiments(uri: str) -> list[str]:
+    """Return the names of the experiments that are not deleted."""
+    with quiet():
+        return sorted(experiment.name for experiment in connect(uri).search_experiments())
+
+
+def where_runs(uri: str, experiment: str) -> str:
+    """Return how to look at an experiment's table of runs, see :func:`where`.
+
+    Raises:
+        ValueError: no experiment of that name.
+    """
+    with quiet():
+        return where(uri, _known_id(connect(uri), uri, experiment))
+
+
+def _logged(client: Any, run: Any) -> LoggedRun:
+    info = run.info
+    files = frozenset(item.path for item in client.list_artifacts(info.run_id))
+
+    def fetch(name: str) -> Path:
+        return Path(client.download_artifacts(info.run_id, name))
+
+    commit = run.data.tags.get(COMMIT, UNKNOWN)
+    return LoggedRun(info.run_id, info.run_name, info.status, commit, run.data.params, files, fetch)
+
+
+def _known_id(client: Any, uri: str, experiment: str) -> str:
+    logged = client.get_experiment_by_name(experiment)
+    if logged is None:
+        known = sorted(e.name for e in client.search_experiments() if e.name != "Default")
+        raise ValueError(f"compare.experiments: {uri} has no experiment {experiment!r}, only {known}")
+    return logged.experiment_id

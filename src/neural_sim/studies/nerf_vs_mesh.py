@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from neural_sim.checks import at_least
-from neural_sim.report.run import write_training_set
+from neural_sim.report.coco import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.meshes import Meshes

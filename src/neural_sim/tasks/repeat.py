@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from neural_sim.checks import at_least
+from neural_sim.detector.protocol import Score
+from neural_sim.documents import markdown_table, write_json
 from neural_sim.report.bootstrap import Outcomes, match
-from neural_sim.report.repeat import Repeated, repeated, sentence, table
+from neural_sim.report.intervals import points
+from neural_sim.report.page.verdict import Gain, verdict
+from neural_sim.report.score_table import ScoreTable
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.tasks.context import Context
 
 APART = 1_000
 """Between the seeds of trainings, so that a sweep over seeds 0, 1, 2 shares none of them."""
+SHOWN = (("learned", "ns"), ("matched", "learned"))
+"""Differences of a table, by which detector is ahead of which."""
+DIFFERENCES = (*SHOWN, ("matched", "ns"))
 
 
 @dataclass(frozen=True)
@@ -56,33 +62,77 @@ class RepeatTask:
             detections = results(again(first[which], k)).detections
             row = [match(detections, test, label, score) for label in range(len(names))]
             matches.setdefault(which, []).append(row)
-        shown = [label for label, each in enumerate(matches["ns"][0]) if each.boxes_per_image.sum()]
+        scores = ScoreTable.of(matches, names, self.draws)
         biased = context.experiment.imaging.distribution.biased
-        found = repeated(matches, groups(names, biased, shown), self.draws)
+        found = [scores.of_classes(group) for group in groups(names, biased, scores.shown)]
         text = f"{sentence(found[0], score)}\n\n{table(found, score)}\n"
         (context.folder / "repeat.md").write_text(text, encoding="utf-8")
-        document = {
-            "trainings": self.trainings,
-            "score": score,
-            "groups": [_document(each) for each in found],
-        }
-        (context.folder / "repeat.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+        document = {"trainings": self.trainings, "score": score, "groups": [group_document(g) for g in found]}
+        write_json(context.folder / "repeat.json", document)
         print(f"{text}results: {context.folder}")
 
 
-def groups(
-    names: Sequence[str], biased: Container[str], shown: Sequence[int]
-) -> list[tuple[list[str], list[int]]]:
-    """Return names and labels of the objects that a run is about, of all objects, and of each one.
-
-    Objects that no test image shows are left out.
-    """
-    about = [label for label in shown if names[label] in biased]
-    found: list[list[int]] = []
-    for group in (about or [*shown], [*shown], *([label] for label in shown)):
+def groups(names: Sequence[str], biased: Container[str], shown: Sequence[str]) -> list[list[str]]:
+    """Return the objects that a run is about, all objects, and each one, without those that no test image shows."""
+    known = [name for name in names if name in shown]
+    about = [name for name in known if name in biased]
+    found: list[list[str]] = []
+    for group in (about or known, known, *([name] for name in known)):
         if group not in found:
             found.append(group)
-    return [([names[label] for label in group], group) for group in found]
+    return found
+
+
+def sentence(scores: ScoreTable, score: Score) -> str:
+    """Return the verdict on the learned distribution, after several trainings."""
+    trainings = scores.point.shape[1]
+    text = verdict(Gain.of(scores), score, trainings)
+    return f"After {trainings} trainings of each distribution: {text}"
+
+
+def table(found: Sequence[ScoreTable], score: Score) -> str:
+    """Return a Markdown table with a row a group, in points; differences whose interval leaves 0 out are in bold."""
+    which = found[0].detectors
+    differences = [(a, b) for a, b in SHOWN if {a, b} <= set(which)]
+    head = [
+        "",
+        *which,
+        *(f"{a} ahead of {b} by" for a, b in differences),
+        "one training's scatter",
+        "over images",
+    ]
+    rows = []
+    for scores in found:
+        names, scatter = scores.classes, scores.scatter()
+        rows.append(
+            [
+                names[0] if len(names) == 1 else "mean of " + ", ".join(names),
+                *(points(scores.mean(detector)) for detector in which),
+                *(points(scores.ahead(a, b), sure=True) for a, b in differences),
+                f"{100 * scatter.seeds:.1f}",
+                f"{100 * scatter.images:.1f}",
+            ]
+        )
+    note = (
+        f"{score[0].upper()}{score[1:]} on the test set in points, means of {found[0].point.shape[1]} trainings, with "
+        "95 % intervals over trainings and test images. Differences in bold leave 0 out. The last two columns are "
+        "standard deviations of one detector's score: between trainings on one distribution, and over test images."
+    )
+    return f"{markdown_table(head, rows)}\n\n{note}"
+
+
+def group_document(scores: ScoreTable) -> dict[str, Any]:
+    """Return a group's part of repeat.json; scores are fractions."""
+    which, scatter = scores.detectors, scores.scatter()
+    pairs = [(a, b) for a, b in DIFFERENCES if {a, b} <= set(which)]
+    return {
+        "names": scores.classes,
+        "scores": {detector: scores.sample(detector)[0].tolist() for detector in which},
+        "mean": {detector: dataclasses.asdict(scores.mean(detector)) for detector in which},
+        "ahead": {f"{a} - {b}": dataclasses.asdict(scores.ahead(a, b)) for a, b in pairs},
+        "between": scatter.seeds,
+        "over_images": scatter.images,
+    }
 
 
 def again(stage: ScoresStage, training: int) -> ScoresStage:
@@ -97,8 +147,3 @@ def _seeded(stage: TrainedStage, by: int) -> TrainedStage:
     if isinstance(stage, DetectorStage):
         return replace(stage, seed=stage.seed + by)
     raise TypeError(f"repeat: a training that has no seed, {type(stage).__name__}")
-
-
-def _document(group: Repeated) -> dict[str, Any]:
-    ahead = {f"{a} - {b}": dataclasses.asdict(estimate) for (a, b), estimate in group.ahead.items()}
-    return dataclasses.asdict(group) | {"ahead": ahead}

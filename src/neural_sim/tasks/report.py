@@ -11,15 +11,11 @@ import torch
 
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
+from neural_sim.report.coco import write_detections, write_training_set
+from neural_sim.report.figures import write_figures
 from neural_sim.report.identity import identity
 from neural_sim.report.page.run_page import PER_OBJECT, Shown, write_run_page
-from neural_sim.report.run import (
-    RunResults,
-    write_detections,
-    write_figures,
-    write_results,
-    write_training_set,
-)
+from neural_sim.report.run import RunResults, write_results
 from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.graph import Psi
 from neural_sim.tasks.context import Context

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from neural_sim.report.intervals import Estimate
-from neural_sim.report.page.verdict import Resampled, interval, listed, verdict
+from neural_sim.report.intervals import Estimate, bounds
+from neural_sim.report.page.run_page import Shown, score_table
+from neural_sim.report.page.verdict import Gain, listed, verdict
 from neural_sim.types import LabelledImages
 
 IMAGES = 40
@@ -26,7 +27,11 @@ def detections(hits):
 
 def gain(ns, learned, matched, same=False):
     found = {"ns": detections(ns), "learned": detections(learned), "matched": detections(matched)}
-    return Resampled.of(found, TEST, 2).gain(["mug"], [0], same)
+    return Gain.of(table(found).of_classes(["mug"]), same)
+
+
+def table(found):
+    return score_table(Shown(TEST, TEST, TEST, found), ["mug", "can"], "AP")
 
 
 def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
@@ -40,20 +45,20 @@ def test_a_gain_is_the_difference_of_ap_and_its_fraction_of_the_room():
     assert text.startswith("It worked") and "on mug" in text and f"{better.closed:.0%}" in text
     one = verdict(better)
     assert one.startswith("In one training of each, the learned distribution gave") and "more on mug" in one
-    assert f"({interval(better.gain)} over test images), from" in one and f"{better.closed:.0%}" in one
+    assert f"({bounds(better.gain)} over test images), from" in one and f"{better.closed:.0%}" in one
 
 
 def test_a_gain_without_a_known_target_has_no_room():
     found = {"ns": detections(8), "learned": detections(24)}
-    alone, beside = Resampled.of(found, TEST, 2).gain(["mug"], [0], False), gain(8, 24, 32)
+    alone, beside = Gain.of(table(found).of_classes(["mug"])), gain(8, 24, 32)
     assert alone.gain == beside.gain and alone.room is None and alone.closed is None
     assert verdict(alone).endswith(f"to {100 * alone.ap['learned']:.1f}.")
 
 
 def test_a_class_without_boxes_is_in_no_mean():
     found = {"ns": detections(8), "learned": detections(24), "matched": detections(32)}
-    both = Resampled.of(found, TEST, 2)
-    assert both.present == [0] and both.gain(["mug", "can"], [0, 1], False).gain == gain(8, 24, 32).gain
+    both = table(found)
+    assert both.shown == ["mug"] and Gain.of(both).gain == gain(8, 24, 32).gain
 
 
 def test_a_loss_is_called_one():
@@ -80,4 +85,4 @@ def test_without_a_gap_the_target_is_not_mentioned():
 
 def test_lists_and_intervals_read_as_sentences_do():
     assert [listed(["a"]), listed(["a", "b"]), listed(["a", "b", "c"])] == ["a", "a and b", "a, b and c"]
-    assert interval(Estimate(0.1, 0.05, 0.152)) == "5.0 to 15.2" and interval(Estimate(0.1)) == "no interval"
+    assert bounds(Estimate(0.1, 0.05, 0.152)) == "5.0 to 15.2" and bounds(Estimate(0.1)) == "no interval"

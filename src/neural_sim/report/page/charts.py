@@ -1,46 +1,28 @@
-"""The page's charts, as SVG with text that stays text."""
+"""The charts of a run's page."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 
 from neural_sim.detector.protocol import Score
 from neural_sim.report import figures
-
-
-def data_uri(figure: Figure) -> str:
-    """The figure as the source of an ``<img>``, which keeps its ids apart from those of other figures."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neural-sim"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
+from neural_sim.report.figures import Figure
+from neural_sim.report.page.render import data_uri
+from neural_sim.report.run import Learned
 
 
 def bin_colours(factor: str, bins: int) -> list[str]:
-    """The colours of a factor's bins in these charts, for a legend."""
+    """Return the colours of a factor's bins in these charts, for a legend."""
     return [to_hex(colour) for colour in figures.bin_colours(factor, bins)]
 
 
-def psi_chart(
-    history: Sequence[Sequence[float]],
-    target: Sequence[float] | None,
-    groups: Sequence[Sequence[int]],
-    factor: str,
-) -> str:
-    """One object's probabilities over the iterations, the target's beside them; arguments as in
-    :func:`figures.psi_panel`.
-    """
+def psi_chart(learned: Learned) -> str:
+    """Draw one object's probabilities over the iterations, with the target's next to them."""
     figure = Figure(figsize=(3.4, 2.1), layout="constrained")
-    figures.psi_panel(
-        figure.add_subplot(), history, target, groups, figures.bin_colours(factor, len(history[0]))
-    )
+    figures.psi_panel(figure.add_subplot(), learned)
     return data_uri(figure)
 
 
@@ -50,8 +32,13 @@ def curve_chart(
     bounds: Mapping[str, float],
     score: Score = "AP",
 ) -> str:
-    """The mean score of the classes ``names`` against the method's seconds; ``bounds`` are scores of other detectors by
-    name, drawn as lines. Scores as fractions.
+    """Draw the mean score of some classes against the method's seconds.
+
+    Args:
+        curve: what was spent and scored, with scores as fractions.
+        names: of the classes.
+        bounds: scores of other detectors by name, drawn as lines.
+        score: what these are.
     """
     figure = Figure(figsize=(6.2, 2.9), layout="constrained")
     axes = figure.add_subplot()

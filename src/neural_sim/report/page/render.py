@@ -1,10 +1,15 @@
-"""Templates to text."""
+"""Templates and figures as the text of a page."""
 
 from __future__ import annotations
 
+import base64
+import io
 from typing import Any
 
+import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from neural_sim.report.figures import Figure
 
 _pages = Environment(
     loader=PackageLoader("neural_sim.report.page"),
@@ -16,12 +21,12 @@ _pages = Environment(
 
 
 def percent(value: float | None) -> str:
-    """A fraction in points with one decimal; a dash for no value."""
+    """Write a fraction in points with one decimal; a dash for no value."""
     return "–" if value is None or value != value else f"{100.0 * value:.1f}"
 
 
 def capital(text: str) -> str:
-    """With a first capital; the rest stays, as in AP."""
+    """Write a text with a first capital; the rest stays, as in AP."""
     return text[:1].upper() + text[1:]
 
 
@@ -29,5 +34,16 @@ _pages.filters |= {"percent": percent, "capital": capital}
 
 
 def page(template: str, **values: Any) -> str:
-    """The named template with these values."""
+    """Fill the named template with values."""
     return _pages.get_template(template).render(**values)
+
+
+def data_uri(figure: Figure) -> str:
+    """Return a figure as the source of an ``<img>``: SVG with text that stays text.
+
+    An image of its own keeps its ids apart from those of other figures.
+    """
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neural-sim"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()

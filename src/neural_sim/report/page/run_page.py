@@ -12,12 +12,14 @@ from torch import Tensor
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.outer.certificate import untrusted
+from neural_sim.report.bootstrap import match
 from neural_sim.report.page import charts, pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
-from neural_sim.report.page.verdict import POINTS, Gain, Resampled, listed, verdict
+from neural_sim.report.page.verdict import POINTS, Gain, listed, verdict
 from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
 from neural_sim.report.run import RunResults
+from neural_sim.report.score_table import ScoreTable
 from neural_sim.types import LabelledImages
 
 FILE = "report.html"
@@ -25,13 +27,19 @@ PER_OBJECT = {True: 6, False: 2}
 """Training images shown of an object that is biased, and of another."""
 EXAMPLES = 8
 """Detections shown of a kind."""
+DRAWS = 200
+"""Resampled test sets of an interval."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Images for the page. ``before`` and ``after`` are training images from the initial and the learned distribution,
-    drawn with the same random numbers, an equal number of every object in the order of their labels. ``detections``
-    are those of ns, learned and, where it is known, matched on ``test``; empty without scores.
+    """Images for the page.
+
+    Args:
+        before: training images from the initial distribution, an equal number of every object in the order of labels.
+        after: the same from the learned distribution, drawn with the same random numbers.
+        test: the test images.
+        detections: on these, of ns, learned and, where it is known, matched; empty without scores.
     """
 
     before: LabelledImages
@@ -42,9 +50,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class PsiChart:
-    """One object's distribution of a factor: the chart, and the distances of ``initial`` and ``learned`` from the
-    target, empty where that is not known.
-    """
+    """One object's distribution of a factor: the chart, and its distances from the target (empty: not known)."""
 
     name: str
     chart: str
@@ -62,7 +68,7 @@ class FactorCharts:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """AP (or accuracy) of a class, fractions by which detector (None: the test set lacks the class)."""
+    """AP (or accuracy) of a class by detector, as fractions; None where the test set lacks the class."""
 
     name: str
     biased: bool
@@ -79,47 +85,43 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
     gains = _gains(results, aim, shown) if scored else {}
     both = {which: shown.detections[which] for which in ("ns", "learned")} if scored else {}
     scores = bin_scores(names, both, shown.test, score=results.score) if scored else []
-    path = folder / FILE
-    path.write_text(
-        render.page(
-            "run.html",
-            title=f"{results.experiment}: {results.method}, seed {results.seed}",
-            results=results,
-            verdict=verdict(gains.get("aim"), results.score),
-            points=POINTS[results.score],
-            others=gains.get("others"),
-            lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
-            psi=_psi(results),
-            rows=_score_rows(results),
-            curve=_curve(results, aim),
-            aim=listed(aim),
-            before=_training(shown.before, results),
-            after=_training(shown.after, results),
-            examples=_examples(shown, names, results.score) if scored else {},
-            steps=step_rows(results.records, names),
-            trust=untrusted(results.records),
-            bins=by_object(scores),
-            weak=weakest([s for s in scores if s.name in aim]),
-            commands=commands,
-            files=_files(folder),
-        ),
-        encoding="utf-8",
+    text = render.page(
+        "run.html",
+        title=f"{results.experiment}: {results.method}, seed {results.seed}",
+        results=results,
+        verdict=verdict(gains.get("aim"), results.score),
+        points=POINTS[results.score],
+        others=gains.get("others"),
+        lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
+        psi=_psi(results),
+        rows=_score_rows(results),
+        curve=_curve(results, aim),
+        aim=listed(aim),
+        before=_training(shown.before, results),
+        after=_training(shown.after, results),
+        examples=_examples(shown, names, results.score) if scored else {},
+        steps=step_rows(results.records, names),
+        trust=untrusted(results.records),
+        bins=by_object(scores),
+        weak=weakest([s for s in scores if s.name in aim]),
+        commands=commands,
+        files=_files(folder),
     )
+    path = folder / FILE
+    path.write_text(text, encoding="utf-8")
     return path
 
 
 def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, Gain]:
-    """Of the objects that the run is about, of all others, and of each of these that certainly lost."""
-    names = list(results.names)
-    same = all(_same(results, label) for label in range(len(names)))
-    scores = Resampled.of(shown.detections, shown.test, len(names), score=results.score)
-    present = [names[label] for label in scores.present]
+    """Return gains of the objects that the run is about, of all others, and of each of these that certainly lost."""
+    same = results.target_known and all(one.p["initial"] == one.p["target"] for one in results.learned)
+    table = score_table(shown, results.names, results.score)
 
-    def gain(of: Sequence[str]) -> Gain:
-        return scores.gain(of, [names.index(name) for name in of], same)
+    def gain(names: Sequence[str]) -> Gain:
+        return Gain.of(table.of_classes(names), same)
 
-    gains = {"aim": gain([name for name in aim if name in present] or present)}
-    others = [name for name in present if name not in aim]
+    gains = {"aim": gain([name for name in aim if name in table.shown] or table.shown)}
+    others = [name for name in table.shown if name not in aim]
     if others:
         gains["others"] = gain(others)
         each = {name: gain([name]) for name in others}
@@ -127,36 +129,29 @@ def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, G
     return gains
 
 
-def _same(results: RunResults, label: int) -> bool:
-    """Whether an object's initial distribution is known to be its target's."""
-    p = results.probabilities
-    return "target" in p and all(
-        torch.equal(p["initial"][f][label], p["target"][f][label]) for f in results.factors
-    )
+def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:
+    """Score ns, learned and, where it is known, matched on the test images and on resampled ones."""
+    outcomes = {
+        which: [[match(shown.detections[which], shown.test, label, score) for label in range(len(names))]]
+        for which in ("ns", "learned", "matched")
+        if which in shown.detections
+    }
+    return ScoreTable.of(outcomes, names, DRAWS)
 
 
 def _psi(results: RunResults) -> list[FactorCharts]:
-    """The biased objects' charts first; none where nothing was learned."""
-    distances = results.total_variations()
-    order = sorted(range(len(results.names)), key=lambda label: results.names[label] not in results.biased)
+    """Return charts of what was learned, the biased objects' first; none where nothing was."""
     drawn = []
     for factor in results.factors if results.records else ():
-        learned, target = results.probabilities["learned"][factor], results.probabilities.get("target")
-        panels = []
-        for label in order:
-            name = results.names[label]
-            history = [*(record["probabilities"][factor][label] for record in results.records)]
-            history.append(learned[label].tolist())
-            wanted = None if target is None else target[factor][label].tolist()
-            chart = charts.psi_chart(history, wanted, results.groups(name, factor), factor)
-            panels.append(PsiChart(name, chart, distances[name].get(factor, {})))
-        colours = charts.bin_colours(factor, learned.shape[-1])
+        learned = sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased)
+        panels = [PsiChart(one.name, charts.psi_chart(one), one.distances) for one in learned]
+        colours = charts.bin_colours(factor, len(learned[0].p["learned"]))
         drawn.append(FactorCharts(factor, tuple(colours), tuple(panels)))
     return drawn
 
 
 def _score_rows(results: RunResults) -> list[ScoreRow]:
-    """Biased objects first, the mean last."""
+    """Return scores by class, the biased ones first, and their mean last."""
 
     def row(name: str, values: Mapping[str, float]) -> ScoreRow:
         known = {which: value if value == value else None for which, value in values.items()}
@@ -178,7 +173,7 @@ def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
 
 
 def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
-    """The first few images of every object."""
+    """Return the first few images of every object."""
     each = len(images) // len(results.names)
     rows = []
     for label, name in enumerate(results.names):
@@ -188,7 +183,7 @@ def _training(images: LabelledImages, results: RunResults) -> list[Picture]:
 
 
 def _examples(shown: Shown, names: Sequence[str], score: Score) -> dict[str, list[Picture]]:
-    """Test images by what the training on the learned distribution changed, a few of each kind spread over the set."""
+    """Return test images by what the training on the learned distribution changed, a few of each kind."""
     test, kinds = shown.test, {"won": [], "lost": [], "still wrong": [], "right": []}
     for row in range(len(test)):
         own = test.labels[row] >= 0
@@ -207,6 +202,6 @@ def _examples(shown: Shown, names: Sequence[str], score: Score) -> dict[str, lis
 
 
 def _files(folder: Path) -> list[str]:
-    """What a reader may open next, of what the run has left."""
+    """Return the files of the run that a reader may open next."""
     wanted = ("results.json", "detections.json", "training_set/annotations.json", "model.json", "model.onnx")
     return [name for name in wanted if (folder / name).exists()]

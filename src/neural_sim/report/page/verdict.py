@@ -6,17 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from jaxtyping import Float
-from torch import Tensor
-
 from neural_sim.detector.protocol import Score
-from neural_sim.report.bootstrap import class_scores, match, mean_of_known
-from neural_sim.report.intervals import Estimate, over_images
-from neural_sim.types import LabelledImages
+from neural_sim.report.intervals import Estimate, bounds
+from neural_sim.report.score_table import ScoreTable
 
 Outcome = Literal["better", "worse", "no difference"]
-WHICH: tuple[str, ...] = ("ns", "learned", "matched")
 PERCENT = 100.0
 POINTS: dict[Score, str] = {"AP": "AP", "accuracy": "points of accuracy"}
 """The unit of a score in a sentence."""
@@ -26,14 +20,30 @@ POINTS: dict[Score, str] = {"AP": "AP", "accuracy": "points of accuracy"}
 class Gain:
     """AP (or accuracy) of a set of classes, as fractions.
 
-    ``gain`` is learned minus ns, ``room`` matched minus ns, both with 95 % intervals.
-    ``room`` is None where matched and ns are one distribution, and where matched is not known.
+    Args:
+        names: of the classes.
+        ap: of the detectors ns, learned and, where the target's distribution is known, matched.
+        gain: learned minus ns, with its 95 % interval.
+        room: matched minus ns; None where the two are one distribution, and where matched is not known.
     """
 
     names: tuple[str, ...]
     ap: Mapping[str, float]
     gain: Estimate
     room: Estimate | None
+
+    @staticmethod
+    def of(table: ScoreTable, same_target: bool = False) -> Gain:
+        """Read the gain of a table's classes.
+
+        Args:
+            table: of the detectors ns, learned and perhaps matched.
+            same_target: whether the target's distribution is the initial one.
+        """
+        known = "matched" in table.detectors and not same_target
+        ap = {which: table.mean(which).value for which in table.detectors}
+        room = table.ahead("matched", "ns") if known else None
+        return Gain(table.classes, ap, table.ahead("learned", "ns"), room)
 
     @property
     def outcome(self) -> Outcome:
@@ -50,95 +60,42 @@ class Gain:
         return self.gain.value / self.room.value
 
 
-@dataclass(frozen=True)
-class Resampled:
-    """AP (or accuracy) of every class by the detections of ns, learned and matched on one test set, and under resampled
-    images; without matched where the target's distribution is not known.
-
-    ``point`` is [which, classes], ``spread`` [draws, which, classes]; nan for a class without a box.
-    """
-
-    which: tuple[str, ...]
-    point: Float[np.ndarray, "which classes"]
-    spread: Float[np.ndarray, "draws which classes"]
-
-    @staticmethod
-    def of(
-        detections: Mapping[str, Sequence[Mapping[str, Tensor]]],
-        test: LabelledImages,
-        classes: int,
-        draws: int = 200,
-        score: Score = "AP",
-    ) -> Resampled:
-        """All classes and detectors under the same resampled images."""
-        known = tuple(which for which in WHICH if which in detections)
-        matches = [
-            [match(detections[which], test, label, score) for label in range(classes)] for which in known
-        ]
-        point, spread = class_scores([matches], draws)
-        return Resampled(known, point[0], spread[:, 0])
-
-    @property
-    def present(self) -> list[int]:
-        """Labels of the classes that the test set shows."""
-        return np.flatnonzero(~np.isnan(self.point[0])).tolist()
-
-    def gain(self, names: Sequence[str], labels: Sequence[int], same_target: bool) -> Gain:
-        """Of the classes ``labels``, called ``names``; draws without a box of a class leave it out. ``same_target``:
-        the target's distribution is the initial one.
-        """
-        point, spread = (mean_of_known(part[..., list(labels)]) for part in (self.point, self.spread))
-        gain, *room = (
-            over_images(float(point[i] - point[0]), spread[:, i] - spread[:, 0]) for i in range(1, len(point))
-        )
-        ap = dict(zip(self.which, point.tolist(), strict=True))
-        return Gain(tuple(names), ap, gain, None if same_target or not room else room[0])
-
-
 def listed(names: Sequence[str]) -> str:
-    """Names as a sentence has them: ``a, b and c``."""
+    """Write names as a sentence has them: ``a, b and c``."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def interval(estimate: Estimate) -> str:
-    """Bounds in points of AP: ``20.1 to 27.3``."""
-    if estimate.low is None or estimate.high is None:
-        return "no interval"
-    return f"{PERCENT * estimate.low:.1f} to {PERCENT * estimate.high:.1f}"
-
-
-def negated(estimate: Estimate) -> Estimate:
-    """Minus the value, with its interval."""
-    low, high = (None if bound is None else -bound for bound in (estimate.high, estimate.low))
-    return Estimate(-estimate.value, low, high)
-
-
 def verdict(gain: Gain | None, score: Score = "AP", trainings: int = 1) -> str:
-    """One sentence for the top of the page; ``score`` is what ``gain`` is of.
+    """Say in one sentence whether the run worked.
 
-    Whether it worked is said of several trainings alone. The interval of one is over test images, and trainings on
+    That it worked is said of several trainings alone. The interval of one is over test images, and trainings on
     distributions that are as good as each other often differ by more.
+
+    Args:
+        gain: None where no detector was scored.
+        score: what the gain is of.
+        trainings: of each distribution.
     """
     if gain is None:
         return "The detectors were not scored on test images, so whether it worked is not known."
-    points, bounds, who = PERCENT * gain.gain.value, interval(gain.gain), listed(gain.names)
+    points, reach, who = PERCENT * gain.gain.value, bounds(gain.gain), listed(gain.names)
     change = f"{abs(points):.1f} {POINTS[score]}"
     reached = f"{PERCENT * gain.ap['ns']:.1f} to {PERCENT * gain.ap['learned']:.1f}"
     one = "In one training of each, the learned distribution gave"
     if gain.outcome == "better":
         several = "It worked: training on the learned distribution gives"
         text = f"{several if trainings > 1 else one} {change} more on {who}"
-        over = bounds if trainings > 1 else f"{bounds} over test images"
+        over = reach if trainings > 1 else f"{reach} over test images"
         return f"{text} ({over}), from {reached}{_of_the_room(gain)}."
     if gain.outcome == "worse":
-        bounds = interval(negated(gain.gain))
+        reach = bounds(gain.gain.negated)
         if trainings == 1:
-            return f"{one} {change} less on {who} ({bounds} over test images)."
+            return f"{one} {change} less on {who} ({reach} over test images)."
         return (
-            f"It made things worse: training on the learned distribution costs {change} on {who} ({bounds})."
+            f"It made things worse: training on the learned distribution costs {change} on {who} ({reach})."
         )
     changes = f"changes the {score} of {who} by {points:+.1f}"
-    text = f"No difference can be told: the learned distribution {changes} ({bounds})"
+    text = f"No difference can be told: the learned distribution {changes} ({reach})"
     return f"{text}{_of_the_room(gain)}."
 
 
@@ -146,5 +103,5 @@ def _of_the_room(gain: Gain) -> str:
     if gain.room is None:
         return ""
     if gain.closed is None:
-        return f"; the target's own distribution would give {PERCENT * gain.room.value:+.1f} ({interval(gain.room)})"
+        return f"; the target's own distribution would give {PERCENT * gain.room.value:+.1f} ({bounds(gain.room)})"
     return f", {gain.closed:.0%} of what the target's own distribution would give"

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from neural_sim.report import logged
-from neural_sim.report.finished import candidates
-from neural_sim.report.selection import Selection
+from neural_sim.report import tracking
+from neural_sim.report.runs import Runs, select
 from neural_sim.studies.work_precision.series import Clock, Point, Series, Timing
 from neural_sim.studies.work_precision.suite import World
 
@@ -34,8 +33,8 @@ class Loops:
         """This run's own method on its objects, and every group of comparable finished runs."""
         del seed
         groups = []
-        if self.experiment in logged.experiments(world.uri):
-            groups = Selection(candidates(world.uri, [self.experiment]), self.reference).groups
+        if self.experiment in tracking.experiments(world.uri):
+            groups, _ = select(Runs.read(world.uri, [self.experiment]), self.reference)
         command = COMMAND.format(experiment=self.experiment)
         missing = (
             "" if groups else f" MLflow has no finished run of {self.experiment} yet: `{command}` makes some."

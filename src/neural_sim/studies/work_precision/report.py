@@ -13,8 +13,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from neural_sim.documents import replace_section
 from neural_sim.report import figures, tracking
-from neural_sim.report.section import replace_section
 from neural_sim.studies.work_precision.series import Series
 
 INTRODUCTION = (

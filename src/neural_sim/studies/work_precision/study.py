@@ -14,7 +14,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.report.machine import machine
+from neural_sim.report.provenance import machine
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.studies.work_precision.derivative import Derivative

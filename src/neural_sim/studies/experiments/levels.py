@@ -1,6 +1,4 @@
-"""Each biased object's score over settings: over how far its start is from the target (the paper's Fig. 5), or over
-targets (Fig. 6).
-"""
+"""Each biased object's score over starts (the paper's Fig. 5) or over targets (Fig. 6): figure and table rows."""
 
 from __future__ import annotations
 
@@ -9,30 +7,29 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from neural_sim.report import figures
-from neural_sim.report.compare import points
-from neural_sim.report.entries import Entry
-from neural_sim.report.object_scores import called
-from neural_sim.report.settings import Setting, modes
+from neural_sim.report.figures import Figure
+from neural_sim.report.intervals import points
+from neural_sim.studies.experiments.measured import Entry
+from neural_sim.studies.experiments.settings import Setting, called, modes
 
 Axis = Literal["gap", "target"]
 STARTS = {"same": "the target's", "uniform": "uniform", "disjoint": "disjoint"}
 COLOURS = {"ns": figures.INK, "lts": "#c23b3b", "auto_sim": "#4c9f70", "neural_sim": "#2f6db5"}
-"""As in the paper's Fig. 5."""
+"""Those of the paper's Fig. 5."""
 APART = 0.03
-"""Between methods, of the distance between ticks."""
+"""Distance between methods, in distances between ticks."""
 LABELS = {"gap": "initial distribution", "target": "bins of the target"}
 
 
 def short(name: str) -> str:
-    """An object's name without its number."""
+    """Return an object's name without its number."""
     return re.sub(r"^\d+_", "", name).replace("_", " ")
 
 
 def place(setting: Setting, name: str, axis: Axis) -> str:
-    """Where a setting of an object stands on the axis."""
+    """Return where a setting of an object stands on the axis."""
     if axis == "gap":
         return STARTS[setting.gap]
     return "; ".join(modes(setting.distribution("target", name, f)) for f in setting.factors(name))
@@ -45,10 +42,10 @@ def _order(label: str, axis: Axis) -> tuple[Any, ...]:
 
 
 def _panels(settings: Sequence[Setting], axis: Axis) -> dict[tuple[str, str, str], dict[str, Setting]]:
-    """Settings by their places on the axis, by experiment, start (unless that is the axis) and object."""
+    """Group settings by experiment, start (unless that is the axis) and object, then by place on the axis."""
     panels: dict[tuple[str, str, str], dict[str, Setting]] = {}
     for setting in settings:
-        for name in setting.scores.objects:
+        for name in setting.objects:
             start = "" if axis == "gap" else STARTS[setting.gap]
             panel = panels.setdefault((setting.experiment, start, name), {})
             panel[place(setting, name, axis)] = setting
@@ -65,7 +62,7 @@ def _rank(key: tuple[str, str, str], settings: Sequence[Setting]) -> tuple[int, 
 
 
 def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
-    """A panel an object, a line a method with 95 % intervals; matched, the upper bound, is dashed."""
+    """Draw a panel an object, a line a method with 95 % intervals; matched, the upper bound, is dashed."""
     panels = _panels(settings, axis)
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
@@ -73,7 +70,7 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
     handles: dict[str, Any] = {}
     for number, ((experiment, start, name), panel) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(rows, columns, number)
-        methods = list(dict.fromkeys(m for setting in panel.values() for m in setting.scores.methods))
+        methods = list(dict.fromkeys(m for setting in panel.values() for m in setting.methods))
         for i, method in enumerate(methods):
             aside = APART * (i - (len(methods) - 1) / 2)
             handles.setdefault(called(method), _line(axes, list(panel.values()), name, method, aside))
@@ -83,7 +80,7 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
         axes.set(ylim=(0, 100), xlim=(-0.3, len(panel) - 0.7))
         axes.set_xlabel(LABELS[axis], fontsize=8, color=figures.MUTED)
         if (number - 1) % columns == 0:
-            score = next(iter(panel.values())).runs[0].score
+            score = next(iter(panel.values())).first.score
             axes.set_ylabel(f"{score} on the test set (%)", fontsize=8)
         axes.yaxis.grid(color=figures.GRID)
         figures.style(axes)
@@ -92,10 +89,11 @@ def levels_figure(settings: Sequence[Setting], axis: Axis) -> Figure:
 
 
 def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: float) -> Any:
-    """One method's line, ``aside`` of the ticks so that intervals do not hide each other; settings that it was not run
-    on are gaps in it. Matched has a dash at every setting, which shows where there is only one.
+    """Draw one method's line, ``aside`` of the ticks so that intervals do not hide each other.
+
+    Settings that it was not run on are gaps in it. Matched has a dash at every setting, which shows a single one too.
     """
-    found = [setting.scores.ap.get(method, {}).get(name) for setting in panel]
+    found = [setting.score(method, name) if method in setting.table.detectors else None for setting in panel]
     values = 100 * np.asarray([np.nan if each is None else each.value for each in found])
     low, high = (
         100 * np.asarray([np.nan if e is None or (v := getattr(e, end)) is None else v for e in found])
@@ -111,30 +109,20 @@ def _line(axes: Any, panel: Sequence[Setting], name: str, method: str, aside: fl
 
 
 def levels_entries(settings: Sequence[Setting], axis: Axis) -> list[Entry]:
-    """The score of every object at every setting, a column a method, in points with 95 % intervals. Lines have NSO's
-    score and its lead; over ``gap`` those of the disjoint start alone.
+    """Return the score of every object at every setting, a column a method, in points with 95 % intervals.
+
+    Lines have NSO's score and its lead; over ``gap`` those of the disjoint start alone.
     """
     made = []
     for (experiment, start, name), panel in _panels(settings, axis).items():
         for label, setting in panel.items():
             cells = {"experiment": experiment, "object": short(name)}
             cells |= {"start": start} if axis == "target" else {}
-            cells |= {LABELS[axis]: label, "seeds": ", ".join(map(str, setting.scores.seeds))}
-            cells |= {called(method): points(own[name]) for method, own in setting.scores.ap.items()}
+            cells |= {LABELS[axis]: label, "seeds": setting.seeds}
+            cells |= {called(method): points(setting.score(method, name)) for method in setting.columns}
             place = (experiment, *_rank((experiment, start, name), settings)[1:], *_order(label, axis))
-            line = (
-                "" if axis == "gap" and setting.gap != "disjoint" else _line_of(setting, name, start, label)
-            )
-            made.append(Entry(place, cells, line, setting.commits))
+            where = f", {start} start, target {label}" if start else ""
+            line = f"{experiment}, {short(name)}{where}: {setting.verdict(name)}"
+            shown = axis == "target" or setting.gap == "disjoint"
+            made.append(Entry(place, cells, line if shown else "", setting.commits))
     return made
-
-
-def _line_of(setting: Setting, name: str, start: str, label: str) -> str:
-    where = f", {start} start, target {label}" if start else ""
-    ours = points(setting.scores.ap[setting.scores.reference][name])
-    ahead = [
-        f"{called(method)} by {points(own[name])}"
-        for method, own in setting.scores.ahead.items()
-        if method != "matched"
-    ]
-    return f"{setting.experiment}, {short(name)}{where}: NSO {ours}; ahead of {', '.join(ahead)}"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from finished_runs import dominant, setting
 
-from neural_sim.report.entries import table
-from neural_sim.report.histograms import histogram_entries, histogram_figure, histograms
+from neural_sim.studies.experiments.histograms import histogram_entries, histogram_figure, histograms
+from neural_sim.studies.experiments.measured import table
 
 HALF = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
 

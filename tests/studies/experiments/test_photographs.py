@@ -4,10 +4,9 @@ import pytest
 from finished_runs import finished, results
 from finished_runs import setting as made_setting
 
-from neural_sim.report.object_scores import MEAN, object_scores
-from neural_sim.report.photographs import asked, photographs_summary, photographs_table
-from neural_sim.report.selection import Group
-from neural_sim.report.settings import Setting
+from neural_sim.report.runs import Group
+from neural_sim.studies.experiments.layouts import asked, photographs_summary, photographs_table
+from neural_sim.studies.experiments.settings import Setting
 
 
 def setting(mode, trained=None, methods=(("neural_sim", 0.75), ("lts", 0.5)), count=None, fraction=None):
@@ -18,13 +17,13 @@ def setting(mode, trained=None, methods=(("neural_sim", 0.75), ("lts", 0.5)), co
     rows = {"ns": (0.3, 0.3), "matched": (0.9, 0.9)}
     if real:
         rows |= {"real_only": (0.25, 0.25), "synthetic_only": (0.5, 0.5), "views_only": (0.1, 0.1)}
-    runs = [
+    runs = tuple(
         finished(
             {**rows, "learned": (ap, ap)}, experiment="shots", method=method, seed=0, config=config, real=real
         )
         for method, ap in methods
-    ]
-    return Setting(Group("shots", "shots", "", (0,), ()), runs, object_scores(runs, "neural_sim", draws=20))
+    )
+    return Setting.of(Group("shots", "shots", "", runs), "neural_sim", draws=20)
 
 
 def cells(table):
@@ -74,11 +73,8 @@ def test_the_summary_has_a_line_for_each_setting():
 
 
 def test_rows_without_the_other_kind_are_in_no_list_of_methods():
-    scores = SETTINGS[0].scores
-    assert scores.methods == ("ns", "lts", "neural_sim", "matched") and set(scores.ahead) == {
-        "ns",
-        "lts",
-        "matched",
-    }
-    assert scores.ap["real_only"][MEAN].value == pytest.approx(0.25, abs=0.01)
-    assert "real_only" not in made_setting().scores.ap
+    made = SETTINGS[0]
+    assert made.methods == ["ns", "lts", "neural_sim", "matched"]
+    assert made.columns[4:] == ["synthetic_only", "real_only", "views_only"]
+    assert made.score("real_only").value == pytest.approx(0.25, abs=0.01)
+    assert "real_only" not in made_setting().columns

@@ -8,11 +8,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
-from neural_sim.report import experiments as module
-from neural_sim.report.experiments import Experiments, Row
-from neural_sim.report.layouts import LAYOUTS, Paper
-from neural_sim.report.measured import Measured
-from neural_sim.report.selection import LeftOut
+from neural_sim.report.runs import LeftOut
+from neural_sim.studies.experiments import study as module
+from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
+from neural_sim.studies.experiments.measured import Measured
+from neural_sim.studies.experiments.study import Experiments, Row
 
 TABLE = {
     "title": "Table 1",

@@ -1,6 +1,4 @@
-"""Learned beside target distributions (the paper's Fig. 7) and total variation over seeds. Bins that look the same are
-one.
-"""
+"""Learned and target distributions (the paper's Fig. 7) and total variation over seeds; equal-looking bins are one."""
 
 from __future__ import annotations
 
@@ -10,22 +8,31 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from neural_sim.parameter.distributions import merged
 from neural_sim.report import figures
-from neural_sim.report.entries import Entry
+from neural_sim.report.figures import Figure
 from neural_sim.report.intervals import Estimate, over_seeds
-from neural_sim.report.levels import short
-from neural_sim.report.settings import Setting, modes
+from neural_sim.studies.experiments.levels import short
+from neural_sim.studies.experiments.measured import Entry
+from neural_sim.studies.experiments.settings import Setting, modes
 
 
 @dataclass(frozen=True)
 class Histogram:
     """One factor of one object at one start.
 
-    ``groups`` are its bins, from 1, that look the same. ``p`` maps initial, target and learned to [seeds, groups],
-    ``distance`` initial and learned to the mean total variation to the target.
+    Args:
+        experiment: of the runs.
+        name: of the object.
+        factor: what is learned of it.
+        start: the initial distribution in short.
+        aim: the target's in short.
+        seeds: of the runs.
+        groups: its bins, from 1, that look the same.
+        p: initial, target and learned probabilities.
+        distance: mean total variation of initial and learned to the target.
+        commits: of the code of the runs.
     """
 
     experiment: str
@@ -41,9 +48,9 @@ class Histogram:
 
 
 def histograms(settings: Sequence[Setting]) -> Iterator[Histogram]:
-    """Of the reference method's runs, for every biased object and factor."""
+    """Read every biased object and factor from the reference method's runs."""
     for setting in settings:
-        for name in setting.scores.objects:
+        for name in setting.objects:
             for factor in setting.factors(name):
                 yield _histogram(setting, name, factor)
 
@@ -70,7 +77,7 @@ def _histogram(setting: Setting, name: str, factor: str) -> Histogram:
 
 
 def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
-    """A panel a start: initial, learned (mean over seeds, with smallest and largest) and target probabilities."""
+    """Draw a panel a start: initial, learned (mean over seeds, with smallest and largest) and target probabilities."""
     columns = min(3, len(all_of))
     rows = -(-len(all_of) // columns)
     figure = Figure(figsize=(3.7 * columns, 2.4 * rows + 0.6), layout="constrained")
@@ -102,14 +109,14 @@ def histogram_figure(all_of: Sequence[Histogram]) -> Figure:
 
 
 def distance(estimate: Estimate) -> str:
-    """A total variation with its interval."""
+    """Write a total variation with its interval."""
     if estimate.low is None or estimate.high is None:
         return f"{estimate.value:.2f}"
     return f"{estimate.value:.2f} ({estimate.low:.2f} to {estimate.high:.2f})"
 
 
 def histogram_entries(all_of: Sequence[Histogram]) -> list[Entry]:
-    """Total variation to the target, with 95 % intervals over seeds."""
+    """Return total variation to the target, with 95 % intervals over seeds."""
     made = []
     for h in all_of:
         initial, learned = (distance(h.distance[which]) for which in ("initial", "learned"))

@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from neural_sim.report.commit import commit
+from neural_sim.report.provenance import commit
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from finished_runs import setting
 
-from neural_sim.report.entries import table
-from neural_sim.report.levels import levels_entries, levels_figure
+from neural_sim.studies.experiments.levels import levels_entries, levels_figure
+from neural_sim.studies.experiments.measured import table
 
 METHODS = (("neural_sim", 0.75), ("lts", 0.5))
 

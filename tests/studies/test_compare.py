@@ -1,12 +1,19 @@
-"""A whole comparison of small made-up runs, from MLflow to compare.md and compare.json."""
+"""A whole comparison of small made-up runs, from MLflow to compare.md, compare.json and the page."""
 
 import json
+import re
 import shutil
+from dataclasses import replace
 
 import pytest
 
-from neural_sim.report import logged, tracking
-from neural_sim.report.compare import Compare, plain
+from neural_sim.report import tracking
+from neural_sim.report.comparison import ONLY_AT_END, Comparison
+from neural_sim.report.costs import NOTE, SECONDS, Costs
+from neural_sim.report.intervals import Estimate
+from neural_sim.report.runs import FinishedRun, Group, LeftOut, Runs
+from neural_sim.studies.compare import Compare, Table, verdict, write_page
+from neural_sim.tasks.context import Context
 
 CONFIG = {
     **{group: {"size": 1} for group in (
@@ -70,8 +77,17 @@ def database(empty_store, tmp_path_factory):
     return uri
 
 
+def compared(uri, folder, **settings):
+    """The comparisons of a study that has written its files."""
+    study = Compare(("gap",), **settings)
+    config = {"name": "compare", "seed": 0, "paths": {"mlflow": uri}}
+    study.run(Context(config, folder, lambda: pytest.fail("no experiment is asked for"), ("compare",)))
+    groups, _ = study.selected(Runs.read(uri, ["gap"]))
+    return [study.table(group, 0).comparison for group in groups]
+
+
 def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, capsys):
-    (found,) = Compare(("gap",), draws=5).compare(database, 0, {"name": "compare"}, tmp_path)
+    (found,) = compared(database, tmp_path, draws=5)
     assert found.methods == ("neural_sim", "lts") and found.seeds == (0, 1)
     assert found.ap["lts"].value == pytest.approx(0.5, abs=0.01)
     document = json.loads((tmp_path / "compare.json").read_text())
@@ -93,16 +109,16 @@ def test_a_later_smoke_run_changes_no_table_and_is_named(database, tmp_path, cap
         "Seconds are not comparable" not in text and (tmp_path / "figures" / "gap.png").stat().st_size > 5000
     )
     printed = capsys.readouterr().out
-    assert text.strip() in printed and logged.where_runs(database, "gap") in printed
+    assert text.strip() in printed and tracking.where_runs(database, "gap") in printed
     page = tmp_path / "report.html"
     assert (
         printed.strip().endswith(f"open {page}") and "neural_sim reaches 75.2 AP" in page.read_text()
     )  # 76 of 101 recalls
-    (own,) = logged.runs(database, "compare")
+    (own,) = tracking.logged_runs(database, "compare")
     assert own.status == "FINISHED" and {"compare.md", "compare.json", "figures"} <= own.files
 
 
-def test_classifiers_are_compared_by_accuracy(uri, tmp_path):
+def test_classifiers_are_compared_by_accuracy(context, tmp_path):
     """Four of eight images are right, and six by the reference, whatever the boxes."""
     for method, found in (("neural_sim", 6), ("lts", 4)):
         run = tmp_path / method
@@ -113,8 +129,8 @@ def test_classifiers_are_compared_by_accuracy(uri, tmp_path):
         for row in written["learned"]:
             row["bbox"] = [0.0, 0.0, 64.0, 64.0]
         (run / "detections.json").write_text(json.dumps(written))
-        tracking.log_run(uri, "gap", method, {}, {}, {}, {}, run)
-    (comparison,) = Compare(("gap",), draws=20).compare(uri, 0, {}, tmp_path / "compare")
+        tracking.log_run(context.uri, "gap", method, {}, {}, {}, {}, run)
+    (comparison,) = compared(context.uri, tmp_path / "compare", draws=20)
     assert (comparison.ap["neural_sim"].value, comparison.ap["lts"].value) == (0.75, 0.5)
     ahead = comparison.ahead["lts"]
     assert ahead.value == 0.25 and 0.0 <= ahead.low < 0.25 < ahead.high <= 0.75
@@ -126,7 +142,7 @@ def test_classifiers_are_compared_by_accuracy(uri, tmp_path):
 
 
 def test_two_ways_of_scoring_are_two_tables_whose_headings_say_how_they_differ(database, tmp_path):
-    found = Compare(("gap",), reference="lts", draws=5).compare(database, 0, {"name": "compare"}, tmp_path)
+    found = compared(database, tmp_path, reference="lts", draws=5)
     assert [comparison.methods for comparison in found] == [("lts",), ("lts", "neural_sim")]
     text = (tmp_path / "compare.md").read_text()
     assert "## gap, scoring t: views.size=0\n" in text and "## gap, scoring s: views.size=1\n" in text
@@ -140,26 +156,86 @@ def test_no_comparable_run_is_refused_with_the_reasons(database, tmp_path):
     with pytest.raises(
         ValueError, match=r"no evaluated run of compare.reference='ours'.*has no run of this setting"
     ):
-        Compare(("gap",), reference="ours", draws=5).compare(database, 0, {}, tmp_path)
+        compared(database, tmp_path, reference="ours", draws=5)
     with pytest.raises(ValueError, match="no experiment 'other'"):
-        Compare(("other",), draws=5).compare(database, 0, {}, tmp_path)
+        Runs.read(database, ["other"])
     with pytest.raises(ValueError, match=r"compare\.methods: no run of typo in gap"):
-        Compare(("gap",), draws=5, methods=("typo",)).compare(database, 0, {}, tmp_path)
+        compared(database, tmp_path, draws=5, methods=("typo",))
 
 
-def test_seconds_of_several_kinds_of_device_are_called_so(uri, tmp_path):
+def test_seconds_of_several_kinds_of_device_are_called_so(context, tmp_path):
     for method, kind in (("neural_sim", "gpu"), ("lts", "cpu")):
         run = tmp_path / method
         run.mkdir()
         held = results(method, 0, 0.5, config={"trainer": {"accelerator": kind}})
         (run / "results.json").write_text(json.dumps(held))
         (run / "detections.json").write_text(json.dumps(detections(4)))
-        tracking.log_run(uri, "gap", method, {}, {}, {}, {}, run)
-    Compare(("gap",), draws=5).compare(uri, 0, {}, tmp_path / "compare")
+        tracking.log_run(context.uri, "gap", method, {}, {}, {}, {}, run)
+    compared(context.uri, tmp_path / "compare", draws=5)
     text = (tmp_path / "compare" / "compare.md").read_text()
     assert "Seconds are not comparable" in text and "cpu: lts seed 0" in text
 
 
-def test_numbers_that_json_lacks_are_null():
-    document = {"a": [float("nan"), (1.0, float("inf"))], "b": {"c": 2, "d": "nan"}}
-    assert plain(document) == {"a": [None, [1.0, None]], "b": {"c": 2, "d": "nan"}}
+@pytest.fixture
+def comparison():
+    methods = ("ours", "first", "second", "third")
+    ahead = {
+        "first": Estimate(0.2, 0.1, 0.3),
+        "second": Estimate(-0.1, -0.2, -0.05),
+        "third": Estimate(0.01, -0.1, 0.1),
+    }
+    return Comparison(
+        "gap", (0, 1), methods, "ours", {m: Estimate(0.5, 0.4, 0.6) for m in (*methods, "ns", "matched")},
+        {m: Estimate(0.9, 0.8, 1.0) for m in methods}, ahead, {"first": Estimate(0.2, 0.1, 0.3)},
+        {m: {"images": 10.0, "detector_steps": 5.0, "products": 1.0, "seconds": 7.0} for m in methods},
+        {m: Estimate(0.45) for m in methods}, 6.0, [5.0, 60.0],
+        {"first": [Estimate(0.05, -0.1, 0.2), Estimate(0.15, 0.11, 0.2)]},
+    )  # fmt: skip
+
+
+def page_of(comparison, folder, heading="", spent=(), left_out=()):
+    curve = [{"images": 10.0, "seconds": 7.0, "ap": {"per_class": {"mug": 0.5}}}]
+    runs = tuple(
+        FinishedRun({"method": m, "seed": 0, "biased": ["mug"], "curve": curve}) for m in comparison.methods
+    )
+    table = Table(Group("gap", "gap", heading, runs), comparison, dict(spent))
+    return write_page([table], left_out, folder).read_text()
+
+
+def test_the_verdict_names_who_is_ahead_behind_and_not_told_apart(comparison):
+    assert verdict(comparison) == (
+        "ours reaches 50.0 AP (40.0 to 60.0), ahead of first by 20.0, behind second by 10.0, "
+        "not told apart from third."
+    )
+    one = verdict(replace(comparison, seeds=(3,)))
+    assert one.endswith("from third; one seed, so that how much trainings differ is not in this.")
+
+
+def test_leads_of_runs_that_were_scored_once_do_not_stand_out(comparison, tmp_path):
+    once = replace(comparison, only_at_end=True)
+    page = page_of(once, tmp_path)
+    assert ONLY_AT_END in page and page.count('class="accepted"') == 1 and page.count('class="rejected"') == 1
+
+
+def test_a_page_has_every_method_and_what_was_left_out(comparison, tmp_path):
+    spent = {"first": Costs(dict.fromkeys(SECONDS, 3.0), 12.0, 700.0, None)}
+    page = page_of(
+        comparison, tmp_path, "size=<1>", spent, [LeftOut("a run", "0" * 8, "gap", "older & smaller")]
+    )
+    assert "size=&lt;1&gt;" in page and "older &amp; smaller" in page  # escaped
+    assert all(f"<th>{method}</th>" in page for method in comparison.methods)
+    assert "data:image/svg+xml;base64," in page and not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert '<td class="accepted">\n20.0' in page or re.search(r'class="accepted">\s*20\.0', page)
+    assert re.search(r'class="rejected">\s*-10\.0', page)
+    cells = "".join(f'<td class="n">{cell}</td>' for cell in [*["3"] * len(SECONDS), "700", "12", ""])
+    assert f"<tr><th>first</th>{cells}</tr>" in page and NOTE in page
+    row = page.split("<tr><th>ours ahead after so many s, of</th>")[1]
+    assert re.match(r'<th class="n">5</th><th class="n">60</th></tr>\s*<tr><th>first</th>\s*<td>\s*5\.0', row)
+    assert re.search(r'<td class="accepted">\s*15\.0 <span class="note">\(11\.0 to 20\.0\)', row)
+    assert "95 %, over seeds and test images" in page
+
+
+def test_differences_of_one_seed_do_not_stand_out(comparison, tmp_path):
+    page = page_of(replace(comparison, seeds=(0,)), tmp_path)
+    assert 'class="accepted"' not in page and 'class="rejected"' not in page
+    assert "95 %, over test images alone" in page and re.search(r"<td>\s*20\.0", page)

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from neural_sim.configuration import conf_directory
+from neural_sim.documents import markdown_table, write_json
 from neural_sim.report import figures
-from neural_sim.report.compare import left_out_table
 from neural_sim.report.costs import costs_table
-from neural_sim.report.layouts import LAYOUTS, Paper
-from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
-from neural_sim.report.selection import LeftOut
-from neural_sim.report.settings import Settings
+from neural_sim.report.runs import LeftOut
+from neural_sim.studies.compare import left_out_table
+from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
+from neural_sim.studies.experiments.measured import (
+    Measured,
+    document_of,
+    newest_document,
+    read_measured,
+    write_measured,
+)
+from neural_sim.studies.experiments.settings import Settings
+from neural_sim.tasks.context import Context
 
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
@@ -62,6 +69,7 @@ class Row:
 
     @property
     def exists(self) -> bool:
+        """Whether conf/experiment has its file."""
         return (conf_directory() / "experiment" / f"{self.experiment}.yaml").is_file()
 
     @property
@@ -79,7 +87,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Experiments:
-    """``+experiment=experiments_table``.
+    """Write the page of experiments; ``+experiment=experiments_table``.
 
     Args:
         rows: the constructor arguments of each :class:`Row`, by a name of its own.
@@ -117,10 +125,24 @@ class Experiments:
     def _tables(self) -> dict[str, Paper]:
         return {name: Paper(**table) for name, table in self.paper["tables"].items()}
 
+    def run(self, context: Context) -> None:
+        """Write the page, tables and figures to the run's folder."""
+        print(self.write(context.uri, context.config, context.folder))
+        print(f"results: {context.folder}")
+
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
-        """experiments.md, experiments.json and figures in ``folder``, and the page where it is asked for; returns the
-        page's text. Only runs with the ``budget`` of ``config`` count. A page keeps what it said of experiments, and of
-        settings in a table of settings, without runs here, from the file beside it.
+        """Write experiments.md, experiments.json and figures, and the page where it is asked for.
+
+        A page keeps what it said of experiments, and of settings in a table of settings, without runs here, from the
+        JSON file of the same name.
+
+        Args:
+            uri: of the MLflow store.
+            config: only runs with its ``budget`` count; its ``seed`` is of the bootstrap.
+            folder: where the files go.
+
+        Returns:
+            The page's text.
         """
         budget = config["budget"]
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
@@ -131,30 +153,29 @@ class Experiments:
         for name, (_, shown, _) in found.items():
             for called, figure in shown.items():
                 figures.save(figure, folder / "figures" / f"{name}_{called}.png")
-        kept = {} if self.page is None else read_measured(beside(self.page), budget)
+        kept = {} if self.page is None else read_measured(document_of(self.page), budget)
         made = {name: measured.with_kept(kept.get(name), rows[name].runs)
                 for name, (measured, _, _) in found.items() if measured is not None}  # fmt: skip
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
-        (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n", encoding="utf-8")
         data = {name: {"command": row.run, "ours": made[name].summary if name in made else None}
                 for name, row in asked.items()}  # fmt: skip
-        (folder / "experiments.json").write_text(
-            json.dumps({"rows": data, "left_out": [asdict(run) for run in lost]}, indent=1)
-        )
+        write_json(folder / "experiments.json", {"rows": data, "left_out": [asdict(run) for run in lost]})
         if self.page is None:
             text = self._page(asked, made, budget)
         else:
             made = {name: own for name, own in {**kept, **made}.items() if name in rows}
             text = self._page(rows, made, budget)
-            write_measured(beside(self.page), budget, made)
-            Path(self.page).write_text(text)
-        (folder / "experiments.md").write_text(text)
+            write_measured(document_of(self.page), budget, made)
+            Path(self.page).write_text(text, encoding="utf-8")
+        (folder / "experiments.md").write_text(text, encoding="utf-8")
         return text
 
     def _found(
         self, row: Row, settings: Settings
     ) -> tuple[Measured | None, Mapping[str, Any], list[LeftOut]]:
-        """What its finished runs gave, None without such; their figures by name, and runs that do not count."""
+        """Return what its finished runs gave, None without such; their figures by name, and runs that do not count."""
         if row.document is not None:
             return newest_document(settings.uri, row.experiment, row.document, settings.budget), {}, []
         if row.layout is None:
@@ -164,50 +185,54 @@ class Experiments:
             return None, {}, left_out
         table = self._tables.get(row.table) if row.table else None
         shown = LAYOUTS[row.layout](found, table)
-        runs = [run for setting in found for run in setting.runs]
+        runs = [run for setting in found for run in setting.group.runs]
         text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
         commits = sorted({commit for setting in found for commit in setting.commits})
         return Measured(list(shown.lines), text, commits, shown.entries), shown.figures, left_out
 
     def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
-        lines = [
-            "# Experiments",
-            "",
-            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
-            "their tables, without runs there it keeps what it said before.",
-            "",
+        note = (
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
             f"{training['image_size']} pixels and {outer['iterations']} iterations. AP is 0.50 to 0.95 on the test "
             "set, in points; brackets are 95 % intervals over seeds and test images. Where there is one seed, they "
             "are over test images alone, and another training may differ by more (docs/results.md, The same training "
             "again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
-            "paper's LaTeX source.",
-            "",
-            "| the paper's experiment | command | ours | the paper | what differs |",
-            "|---|---|---|---|---|",
+            "paper's LaTeX source."
+        )
+        cells = [
+            [
+                row.title,
+                f"`{row.run}`",
+                made[name].cell if name in made else row.without_runs,
+                "<br>".join(self._claims(row)),
+                row.differs,
+            ]
+            for name, row in rows.items()
+        ]
+        parts = [
+            "# Experiments",
+            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
+            "their tables, without runs there it keeps what it said before.",
+            note,
+            markdown_table(["the paper's experiment", "command", "ours", "the paper", "what differs"], cells),
         ]
         for name, row in rows.items():
-            ours = made[name].cell if name in made else row.without_runs
-            lines.append(
-                f"| {row.title} | `{row.run}` | {ours} | {'<br>'.join(self._claims(row))} | {row.differs} |"
-            )
-        for name, row in rows.items():
-            parts = [made[name].below] if name in made and made[name].below else []
-            # A layout sets the paper's table beside ours.
-            if row.table and not (parts and row.layout):
-                parts.append(self._tables[row.table].markdown())
-            if parts:
-                lines += ["", f"## {name.replace('_', ' ')}", "", f"{row.title}.", "", "\n\n".join(parts)]
+            below = [made[name].below] if name in made and made[name].below else []
+            # A layout sets the paper's table next to ours.
+            if row.table and not (below and row.layout):
+                below.append(self._tables[row.table].markdown())
+            if below:
+                parts += [f"## {name.replace('_', ' ')}", f"{row.title}.", *below]
         used = {row.table for row in rows.values()}
         others = [table for name, table in self._tables.items() if name not in used]
         if others and set(rows) >= {name for name, row in self.rows.items() if Row(**row).exists}:
-            lines += ["", "## Tables of the paper without an experiment here", ""]
-            lines += ["\n\n".join(table.markdown() for table in others)]
-        return "\n".join(lines) + "\n"
+            parts += ["## Tables of the paper without an experiment here"]
+            parts += [table.markdown() for table in others]
+        return "\n\n".join(parts) + "\n"
 
     def _claims(self, row: Row) -> list[str]:
-        """What the paper says, with its source."""
+        """Return what the paper says, with its source."""
         found = [claim for name in row.claims for claim in self.paper["claims"][name]]
         texts = [f"{c['what']} {c['value']} ({c['source']}, l. {c['line']})" for c in found]
         if row.table:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from neural_sim.report.bootstrap import THRESHOLDS, Matches
-from neural_sim.report.compare import markdown, points
-from neural_sim.report.finished import FinishedRun
-from neural_sim.report.statistics import ONLY_AT_END, ap_at, area_under, biased_ap, compare
+from neural_sim.report.comparison import ONLY_AT_END, ap_at, area_under, biased_ap, compare
+from neural_sim.report.intervals import points
+from neural_sim.report.runs import FinishedRun
+from neural_sim.studies.compare import markdown
 
 IMAGES = 100
 
@@ -35,7 +36,11 @@ def run(method, seed, learned, seconds=(10.0, 100.0)):
         "method": method, "seed": seed, "experiment": "gap", "gap": "disjoint", "biased": ["mug"], "curve": curve,
     }  # fmt: skip
     held = {"ns": matches(0.2), "learned": matches(learned, seed), "matched": matches(0.8)}
-    return FinishedRun(results, held)
+    return FinishedRun(results, read=lambda: held)
+
+
+def with_outcomes(each, held):
+    return dataclasses.replace(each, read=lambda: held)
 
 
 def test_shares_won_back_and_leads_are_those_of_the_runs():
@@ -56,9 +61,7 @@ def test_shares_won_back_and_leads_are_those_of_the_runs():
 
 def test_leads_do_not_need_a_known_target():
     runs = [run(method, s, ap) for s in range(3) for method, ap in (("ours", 0.7), ("other", 0.4))]
-    bare = [
-        dataclasses.replace(r, matches={w: m for w, m in r.matches.items() if w != "matched"}) for r in runs
-    ]
+    bare = [with_outcomes(r, {w: m for w, m in r.outcomes.items() if w != "matched"}) for r in runs]
     found, beside = compare(bare, "ours", draws=50), compare(runs, "ours", draws=50)
     assert found.bounds == ["ns"] and beside.bounds == ["ns", "matched"] and found.won_back == {}
     assert found.ahead == beside.ahead and found.ap == {m: e for m, e in beside.ap.items() if m != "matched"}
@@ -66,7 +69,7 @@ def test_leads_do_not_need_a_known_target():
 
 def test_no_fraction_is_closed_where_there_is_no_gap():
     runs = [run(method, s, ap) for s in range(3) for method, ap in (("ours", 0.2), ("other", 0.3))]
-    at_target = [dataclasses.replace(r, matches=r.matches | {"matched": r.matches["ns"]}) for r in runs]
+    at_target = [with_outcomes(r, {**r.outcomes, "matched": r.outcomes["ns"]}) for r in runs]
     found = compare(at_target, "ours", draws=50)
     assert found.won_back == {} and found.ahead["other"].value == pytest.approx(-0.1, abs=0.01)
     assert "nan" not in markdown(found, [_with_distances(each) for each in at_target])

@@ -5,9 +5,17 @@ import json
 import pytest
 
 from neural_sim.report import tracking
-from neural_sim.report.commit import commit
-from neural_sim.report.entries import Entry
-from neural_sim.report.measured import Measured, beside, newest_document, read_measured, write_measured
+from neural_sim.report.provenance import commit
+from neural_sim.studies.experiments.measured import (
+    Entry,
+    Measured,
+    document_of,
+    merged,
+    newest_document,
+    read_measured,
+    table,
+    write_measured,
+)
 
 BUDGET = {"views": {"count": 84}, "field": {"batches": [1024, 8192], "background": None}}
 ROWS = {
@@ -26,7 +34,7 @@ ROWS = {
 
 
 def test_what_is_written_is_read_at_the_same_scale_alone(tmp_path):
-    file = beside(str(tmp_path / "page.md"))
+    file = document_of(str(tmp_path / "page.md"))
     assert file.name == "page.json" and read_measured(file, BUDGET) == {}
     write_measured(file, BUDGET, ROWS)
     assert read_measured(file, BUDGET) == ROWS
@@ -92,3 +100,33 @@ def test_without_runs_there_is_no_document(uri, tmp_path):
     log(uri, tmp_path / "a", "first")
     assert newest_document(uri, "study", "other.md", BUDGET) is None
     assert newest_document(uri, "another", "study.md", BUDGET) is None
+
+
+def entry(*place, **cells):
+    return Entry(place, {"object": str(place[1]), **cells})
+
+
+OLD = [entry("zoom", "can", 2, NS="1", LTS="2", matched="3"), entry("pose", "drill", 2, NS="4")]
+
+
+def test_newer_entries_stand_for_those_of_the_same_place_and_others_stay():
+    new = [entry("zoom", "can", 2, NS="5"), entry("zoom", "can", 0, NS="6"), entry("pose", "can", 1, NS="7")]
+    found = merged(OLD, new, ["pose", "zoom"])
+    assert [e.place for e in found] == [
+        ("pose", "can", 1),
+        ("pose", "drill", 2),
+        ("zoom", "can", 0),
+        ("zoom", "can", 2),
+    ]
+    assert found[3] is new[0] and found[1] is OLD[1], "an entry is replaced whole, with its commits"
+    assert merged(OLD, [], ["zoom"]) == (OLD[0],), "an experiment that the row does not have any longer"
+
+
+def test_a_table_has_the_columns_of_all_entries_and_empty_cells():
+    assert table([OLD[1], OLD[0], entry("zoom", "mug", 2, more="8")]).splitlines() == [
+        "| object | NS | LTS | matched | more |",
+        "|---|---|---|---|---|",
+        "| drill | 4 |  |  |  |",
+        "| can | 1 | 2 | 3 |  |",
+        "| mug |  |  |  | 8 |",
+    ]

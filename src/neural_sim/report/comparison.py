@@ -1,0 +1,223 @@
+"""Methods of one setting side by side: what they score at the end, at equal time and on the way, and who is ahead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from neural_sim.detector.protocol import Score
+from neural_sim.report.intervals import Estimate, over_seeds
+from neural_sim.report.runs import BOUNDS, FIXED, FinishedRun, common_seeds, score_table
+
+BUDGETS = 6
+"""Seconds at which the methods are compared, evenly spaced in their logarithm."""
+ONLY_AT_END = (
+    "Some runs were scored at their end alone and count as their start until then, so that areas, and scores and leads "
+    "after fewer seconds, do not tell who is ahead: score_at=[0.25,0.5] scores a run on its way, too."
+)
+SPENT = ("images", "detector_steps", "products")
+Clock = Literal["seconds", "cpu_seconds"]
+"""What a method has taken: by the clock on the wall, or of all processor cores together."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The methods of one setting over the seeds that all of them have.
+
+    Scores are means over the biased objects. What is read at fewer seconds than a run took does not tell who is ahead
+    where some run was scored at its end alone (``only_at_end``).
+
+    Args:
+        setting: the experiment and its gap.
+        seeds: those that all methods have.
+        methods: the reference first.
+        reference: the method that the others are compared with.
+        ap: the score of every method and of ``bounds``.
+        won_back: the fraction of the gap from ns to matched that a method closes; empty without matched, and where the
+            start is the target's and there is no gap.
+        ahead: the reference's score minus each other method's.
+        area: the same of the areas under the score against log seconds, per unit of log seconds.
+        spent: what every method needed in all, with the warm start, means over seeds.
+        at_equal_cost: the score at the seconds that the cheapest method took in all, see :func:`ap_at`.
+        equal_cost: these seconds, their mean over seeds.
+        budgets: seconds from the first scored iteration of any run to the last.
+        ahead_at: the reference's lead over each other method at each of ``budgets``; a method that has ended by then
+            keeps its last score.
+        clock: which seconds.
+        score: what detectors are scored by.
+        only_at_end: whether some run was scored once.
+    """
+
+    setting: str
+    seeds: tuple[int, ...]
+    methods: tuple[str, ...]
+    reference: str
+    ap: Mapping[str, Estimate]
+    won_back: Mapping[str, Estimate]
+    ahead: Mapping[str, Estimate]
+    area: Mapping[str, Estimate]
+    spent: Mapping[str, Mapping[str, float]]
+    at_equal_cost: Mapping[str, Estimate]
+    equal_cost: float
+    budgets: Sequence[float] = ()
+    ahead_at: Mapping[str, Sequence[Estimate]] = field(default_factory=dict)
+    clock: Clock = "seconds"
+    score: Score = "AP"
+    only_at_end: bool = False
+
+    @property
+    def several(self) -> bool:
+        """Whether intervals are over seeds, so that differences that leave 0 out exceed the spread."""
+        return len(self.seeds) > 1
+
+    @property
+    def timed(self) -> bool:
+        """Whether differences at fewer seconds than a run took exceed the spread where they leave 0 out."""
+        return self.several and not self.only_at_end
+
+    @property
+    def bounds(self) -> list[str]:
+        """The detectors of ``BOUNDS`` that the runs have."""
+        return [bound for bound in BOUNDS if bound in self.ap]
+
+
+def compare(
+    runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0, clock: Clock = "seconds"
+) -> Comparison:
+    """Compare the runs of one setting.
+
+    Args:
+        runs: one of each method at each seed.
+        reference: the method that the others are compared with.
+        draws: of the bootstrap over test images.
+        seed: of the bootstrap.
+        clock: which seconds.
+
+    Raises:
+        ValueError: the reference has no run, or no seed is common to all methods.
+    """
+    table = score_table(runs, reference, draws, seed)
+    methods = (reference, *sorted({run.method for run in runs} - {reference, *FIXED}))
+    seeds = common_seeds(runs, methods)
+    chosen = {(run.method, run.seed): run for run in runs if run.seed in seeds and run.method in methods}
+    curves = Curves({key: biased_ap(run, clock) for key, run in chosen.items()}, methods, seeds)
+    bounds = [bound for bound in BOUNDS if bound in table.detectors]
+    won_back = {method: table.closed(method) for method in methods if "matched" in bounds}
+    return Comparison(
+        setting=runs[0].setting,
+        seeds=seeds,
+        methods=methods,
+        reference=reference,
+        ap={name: table.mean(name) for name in (*bounds, *methods)},
+        won_back={method: part for method, part in won_back.items() if not math.isnan(part.value)},
+        ahead={method: table.ahead(reference, method) for method in methods[1:]},
+        area=curves.area_ahead,
+        spent={
+            method: {key: _mean(chosen[method, at].spent(key) for at in seeds) for key in (*SPENT, clock)}
+            for method in methods
+        },
+        at_equal_cost=curves.at_equal_cost,
+        equal_cost=_mean(curves.cheapest.values()),
+        budgets=curves.budgets,
+        ahead_at=curves.ahead_at,
+        clock=clock,
+        score=runs[0].score,
+        only_at_end=any((seconds > 0.0).sum() == 1 for seconds, _ in curves.of.values()),
+    )
+
+
+Curve = tuple[Float[np.ndarray, "points"], Float[np.ndarray, "points"]]
+"""Seconds spent, and the mean score of the biased objects, at every iteration that was scored."""
+
+
+def biased_ap(run: FinishedRun, clock: Clock) -> Curve:
+    """Return the biased objects' mean score over the seconds of a clock."""
+    curve, biased = run.results["curve"], run.results["biased"]
+    ap = [_mean(point["ap"]["per_class"][name] for name in biased) for point in curve]
+    return np.asarray([point[clock] for point in curve]), np.asarray(ap)
+
+
+def area_under(
+    seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
+) -> float:
+    """Return the mean of AP over log seconds in [first, last], AP as :func:`ap_at` has it at every budget."""
+    begun = seconds > 0.0
+    if not begun.any():
+        return float(ap[0])
+    lower, upper, points = math.log(first), math.log(last), np.log(seconds[begun])
+    start = min(max(points[0], lower), upper)
+    edges = np.concatenate([[start], points[(points > start) & (points < upper)], [upper]])
+    line = np.trapezoid(np.interp(edges, points, ap[begun]), edges)
+    return float(ap[0] * (start - lower) + line) / (upper - lower)
+
+
+def ap_at(seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], budget: float) -> float:
+    """Return AP at a budget: linear in log seconds between scored points, the start's until the first of them."""
+    begun = seconds > 0.0
+    if not begun.any() or budget < seconds[begun][0]:
+        return float(ap[0])
+    return float(np.interp(math.log(budget), np.log(seconds[begun]), ap[begun]))
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The curves of all methods at all seeds, read at equal times; the first method is compared with the others."""
+
+    of: Mapping[tuple[str, int], Curve]
+    methods: Sequence[str]
+    seeds: Sequence[int]
+
+    @property
+    def cheapest(self) -> dict[int, float]:
+        """The least seconds that any method took in all, by seed; 0 where none took any."""
+        ends = {at: [self.of[method, at][0][-1] for method in self.methods] for at in self.seeds}
+        return {at: min((end for end in own if end > 0.0), default=0.0) for at, own in ends.items()}
+
+    @property
+    def at_equal_cost(self) -> dict[str, Estimate]:
+        """Every method's score at ``cheapest``."""
+        budgets = self.cheapest
+        reached = {m: [ap_at(*self.of[m, at], budgets[at]) for at in self.seeds] for m in self.methods}
+        return {method: over_seeds(np.asarray(own)).as_fraction for method, own in reached.items()}
+
+    @cached_property
+    def budgets(self) -> list[float]:
+        """Seconds from the first scored iteration of any run to the last; empty where no run took any."""
+        spent = np.concatenate([seconds[seconds > 0.0] for seconds, _ in self.of.values()])
+        if not len(spent):
+            return []
+        return np.unique(np.geomspace(spent.min(), spent.max(), BUDGETS)).tolist()
+
+    @property
+    def ahead_at(self) -> dict[str, list[Estimate]]:
+        """The first method's lead over each other one at each of ``budgets``; empty without any."""
+        reached = [{key: ap_at(*curve, budget) for key, curve in self.of.items()} for budget in self.budgets]
+        others = self.methods[1:] if reached else ()
+        return {method: [self._ahead(values, method) for values in reached] for method in others}
+
+    @property
+    def area_ahead(self) -> dict[str, Estimate]:
+        """The same of areas under the curves, from the first scored iteration of any run to the last end."""
+        spent = [times[times > 0.0] for times, _ in self.of.values() if (times > 0.0).any()]
+        first, last = (
+            min((times.min() for times in spent), default=0.0),
+            max((t.max() for t in spent), default=0.0),
+        )
+        if first >= last:
+            return {}
+        areas = {key: area_under(*curve, first, last) for key, curve in self.of.items()}
+        return {method: self._ahead(areas, method) for method in self.methods[1:]}
+
+    def _ahead(self, values: Mapping[tuple[str, int], float], method: str) -> Estimate:
+        first = self.methods[0]
+        return over_seeds(np.asarray([values[first, at] - values[method, at] for at in self.seeds]))
+
+
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))

@@ -1,0 +1,379 @@
+"""Finished runs as rows of a table: read from MLflow, grouped by what can be compared, the others with the reason.
+
+Scores are comparable between runs that share what is scored (``scoring``) and the test images of a seed (``test_set``).
+Seeds may be averaged where a method ran with the same settings for all of them (``configuration``). The three are
+digests in results.json, see :mod:`identity`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from neural_sim.detector.protocol import Score
+from neural_sim.report import coco, tracking
+from neural_sim.report.bootstrap import Outcomes, match
+from neural_sim.report.identity import KEYS, all_values, differences, headings, scored_values
+from neural_sim.report.score_table import ScoreTable
+
+BOUNDS = ("ns", "matched")
+"""Detectors that every run of a seed has and that do not depend on its method: trained on the initial distribution and
+on the target's, if that is known. They stand for the methods of ``FIXED``, whose own runs are not compared again."""
+FIXED = ("ns", "oracle")
+WITHOUT = ("synthetic_only", "real_only", "views_only")
+"""Detectors that are scored where photographs train too: on synthetic images alone, on photographs alone, and on the
+views of the fields alone."""
+RESULTS = "results.json"
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A run: what its results.json says, and its detections when they are asked for.
+
+    Args:
+        results: the content of results.json, empty where the run is unusable.
+        name: in MLflow.
+        run_id: in MLflow.
+        experiment: in MLflow.
+        read: makes ``outcomes``.
+        unusable: why there is nothing to compare.
+    """
+
+    results: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+    run_id: str = ""
+    experiment: str = ""
+    read: Callable[[], Mapping[str, Sequence[Outcomes]]] = dict
+    unusable: str | None = None
+
+    @cached_property
+    def outcomes(self) -> Mapping[str, Sequence[Outcomes]]:
+        """What the scores of its biased objects are computed from, for each of its detectors (ns, learned, ...)."""
+        return self.read()
+
+    @property
+    def method(self) -> str:
+        """The method that chose the training images."""
+        return self.results["method"]
+
+    @property
+    def seed(self) -> int:
+        """The run's seed."""
+        return self.results["seed"]
+
+    @property
+    def score(self) -> Score:
+        """What its detectors are scored by; versions without classifiers did not record it."""
+        return self.results.get("score", "AP")
+
+    @property
+    def setting(self) -> str:
+        """The experiment, with its gap unless that is the experiment's own."""
+        gap = self.results["gap"]
+        return self.results["experiment"] + ("" if gap == "disjoint" else f", {gap}")
+
+    @property
+    def label(self) -> str:
+        """Its name and the first digits of its id."""
+        return f"{self.name} ({self.run_id[:8]})"
+
+    def spent(self, key: str) -> float:
+        """Return what the method needed in all: images, detector_steps, products, seconds or cpu_seconds."""
+        return float(self.results["curve"][-1][key])
+
+    def detector(self, name: str) -> Sequence[Outcomes]:
+        """Return a detector's outcomes by its name in a table, where a method stands for what it has learned."""
+        return self.outcomes[name if name in (*BOUNDS, *WITHOUT) else "learned"]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A run that a comparison does not use, and the reason."""
+
+    run: str
+    run_id: str
+    experiment: str
+    reason: str
+
+    @property
+    def label(self) -> str:
+        """Its name and the first digits of its id."""
+        return f"{self.run} ({self.run_id[:8]})"
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Rows of a table in their order, and the runs that rules have left out of it.
+
+    Args:
+        rows: the runs, those of an experiment the newest first.
+        left_out: in the order in which they were left out.
+    """
+
+    rows: tuple[FinishedRun, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+
+    @staticmethod
+    def read(uri: str, experiments: Sequence[str]) -> Runs:
+        """Read the runs of MLflow experiments.
+
+        Raises:
+            ValueError: no such experiment.
+        """
+        names = dict.fromkeys(experiments)
+        return Runs(tuple(_read(run, name) for name in names for run in tracking.logged_runs(uri, name)))
+
+    def without(self, reason: Callable[[FinishedRun], str | None]) -> Runs:
+        """Leave out the runs that a rule gives a reason for."""
+        kept, left = [], list(self.left_out)
+        for run in self.rows:
+            why = reason(run)
+            if why is None:
+                kept.append(run)
+            else:
+                left.append(LeftOut(run.name, run.run_id, run.experiment, why))
+        return Runs(tuple(kept), tuple(left))
+
+    def groupby(self, key: Callable[[FinishedRun], Key]) -> dict[Key, Runs]:
+        """Group the rows, in the order of the groups' first rows; what was left out before is in none of them."""
+        groups: dict[Key, list[FinishedRun]] = {}
+        for run in self.rows:
+            groups.setdefault(key(run), []).append(run)
+        return {value: Runs(tuple(rows)) for value, rows in groups.items()}
+
+    def of(self, method: str) -> tuple[FinishedRun, ...]:
+        """Return the rows of a method."""
+        return tuple(run for run in self.rows if run.method == method)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs to compare: one of each method at each of ``seeds``, the reference's first.
+
+    Args:
+        setting: the experiment and its gap.
+        label: names the group among all of a comparison.
+        heading: how it differs from other groups of the same setting; empty for the only one.
+        runs: on equal test images, seed by seed.
+    """
+
+    setting: str
+    label: str
+    heading: str
+    runs: tuple[FinishedRun, ...]
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds that all methods have."""
+        return tuple(sorted({run.seed for run in self.runs}))
+
+
+def score_table(runs: Sequence[FinishedRun], reference: str, draws: int, seed: int = 0) -> ScoreTable:
+    """Score the detectors of runs on the biased objects: the bounds, every method, and those of ``WITHOUT``.
+
+    The seeds are those that all methods have; the reference's runs stand for what all methods share.
+
+    Args:
+        runs: of one group.
+        reference: the method that the others are compared with.
+        draws: of the bootstrap over test images.
+        seed: of the bootstrap.
+
+    Raises:
+        ValueError: the reference has no run, or no seed is common to all methods.
+    """
+    table = {(run.method, run.seed): run for run in runs}
+    if not any(method == reference for method, _ in table):
+        raise ValueError(f"compare.reference: no run of {reference!r}, got {sorted({m for m, _ in table})}")
+    methods = [reference, *sorted({method for method, _ in table} - {reference, *FIXED})]
+    seeds = common_seeds(runs, methods)
+    if not seeds:
+        raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
+    ours = [table[reference, at] for at in seeds]
+    shared = [name for name in (*BOUNDS, *WITHOUT) if all(name in run.outcomes for run in ours)]
+    outcomes = {name: [run.detector(name) for run in ours] for name in shared}
+    outcomes |= {name: [table[name, at].detector(name) for at in seeds] for name in methods}
+    return ScoreTable.of(outcomes, runs[0].results["biased"], draws, seed)
+
+
+def common_seeds(runs: Iterable[FinishedRun], methods: Iterable[str]) -> tuple[int, ...]:
+    """Return the seeds that all methods have, in order."""
+    known = {(run.method, run.seed) for run in runs}
+    methods = list(methods)
+    return tuple(sorted({seed for _, seed in known if all((method, seed) in known for method in methods)}))
+
+
+def by_reason(left_out: Iterable[LeftOut]) -> dict[str, list[str]]:
+    """Group labels of runs by why they were left out."""
+    grouped: dict[str, list[str]] = {}
+    for run in left_out:
+        grouped.setdefault(run.reason, []).append(run.label)
+    return grouped
+
+
+def select(
+    runs: Runs, reference: str, methods: Sequence[str] | None = None
+) -> tuple[list[Group], tuple[LeftOut, ...]]:
+    """Return the groups that can be compared with a reference method, and all runs that are left out.
+
+    Args:
+        runs: of all experiments asked for, those of each the newest first.
+        reference: the method that the others are compared with.
+        methods: the others; None: all.
+    """
+    usable = runs.without(lambda run: _useless(run, reference, methods))
+    keyed = usable.groupby(lambda run: (run.setting, run.results["scoring"]))
+    anchors = {key: own.of(reference)[:1] for key, own in keyed.items()}
+    kept, left = {}, list(usable.left_out)
+    for (setting, scoring), own in keyed.items():
+        if anchors[setting, scoring]:
+            chosen = _comparable(own, reference)
+            kept[setting, scoring] = chosen.rows
+        else:
+            others = [run for (name, _), found in anchors.items() if name == setting for run in found]
+            chosen = own.without(lambda run, others=others: _no_reference(run, reference, others))
+        left += chosen.left_out
+    return [group for group in _grouped(kept) if group.runs], tuple(left)
+
+
+def _read(run: tracking.LoggedRun, experiment: str) -> FinishedRun:
+    known = FinishedRun(name=run.name, run_id=run.run_id, experiment=experiment)
+    if run.status != "FINISHED":
+        return replace(known, unusable=f"its status in MLflow is {run.status}")
+    for file in (RESULTS, coco.FILE):
+        if file not in run.files:
+            return replace(known, unusable=f"it was not evaluated: it left no {file}")
+    results = json.loads(run.fetch(RESULTS).read_text(encoding="utf-8"))
+    return replace(known, results=results, read=lambda: read_outcomes(results, run.fetch(coco.FILE)))
+
+
+def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outcomes]]:
+    """Match a run's detections to the test set's boxes, for each of its biased objects.
+
+    Args:
+        results: the content of results.json.
+        file: detections.json.
+    """
+    names = list(results["psi"])
+    truth, detections = coco.read_detections(file)
+    score: Score = results.get("score", "AP")
+    labels = [names.index(name) for name in results["biased"]]
+    return {which: [match(own, truth, label, score) for label in labels] for which, own in detections.items()}
+
+
+def _useless(run: FinishedRun, reference: str, methods: Sequence[str] | None) -> str | None:
+    """Why a run is compared with no other, None if it may be."""
+    if run.unusable is not None:
+        return run.unusable
+    if methods is not None and run.method not in (reference, *methods):
+        return "compare.methods does not name its method"
+    if not all(run.results.get(key) for key in KEYS):
+        return "an older version wrote it, without the digests that say what it can be compared with"
+    if not (run.results["biased"] and run.results["curve"]):
+        return "none of its objects starts from another distribution than its target's"
+    if run.method in FIXED and run.method != reference:
+        return "every run trains and scores this detector itself: rows ns and matched"
+    return None
+
+
+def _no_reference(run: FinishedRun, reference: str, anchors: Sequence[FinishedRun]) -> str:
+    """``anchors``: the reference's newest runs of the same setting, scored in other ways."""
+    if not anchors:
+        return f"{reference} has no run of this setting"
+    differs = differences(scored_values(run.results), scored_values(anchors[0].results))
+    return f"no run of {reference} is scored in the same way; beside {anchors[0].label}, {differs}"
+
+
+def _comparable(runs: Runs, reference: str) -> Runs:
+    """One run of each method at each seed that they have in common, the reference's first."""
+    by_method = runs.groupby(lambda run: run.method)
+    order = sorted(by_method, key=lambda method: (method != reference, method))
+    alike = {method: _of_one_configuration(by_method[method]) for method in order}
+    left = [run for each in alike.values() for run in each.left_out]
+    ours = _newest_of_seeds(Runs(alike.pop(reference).rows))
+    left += ours.left_out
+    kept = {reference: ours.rows}
+    for method, each in alike.items():
+        same = _on_the_test_set_of(Runs(each.rows), ours, reference)
+        newest = _newest_of_seeds(same)
+        left += newest.left_out
+        if newest.rows:
+            kept[method] = newest.rows
+    chosen = _at_common_seeds(kept, reference)
+    return Runs(chosen.rows, (*left, *chosen.left_out))
+
+
+def _of_one_configuration(runs: Runs) -> Runs:
+    newest = runs.rows[0]
+
+    def reason(run: FinishedRun) -> str | None:
+        if run.results["configuration"] == newest.results["configuration"]:
+            return None
+        differs = differences(all_values(run.results), all_values(newest.results))
+        return f"not run as the newest of {run.method}, {newest.label}: {differs}"
+
+    return runs.without(reason)
+
+
+def _newest_of_seeds(runs: Runs) -> Runs:
+    newest = {seed: own.rows[0] for seed, own in runs.groupby(lambda run: run.seed).items()}
+
+    def reason(run: FinishedRun) -> str | None:
+        if newest[run.seed] is run:
+            return None
+        return f"a newer run of the same settings and seed stands for it, {newest[run.seed].label}"
+
+    return runs.without(reason)
+
+
+def _on_the_test_set_of(runs: Runs, ours: Runs, reference: str) -> Runs:
+    by_seed = {run.seed: run for run in ours.rows}
+
+    def reason(run: FinishedRun) -> str | None:
+        other = by_seed.get(run.seed)
+        if other is None:
+            return f"{reference} has no run of seed {run.seed}"
+        if run.results["test_set"] == other.results["test_set"]:
+            return None
+        differs = differences(all_values(run.results), all_values(other.results))
+        differs = differs or "the settings are equal, so another machine or library drew them"
+        return f"its test images or labels are not those of {other.label}: {differs}"
+
+    return runs.without(reason)
+
+
+def _at_common_seeds(runs: Mapping[str, Sequence[FinishedRun]], reference: str) -> Runs:
+    """Methods with many seeds come first; one that would leave no seed in common is left out."""
+    of = {method: {run.seed: run for run in rows} for method, rows in runs.items()}
+    seeds, chosen, left = set(of[reference]), [reference], []
+    for method in sorted(of.keys() - {reference}, key=lambda name: (-len(of[name]), name)):
+        if seeds & set(of[method]):
+            chosen.append(method)
+            seeds &= set(of[method])
+        else:
+            what = f"it shares no seed with all of {', '.join(chosen)}"
+            left += Runs(tuple(of[method].values())).without(lambda _, what=what: what).left_out
+
+    def lacking(run: FinishedRun) -> str | None:
+        others = [method for method in chosen if run.seed not in of[method]]
+        return None if run.seed in seeds else f"there is no run of seed {run.seed} of {', '.join(others)}"
+
+    for method in chosen:
+        left += Runs(tuple(of[method].values())).without(lacking).left_out
+    order = [reference, *sorted(chosen[1:])]
+    return Runs(tuple(of[method][seed] for method in order for seed in sorted(seeds)), tuple(left))
+
+
+def _grouped(kept: Mapping[tuple[str, str], tuple[FinishedRun, ...]]) -> Iterable[Group]:
+    for setting in dict.fromkeys(setting for setting, _ in kept):
+        own = {scoring: runs for (name, scoring), runs in kept.items() if name == setting}
+        what = headings([scored_values(runs[0].results) for runs in own.values()])
+        for (scoring, runs), heading in zip(own.items(), what, strict=True):
+            label = setting if len(own) == 1 else f"{setting}, scoring {scoring[:8]}"
+            yield Group(setting, label, heading, runs)

@@ -1,0 +1,356 @@
+"""Study ``compare``: all methods of an experiment side by side, from finished runs; ``+experiment=compare``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
+
+from neural_sim.detector.metrics import IN_FULL
+from neural_sim.documents import markdown_table
+from neural_sim.report import figures, tracking
+from neural_sim.report.comparison import ONLY_AT_END, Clock, Comparison, biased_ap, compare
+from neural_sim.report.costs import HEAD, NOTE, Costs, cells, costs, costs_table
+from neural_sim.report.figures import Figure
+from neural_sim.report.intervals import bounds, points
+from neural_sim.report.page import render
+from neural_sim.report.page.verdict import POINTS, listed
+from neural_sim.report.runs import FinishedRun, Group, LeftOut, Runs, by_reason, select
+from neural_sim.tasks.context import Context
+
+UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of processor time"}
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare finished runs of MLflow experiments, each experiment by itself and at each gap.
+
+    Args:
+        experiments: MLflow experiments whose runs are compared.
+        reference: the method that the others are compared with.
+        draws: of the bootstrap over test images.
+        clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
+        methods: these; null: all that have runs. Seeds are those that all of them have.
+
+    Raises:
+        ValueError: no experiment, fewer than two draws, or another clock.
+    """
+
+    experiments: tuple[str, ...]
+    reference: str = "neural_sim"
+    draws: int = 300
+    clock: Clock = "seconds"
+    methods: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.experiments or self.draws < 2:
+            raise ValueError(
+                f"compare: want experiments and at least 2 draws, got {list(self.experiments)}, {self.draws}"
+            )
+        if self.clock not in get_args(Clock):
+            raise ValueError(f"compare.clock must be one of {get_args(Clock)}, got {self.clock!r}")
+
+    def run(self, context: Context) -> None:
+        """Write compare.md, compare.json, the figures and report.html to the run's folder, and a run to MLflow.
+
+        Raises:
+            ValueError: no such experiment, no run of a named method, or none that can be compared, with the reasons.
+        """
+        groups, left_out = self.selected(Runs.read(context.uri, self.experiments))
+        tables = [self.table(group, context.config["seed"]) for group in groups]
+        page = write_page(tables, left_out, context.folder)
+        labels = ", ".join(table.group.label for table in tables)
+        context.publish(
+            "compare",
+            {
+                "comparisons": [table.document for table in tables],
+                "left_out": [dataclasses.asdict(run) for run in left_out],
+            },
+            compare_markdown(tables, left_out),
+            {table.slug: table.figure for table in tables},
+            {name: value for table in tables for name, value in table.metrics.items()},
+            tags={"compared": ",".join(table.group.label for table in tables)},
+            title=labels,
+        )
+        shown = [tracking.where_runs(context.uri, name) for name in dict.fromkeys(self.experiments)]
+        lines = dict.fromkeys(line for where in shown for line in where.splitlines())  # one command for all
+        print(*lines, f"who is ahead? open {page}", sep="\n")
+
+    def selected(self, runs: Runs) -> tuple[list[Group], tuple[LeftOut, ...]]:
+        """Return the groups of runs that are compared, and the runs that are left out.
+
+        Raises:
+            ValueError: no run of a named method, or none that can be compared, with the reasons.
+        """
+        known = {run.results.get("method") for run in runs.rows}
+        missing = sorted(set(self.methods or ()) - known)
+        names = ", ".join(self.experiments)
+        if missing:
+            raise ValueError(f"compare.methods: no run of {', '.join(missing)} in {names}")
+        groups, left_out = select(runs, self.reference, self.methods)
+        if not groups:
+            why = "; ".join(
+                f"{reason}: {', '.join(labels)}" for reason, labels in by_reason(left_out).items()
+            )
+            raise ValueError(
+                f"compare.experiments: no evaluated run of compare.reference={self.reference!r} on biased objects in "
+                f"{names}" + (f" ({why})" if why else "")
+            )
+        return groups, left_out
+
+    def table(self, group: Group, seed: int) -> Table:
+        """Compare the runs of one group; ``seed`` is of the bootstrap."""
+        comparison = compare(group.runs, self.reference, self.draws, seed, self.clock)
+        return Table(group, dataclasses.replace(comparison, setting=group.label), costs(group.runs))
+
+
+@dataclass(frozen=True)
+class Table:
+    """One group of runs compared: a part of compare.md, of compare.json and of the page."""
+
+    group: Group
+    comparison: Comparison
+    costs: Mapping[str, Costs]
+
+    cost_head = HEAD
+    cost_note = NOTE
+
+    @property
+    def slug(self) -> str:
+        """The setting as part of a file's or a metric's name."""
+        return self.group.label.replace(", ", "_").replace(" ", "_")
+
+    @property
+    def biased(self) -> Sequence[str]:
+        """The objects whose scores are compared."""
+        return self.group.runs[0].results["biased"]
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The group's part of compare.json."""
+        runs = self.group.runs
+        return {
+            **dataclasses.asdict(self.comparison),
+            "costs": {method: dataclasses.asdict(cost) for method, cost in self.costs.items()},
+            "heading": self.group.heading,
+            "scoring": runs[0].results["scoring"],
+            "runs": [
+                {"method": run.method, "seed": run.seed, "run": run.name, "run_id": run.run_id}
+                for run in runs
+            ],
+        }
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Scores of the methods by their names in MLflow."""
+        c = self.comparison
+        return {f"{self.slug}/{method}/{c.score.lower()}": c.ap[method].value for method in c.methods}
+
+    @cached_property
+    def figure(self) -> Figure:
+        """Scores against images and seconds."""
+        return curves(self.comparison, self.group.runs)
+
+    @property
+    def chart(self) -> str:
+        """The figure as the source of an ``<img>``."""
+        return render.data_uri(self.figure)
+
+    @property
+    def cost_rows(self) -> dict[str, list[str]]:
+        """Cells by method, under ``cost_head``."""
+        return {method: cells(cost) for method, cost in self.costs.items()}
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: whom the reference is ahead of, and whom not."""
+        return verdict(self.comparison)
+
+    @property
+    def warning(self) -> str:
+        """What the scores at fewer seconds do not tell; empty if they do."""
+        return ONLY_AT_END if self.comparison.only_at_end else ""
+
+    @property
+    def in_full(self) -> str:
+        """The score's name."""
+        return IN_FULL[self.comparison.score]
+
+    @property
+    def longest(self) -> float:
+        """The largest score of the table, to which bars are drawn."""
+        return max((estimate.value for estimate in self.comparison.ap.values()), default=1.0) or 1.0
+
+
+def compare_markdown(tables: Sequence[Table], left_out: Sequence[LeftOut]) -> str:
+    """Return the text of compare.md."""
+    parts = [markdown(table.comparison, table.group.runs, table.group.heading) for table in tables]
+    return "\n\n".join([*parts, *left_out_table(left_out)])
+
+
+def left_out_table(left_out: Sequence[LeftOut]) -> list[str]:
+    """Return a section of compare.md; none where every run was compared."""
+    if not left_out:
+        return []
+    rows = [(", ".join(runs), reason.replace("\n", " ")) for reason, runs in by_reason(left_out).items()]
+    return ["## Left out\n\n" + markdown_table(["runs", "why"], rows)]
+
+
+def markdown(comparison: Comparison, runs: Sequence[FinishedRun], heading: str = "") -> str:
+    """Return the table of one setting, its differences, the distances of the learned distributions, and costs.
+
+    Args:
+        comparison: of the runs.
+        runs: one of each method at each seed.
+        heading: how these runs differ from others of the setting.
+    """
+    c = comparison
+    bold = "Differences in bold exceed the spread: their interval leaves 0 out. "
+    if not c.several:
+        bold = "None is in bold: intervals of one seed leave out how much trainings differ. "
+    parts = [
+        f"## {c.setting}" + (f": {heading}" if heading else "") + "\n"
+        f"Seed{'s' if c.several else ''} {', '.join(map(str, c.seeds))}; "
+        f"{IN_FULL[c.score]} of {', '.join(runs[0].results['biased'])} in points, "
+        f"with 95 % intervals over {'seeds and test images' if c.several else 'test images alone'}.",
+        *_on_other_devices(runs),
+        _scores_table(c),
+        f"{bold}Images, steps and seconds include the warm start, whose backbone every loop trains on; fields, which "
+        "all methods share, and the labelled validation images are not counted. "
+        "The fraction closed has no interval where the gap's own includes 0. "
+        f"{c.score[0].upper()}{c.score[1:]} at equal seconds: those of the cheapest method, between scored "
+        "iterations linear in log seconds.",
+        *[ONLY_AT_END] * c.only_at_end,
+        *_leads(c),
+        *_distances(c, runs),
+        costs_table(runs),
+    ]
+    return "\n\n".join(parts)
+
+
+def _unit(comparison: Comparison) -> str:
+    return "seconds" if comparison.clock == "seconds" else "CPU seconds"
+
+
+def _scores_table(c: Comparison) -> str:
+    unit = _unit(c)
+    head = [
+        "method", c.score, "of the gap closed", f"{c.reference} ahead by", "area ahead by",
+        f"{c.score} after {c.equal_cost:.0f} {unit}", "images", "detector steps", unit,
+    ]  # fmt: skip
+    rows = [[bound, points(c.ap[bound]), *[""] * (len(head) - 2)] for bound in c.bounds]
+    for method in c.methods:
+        spent = [f"{c.spent[method][key]:.0f}" for key in ("images", "detector_steps", c.clock)]
+        rows.append(
+            [
+                method,
+                points(c.ap[method]),
+                points(c.won_back[method], "%") if method in c.won_back else "",
+                points(c.ahead[method], sure=c.several) if method in c.ahead else "",
+                points(c.area[method], sure=c.timed) if method in c.area else "",
+                points(c.at_equal_cost[method]),
+                *spent,
+            ]
+        )
+    return markdown_table(head, rows)
+
+
+def _leads(c: Comparison) -> list[str]:
+    """Return the reference's lead by budget and a note; nothing without another method."""
+    if not c.ahead_at:
+        return []
+    head = [f"{c.reference} ahead after so many {_unit(c)}, of", *(f"{budget:.0f}" for budget in c.budgets)]
+    rows = [[method, *(points(lead, sure=c.timed) for lead in leads)] for method, leads in c.ahead_at.items()]
+    note = f"A method that has ended keeps its last {c.score}; before its first scored iteration it has the start's."
+    return [markdown_table(head, rows), note]
+
+
+def _on_other_devices(runs: Sequence[FinishedRun]) -> list[str]:
+    """Return a warning where the seconds of a table come from devices of several kinds."""
+    kinds: dict[str, list[str]] = {}
+    for run in runs:
+        kind = run.results["config"]["trainer"]["accelerator"]
+        kinds.setdefault(kind, []).append(f"{run.method} seed {run.seed}")
+    if len(kinds) == 1:
+        return []
+    named = "; ".join(f"{kind}: {', '.join(which)}" for kind, which in kinds.items())
+    return [f"Seconds are not comparable, the runs were made on devices of several kinds ({named})."]
+
+
+def _distances(comparison: Comparison, runs: Sequence[FinishedRun]) -> list[str]:
+    """Return mean distances of every biased object and factor; nothing where the target is not known."""
+    rows = []
+    table = {(run.method, run.seed): run.results["total_variation"] for run in runs}
+    for name in runs[0].results["biased"]:
+        for factor in runs[0].results["total_variation"][name]:
+            means = []
+            for method in comparison.methods:
+                each = [table[method, seed][name][factor] for seed in comparison.seeds]
+                means.append({w: sum(row[w] for row in each) / len(each) for w in ("initial", "learned")})
+            learned = [f"{mean['learned']:.2f}" for mean in means]
+            rows.append([f"{name}, {factor}", f"{means[0]['initial']:.2f}", *learned])
+    head = ["total variation to the target", "initial", *comparison.methods]
+    return [markdown_table(head, rows)] if rows else []
+
+
+def curves(comparison: Comparison, runs: Sequence[FinishedRun]) -> Figure:
+    """Draw the biased objects' score against images and against seconds, a line a seed."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    figure.suptitle(comparison.setting, color=figures.INK, fontsize=11)
+    for place, key in enumerate(("images", comparison.clock), 1):
+        axes = figure.add_subplot(1, 2, place)
+        for number, method in enumerate(comparison.methods):
+            colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
+            for line, run in enumerate(run for run in runs if run.method == method):
+                spent = [point[key] for point in run.results["curve"]]
+                # In steps: worth what it has reached, as in the area.
+                axes.plot(
+                    spent, 100 * biased_ap(run, comparison.clock)[1], ".-", drawstyle="steps-post", color=colour,
+                    alpha=0.7, linewidth=1, label=method if line == 0 else None,
+                )  # fmt: skip
+        for bound, style in zip(comparison.bounds, (":", "--"), strict=False):
+            axes.axhline(100 * comparison.ap[bound].value, color=figures.MUTED, linestyle=style, linewidth=1)
+            axes.annotate(bound, (1.0, 100 * comparison.ap[bound].value), xycoords=("axes fraction", "data"),
+                          ha="right", va="bottom", fontsize=7, color=figures.MUTED)  # fmt: skip
+        # The start, where nothing is spent yet, has a place too.
+        least = [point[key] for run in runs for point in run.results["curve"] if point[key] > 0]
+        axes.set_xscale("symlog", linthresh=min(least, default=1))
+        label = f"{comparison.score} of the biased objects (%)"
+        axes.set(xlabel=f"{UNITS[key]} (log)", ylabel=label, xlim=(0, None))
+        axes.grid(color=figures.GRID)
+        figures.style(axes)
+        handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
+def verdict(comparison: Comparison) -> str:
+    """Say whom the reference is ahead of by its score at the end, and whom it cannot be told apart from.
+
+    Of one seed it says that intervals leave out how much trainings differ.
+    """
+    c = comparison
+    reached = c.ap[c.reference]
+    parts = [f"{c.reference} reaches {100 * reached.value:.1f} {POINTS[c.score]} ({bounds(reached)})"]
+    for word, sign in (("ahead of", 1.0), ("behind", -1.0)):
+        methods = [method for method, lead in c.ahead.items() if lead.certain and sign * lead.value > 0.0]
+        if methods:
+            parts.append(f"{word} " + listed([f"{m} by {abs(100 * c.ahead[m].value):.1f}" for m in methods]))
+    untold = [method for method, lead in c.ahead.items() if not lead.certain]
+    if untold:
+        parts.append(f"not told apart from {listed(untold)}")
+    one = "; one seed, so that how much trainings differ is not in this" if len(c.seeds) == 1 else ""
+    return ", ".join(parts) + one + "."
+
+
+def write_page(tables: Sequence[Table], left_out: Sequence[LeftOut], folder: Path) -> Path:
+    """Write report.html: who is ahead, by how much, at what cost."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "report.html"
+    title = "Comparison: " + ", ".join(table.group.label for table in tables)
+    text = render.page("comparison.html", title=title, sections=tables, left_out=by_reason(left_out))
+    path.write_text(text, encoding="utf-8")
+    return path
