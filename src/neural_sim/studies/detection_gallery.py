@@ -91,7 +91,7 @@ class DetectionGallery:
         found = {}
         for method, graph in graphs.items():
             scores = results(graph.scores(results(graph.learned).last, f"what {method} learned"))
-            found[method] = Found(scores.detections, scores.ap)
+            found[method] = Found(scores.detections, scores.ap)  # pyright: ignore[reportArgumentType]  (boxes)
         self.publish(context, test, found, context.graph.names)
 
     def publish(

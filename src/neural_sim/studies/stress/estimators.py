@@ -31,8 +31,9 @@ def _peaked(depth: float) -> Tensor:
 
 @case
 def constant_scores(scope: Scope) -> Checks:
-    """All scores equal: no bin is better, and the derivative is 0 exactly, not the rounding of a sum, which
-    an update that takes out the gradient's scale would turn into a full step.
+    """Estimate from equal scores: no bin is better, and the derivative is 0 exactly.
+
+    The rounding of a sum would not do: an update that takes out the gradient's scale would turn it into a full step.
     """
     for value in (1.0, 0.1, -1e8, 1e-300, 1e100):
         scores = torch.full((len(KNOWN),), value, dtype=DOUBLE)
@@ -51,8 +52,9 @@ def constant_scores(scope: Scope) -> Checks:
 
 @case
 def score_scales(scope: Scope) -> Checks:
-    """Scores in another unit, by powers of two: the derivative changes by that, and no digit of it. An offset common to
-    all scores changes nothing but by its rounding, n eps of the offset.
+    """Estimate from scores in another unit, by powers of two: the derivative changes by that, and no digit of it.
+
+    An offset common to all scores changes nothing but by its rounding, n eps of the offset.
     """
     table, psi = scope.normal(BINS, EACH), scope.normal(BINS)
     plain = stratified(table, psi, _floored)
@@ -71,9 +73,10 @@ def score_scales(scope: Scope) -> Checks:
 
 @case
 def significance(scope: Scope) -> Checks:
-    """p-values in another unit, by powers of two: no digit changes. Scores that are all equal, one image, one row other
-    than zero, numbers that are not finite: 1, nothing is told. Bins of one image each: every permutation has the same
-    statistic, and the p-value is 1.
+    """Take p-values in another unit, by powers of two: no digit changes.
+
+    Scores that are all equal, one image, one row other than zero, numbers that are not finite: 1, nothing is told. Bins
+    of one image each: every permutation has the same statistic, and the p-value is 1.
     """
     bins = torch.eye(BINS, dtype=DOUBLE).repeat_interleave(EACH, 0)
     scores, rows = scope.normal(len(bins)), scope.normal(len(bins), BINS)
@@ -100,7 +103,7 @@ def significance(scope: Scope) -> Checks:
 
 @case
 def one_hot(scope: Scope) -> Checks:
-    """P from uniform to one-hot: the closed form p_i (s_i - sum_j p_j s_j)."""
+    """Estimate at p from uniform to one-hot: the closed form p_i (s_i - sum_j p_j s_j)."""
     table = scope.normal(BINS, EACH)
     means = table.mean(-1)
     for depth in (0.0, 20.0, 1000.0):

@@ -1,5 +1,6 @@
-"""Whole images at the ends of size, distance and precision, by the geometry of the pinhole and rounding of 8
-bits; and boxes of a pixel and of the image, as the detector learns them.
+"""Whole images at the ends of size, distance and precision; boxes of a pixel and of the image, as detectors learn them.
+
+Truths are the geometry of the pinhole, and the rounding of 8 bits.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.hvp import gradient
 from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, not_finite, worst
-from neural_sim.studies.stress.detectors import small_detector
-from neural_sim.studies.stress.rendering import (
+from neural_sim.studies.stress.subjects import (
     EXACT,
     along_x,
     block,
@@ -28,6 +28,7 @@ from neural_sim.studies.stress.rendering import (
     outside,
     raw_density,
     rounding_of,
+    small_detector,
 )
 from neural_sim.synthesis.boxes import boxes_from_opacity
 from neural_sim.types import LabelledImages, PinholeCamera, Rays
@@ -36,12 +37,13 @@ OPAQUE = 1e8
 
 
 def beside(distance: float) -> Tensor:
-    """A camera on world +x that looks at the origin."""
+    """Place a camera on world +x that looks at the origin."""
     values = (torch.tensor([value], dtype=DOUBLE) for value in (math.pi / 2, 0.0, distance))
     return cameras.orbit(*values).float()
 
 
 def boxed(label: str, opacity: Tensor, expected: list[float], margin: float, wanted: str = "BOX") -> Check:
+    """Check the box round what is opaque."""
     boxes, present = boxes_from_opacity(opacity)
     status = "BOX" if bool(present[0]) else "NO_BOX"
     return Check(f"box: {label}", worst(boxes[0, 0] - torch.tensor(expected)), margin, status, (wanted,))
@@ -49,8 +51,9 @@ def boxed(label: str, opacity: Tensor, expected: list[float], margin: float, wan
 
 @case
 def one_pixel_object(scope: Scope) -> Checks:
-    """An object of half a pixel in front of the middle pixel of 33: exactly one pixel, a box of 1 x 1 along
-    its edges; between four pixels of 32 no ray meets it and there is no box.
+    """Render an object of half a pixel in front of the middle pixel of 33: exactly one pixel, a box of 1 x 1.
+
+    Between four pixels of 32 no ray meets it, and there is no box.
     """
     field = block(OPAQUE, half=0.1)
     for size, expected, wanted in ((33, [16.0, 16.0, 17.0, 17.0], "BOX"), (32, [0.0] * 4, "NO_BOX")):
@@ -62,12 +65,11 @@ def one_pixel_object(scope: Scope) -> Checks:
 
 @case
 def wide_object(scope: Scope) -> Checks:
-    """A cube across an image 2,000 pixels wide: one that covers all of it, and one whose edges are in sight.
+    """Render a cube across an image 2,000 pixels wide: one that covers all of it, one whose edges are in sight.
 
-    The front face at distance d - a has edges f a / (d - a) pixels from the middle. A pixel's ray is that of
-    its centre (half a pixel), and a ray that leaves through the side within one step of the edge may be
-    missed: at slope a / (d - a) that is the outermost f h (a / (d - a)) / (d - a) pixels, plus one where both
-    meet.
+    The front face at distance d - a has edges f a / (d - a) pixels from the middle. A pixel's ray is that of its centre
+    (half a pixel), and a ray that leaves through the side within one step of the edge may be missed: at slope a / (d -
+    a) that is the outermost f h (a / (d - a)) / (d - a) pixels, plus one where both meet.
     """
     width, height, half = 2000, 400 if scope.full else 20, 0.5
     focal = 0.5 * width / math.tan(math.radians(20.0))
@@ -89,8 +91,9 @@ def wide_object(scope: Scope) -> Checks:
 
 @case
 def zoom_ends(scope: Scope) -> Checks:
-    """Both ends of the distance: drawn exactly, and rendered right from just outside the unit sphere to 1e5
-    radii. A point at distance D is known to 2 eps D, so that the chord of a ray is known to 4 eps D and a step.
+    """Draw and render both ends of the distance, from just outside the unit sphere to 1e5 radii.
+
+    A point at distance D is known to 2 eps D, so that the chord of a ray is known to 4 eps D and a step.
     """
     for ends in ((2.4, 4.0), (1.0 + 1e-6, 1e5)):
         scene = SceneDistribution.of([Pose()], Unlearned(distance=ends))
@@ -117,13 +120,12 @@ def zoom_ends(scope: Scope) -> Checks:
 
 @case
 def bfloat16(scope: Scope) -> Checks:
-    """Rendering with bfloat16 (8 bits of mantissa, so u = 2^-8): the table stored in it, and autocast,
-    against float64.
+    """Render with bfloat16 (u = 2^-8): the table stored in it, and autocast, against float64.
 
-    A raw value r is read to u |r| where it is stored, to 11 u |r| under autocast (entry and weight rounded,
-    eight products summed in bfloat16 at worst, and the sum), its softplus to 2 u more. Opacity is monotone in
-    r: the bound is the opacity of r moved by that much, closed form, plus 4 u under autocast for alpha,
-    transmittance, their product and sum. A colour is opacity times a sigmoid, whose slope is at most 1/4.
+    A raw value r is read to u |r| where it is stored, to 11 u |r| under autocast (entry and weight rounded, eight
+    products summed in bfloat16 at worst, and the sum), its softplus to 2 u more. Opacity is monotone in r: the bound is
+    the opacity of r moved by that much, closed form, plus 4 u under autocast for alpha, transmittance, their product
+    and sum. A colour is opacity times a sigmoid, whose slope is at most 1/4.
     """
     unit, colour, cell = 0.5 * eps(torch.bfloat16), 1.3, 0.25
     for sigma in (0.0, 1e-6, 1e-2, 0.3, 1.0, 3.0, 1e3, OPAQUE):
@@ -151,9 +153,10 @@ def bfloat16(scope: Scope) -> Checks:
 
 @case
 def extreme_boxes(scope: Scope) -> Checks:
-    """Boxes of one pixel, of the whole image, at its corner, and a sliver: each claims the anchor that
-    overlaps it most (low quality matches), its code decodes to the box itself, and loss and gradient are
-    finite; also without any box, where every anchor is background.
+    """Assign boxes of one pixel, of the whole image, at its corner, and a sliver.
+
+    Each claims the anchor that overlaps it most (low quality matches), its code decodes to the box itself, and loss and
+    gradient are finite; also without any box, where every anchor is background.
     """
     side = 32.0
     network = small_detector(3)

@@ -1,6 +1,4 @@
-"""Inner problems that are far from stationary, flat, indefinite or of any unit, where the implicit derivative
-is known.
-"""
+"""Inner problems far from stationary, flat, indefinite or of any unit, where the implicit derivative is known."""
 
 from __future__ import annotations
 
@@ -23,8 +21,8 @@ from neural_sim.solver.hvp import gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.solution import Status
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite, worst
-from neural_sim.studies.stress.detectors import small_detector
 from neural_sim.studies.stress.linear import UNTRUSTED, ended, logarithmic, relative, system
+from neural_sim.studies.stress.subjects import small_detector
 from neural_sim.types import LabelledImages
 
 ROWS, SIZE, PSI = 12, 6, 3
@@ -33,11 +31,11 @@ TRIED: dict[str, LinearSolver] = {"cg": ConjugateGradient(), "minres": MinimumRe
 
 @dataclass(frozen=True)
 class Quadratic:
-    """``L_train = s (sum_i (a_i theta - c_i - d_i psi)^2 / 2 N + lambda |theta|^2 / 2)``, ``L_val = |B theta
-    - t|^2 / 2``.
+    """A least-squares problem whose implicit derivative is a closed form.
 
-    At psi = 0 the minimiser is ``(A^T A / N + lambda)^-1 A^T c / N``, and at any theta the implicit formula gives
-    ``D^T A (A^T A / N + lambda)^-1 B^T (B theta - t) / N``, which is dL_val/dpsi at the minimiser only.
+    ``L_train = s (sum_i (a_i theta - c_i - d_i psi)^2 / 2 N + lambda |theta|^2 / 2)``, ``L_val = |B theta - t|^2 / 2``.
+    At psi = 0 the minimiser is ``(A^T A / N + lambda)^-1 A^T c / N``, and at any theta the implicit formula gives ``D^T
+    A (A^T A / N + lambda)^-1 B^T (B theta - t) / N``, which is dL_val/dpsi at the minimiser only.
     """
 
     a: Tensor
@@ -50,6 +48,7 @@ class Quadratic:
 
     @staticmethod
     def random(scope: Scope) -> Quadratic:
+        """Draw a problem."""
         a, c, d, b, t = scope.normal(ROWS * (SIZE + 1 + PSI) + 4 * (SIZE + 1)).split(
             [ROWS * SIZE, ROWS, ROWS * PSI, 4 * SIZE, 4]
         )
@@ -57,18 +56,21 @@ class Quadratic:
 
     @property
     def hessian(self) -> Tensor:
+        """The second derivative of L_train, without the unit."""
         return self.a.T @ self.a / ROWS + self.damping * torch.eye(SIZE, dtype=DOUBLE)
 
     @property
     def minimiser(self) -> Tensor:
+        """L_train's, at psi = 0."""
         return torch.linalg.solve(self.hessian, self.a.T @ self.c / ROWS)
 
     def implicit(self, theta: Tensor) -> Tensor:
+        """Evaluate the implicit formula in closed form."""
         slope = self.b.T @ (self.b @ theta - self.t)
         return self.d.T @ self.a @ torch.linalg.solve(self.hessian, slope) / ROWS
 
     def solved(self, theta: Tensor, solver: LinearSolver, rtol: float) -> Hypergradient:
-        """The code's own way, with the proximal term as damping."""
+        """Solve by the project's own code, with the proximal term as damping."""
         params = {"w": theta[:2].clone(), "v": theta[2:].clone()}
         weights = torch.full((ROWS,), self.unit / ROWS, dtype=DOUBLE)
         anchor = {name: torch.zeros_like(value) for name, value in params.items()}
@@ -88,11 +90,11 @@ class Quadratic:
 
 @case
 def far_from_stationary(scope: Scope) -> Checks:
-    """Theta = theta* + delta for |delta| from 0 to 1e6: the stationarity is |H delta|, and the implicit
-    gradient is off by D^T A H^-1 B^T B delta / N, both closed forms. The quantity states by how much it
-    misses dL_val/dpsi at theta*.
+    """Solve at theta* + delta for |delta| from 0 to 1e6.
 
-    Rounding: N eps of the terms summed; the solve's rtol and n^2 eps through |H^-1| onto the gradient.
+    The stationarity is |H delta|, and the implicit gradient is off by D^T A H^-1 B^T B delta / N, both closed forms.
+    The quantity states by how much it misses dL_val/dpsi at theta*. Rounding: N eps of the terms summed; the solve's
+    rtol and n^2 eps through |H^-1| onto the gradient.
     """
     problem = Quadratic.random(scope)
     towards = torch.nn.functional.normalize(scope.normal(SIZE), dim=0)
@@ -118,7 +120,7 @@ def far_from_stationary(scope: Scope) -> Checks:
 
 @case
 def units(scope: Scope) -> Checks:
-    """L_train in another unit leaves dL_val/dpsi as it is; powers of two change no digit."""
+    """Solve with L_train in another unit, which leaves dL_val/dpsi as it is; powers of two change no digit."""
     problem = Quadratic.random(scope)
     plain = problem.solved(problem.minimiser, ConjugateGradient(), 1e-10)
     for power in (-200, -60, 60, 200):
@@ -130,8 +132,10 @@ def units(scope: Scope) -> Checks:
 
 @case
 def degenerate(scope: Scope) -> Checks:
-    """A flat inner problem without damping has no inverse: v = 0 and a status; with lambda, v = b / lambda. A loss that
-    is NaN or overflows has a status and v = 0.
+    """Solve flat inner problems, and losses that are NaN or overflow.
+
+    A flat one without damping has no inverse: v = 0 and a status; with lambda, v = b / lambda. A loss that is NaN or
+    overflows has a status and v = 0.
     """
     b = scope.normal(SIZE)
     params = {"x": torch.ones(SIZE, dtype=DOUBLE)}
@@ -159,10 +163,10 @@ def degenerate(scope: Scope) -> Checks:
 
 @case
 def indefinite_hessians(scope: Scope) -> Checks:
-    """The default damping on Hessians of any sign and condition, with as many Lanczos steps as parameters.
+    """Damp Hessians of any sign and condition by default, with as many Lanczos steps as parameters.
 
-    It must pass the most negative eigenvalue by its margin (to the rounding n eps |H| of a Ritz value), and the solve
-    reach the dense one: condition of the damped matrix times rtol and n^2 eps.
+    The damping must pass the most negative eigenvalue by its margin (to the rounding n eps |H| of a Ritz value), and
+    the solve reach the dense one: condition of the damped matrix times rtol and n^2 eps.
     """
     spectra = {
         "definite, condition 1e12": logarithmic(1e12),
@@ -191,9 +195,11 @@ def indefinite_hessians(scope: Scope) -> Checks:
 
 @case
 def untrained_detector(scope: Scope) -> Checks:
-    """A real detector at its random start, 10 times and 100 times that: its stationarity against the directional
-    derivative of the loss along the gradient itself, extrapolated from two central differences (Richardson). The
-    tolerance is that reference's own error: what the extrapolation changed, and eps L / step.
+    """Take the stationarity of a real detector at its random start, 10 times and 100 times that.
+
+    The truth is the directional derivative of the loss along the gradient itself, extrapolated from two central
+    differences (Richardson). The tolerance is that reference's own error: what the extrapolation changed, and eps L /
+    step.
     """
     detector = small_detector(2)
     start = {name: value.double() for name, value in detector.init(scope.generator()).items()}

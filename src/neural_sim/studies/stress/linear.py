@@ -1,9 +1,8 @@
-"""Linear systems. Truths are closed forms in the eigenbasis, or a solution chosen before its right-hand side.
+"""Linear systems, against closed forms in the eigenbasis or a solution chosen before its right-hand side.
 
-Notation: n unknowns, condition number k = |A| |A^-1|, eps of the arithmetic. A backward stable solver leaves
-a residual of at most n^2 eps |A| |x| (the worst-case constant of a dense factorisation; Higham, Accuracy and
-Stability, Thm. 10.4), and ``|x - x*| <= |A^-1| |r|`` whatever the solver. More may not be asked of any of
-them.
+Notation: n unknowns, condition number k = |A| |A^-1|, eps of the arithmetic. A backward stable solver leaves a residual
+of at most n^2 eps |A| |x| (the worst-case constant of a dense factorisation; Higham, Accuracy and Stability, Thm.
+10.4), and ``|x - x*| <= |A^-1| |r|`` whatever the solver. More may not be asked of any of them.
 """
 
 from __future__ import annotations
@@ -61,16 +60,18 @@ class System:
         return float(self.values.abs().max() * self.x.norm() / self.b.norm())
 
     def rounded(self) -> System:
-        """The system in float32, with the float64 solution of what that stores."""
+        """Return the system in float32, with the float64 solution of what that stores."""
         matrix, b = self.matrix.float(), self.b.float()
         truth = torch.linalg.solve(matrix.double(), b.double())
         return System(matrix, self.basis, self.values, truth, b)
 
     def solve(self, solver: LinearSolver, rtol: float, max_steps: int = 400) -> Solution:
+        """Solve by one of the solvers."""
         return solver.solve(self.matrix.mv, self.b, rtol=rtol, max_steps=max_steps)
 
 
 def system(values: Tensor, generator: torch.Generator) -> System:
+    """Draw a basis and a solution for the given eigenvalues."""
     size = len(values)
     basis, _ = torch.linalg.qr(torch.randn(size, size, generator=generator, dtype=DOUBLE))
     matrix = basis * values @ basis.T
@@ -80,40 +81,43 @@ def system(values: Tensor, generator: torch.Generator) -> System:
 
 
 def logarithmic(condition: float, size: int = SIZE) -> Tensor:
+    """Spread eigenvalues evenly in log from 1 to 1 / ``condition``."""
     return torch.logspace(0.0, -math.log10(condition), size, dtype=DOUBLE)
 
 
 def relative(value: Tensor, truth: Tensor) -> float:
+    """Return |value - truth| / |truth| in float64."""
     return float((value.double() - truth.double()).norm() / truth.double().norm())
 
 
 def backward_error(dtype: torch.dtype = DOUBLE) -> float:
+    """Return n^2 eps, what a backward stable solver may leave."""
     return SIZE**2 * eps(dtype)
 
 
 def krylov_steps(condition: float, rtol: float) -> int:
-    """Steps within which conjugate gradients and MINRES must have converged: twice the Chebyshev bound."""
+    """Return steps within which CG and MINRES must have converged: twice the Chebyshev bound."""
     return math.ceil(math.sqrt(condition) * math.log(2.0 * math.sqrt(condition) / rtol)) + 2 * SIZE
 
 
 def ended(quantity: str, value: float, tolerance: float, solution: Solution, *wanted: Status) -> Check:
-    """A check of a solve, which must have ended as ``wanted`` says (converged)."""
+    """Check a solve, which must have ended as ``wanted`` says (converged)."""
     names = tuple(status.name for status in wanted or (Status.CONVERGED,))
     return Check(quantity, value, tolerance, solution.status.name, names)
 
 
 @case
 def condition_numbers(scope: Scope) -> Checks:
-    """K from 1 to 1e12 in float64 and float32, asked for the residual of a backward stable solver.
+    """Solve for k from 1 to 1e12 in float64 and float32, to the residual of a backward stable solver.
 
-    ``|x - x*| / |x*| <= k (rtol |b| / (|A| |x*|) + n^2 eps)``: the residual asked for, and the rounding of
-    ``A x*`` and of the recomputed residual, n eps each. The rounding of MINRES' short recurrences reaches the
-    residual as k^2 eps (Sleijpen, van der Vorst and Modersitzki 2000): beyond k = 1 / sqrt(eps) it may stop
-    with STAGNATED instead, no worse than zero; LEAST_SQUARES would be a false claim here.
+    ``|x - x*| / |x*| <= k (rtol |b| / (|A| |x*|) + n^2 eps)``: the residual asked for, and the rounding of ``A x*`` and
+    of the recomputed residual, n eps each. The rounding of MINRES' short recurrences reaches the residual as k^2 eps
+    (Sleijpen, van der Vorst and Modersitzki 2000): beyond k = 1 / sqrt(eps) it may stop with STAGNATED instead, no
+    worse than zero; LEAST_SQUARES would be a false claim here.
 
     float32 is compared with the float64 solution of the very same rounded system. Where its bound exceeds 1 no digit is
-    promised, and the claim must be honest: converged only if the float64 residual is below rtol and the rounding of
-    one product, n eps |A| |x| / |b|.
+    promised, and the claim must be honest: converged only if the float64 residual is below rtol and the rounding of one
+    product, n eps |A| |x| / |b|.
     """
     generator = scope.generator()
     for condition in (1.0, 1e2, 1e4, 1e6, 1e8, 1e10, 1e12):
@@ -140,12 +144,11 @@ def condition_numbers(scope: Scope) -> Checks:
 
 @case
 def indefinite(scope: Scope) -> Checks:
-    """Eigenvalues of both signs, and all negative.
+    """Solve with eigenvalues of both signs, and all negative.
 
-    MINRES and the dense solve reach the bound of ``condition_numbers``. Conjugate gradients run over n
-    A-conjugate directions, among which as many have negative curvature as A has negative eigenvalues
-    (Sylvester), so they must meet one before they converge. What they hand back is no worse
-    than zero, whose residual is 1.
+    MINRES and the dense solve reach the bound of ``condition_numbers``. Conjugate gradients run over n A-conjugate
+    directions, among which as many have negative curvature as A has negative eigenvalues (Sylvester), so they must meet
+    one before they converge. What they hand back is no worse than zero, whose residual is 1.
     """
     generator = scope.generator()
     signs = torch.ones(SIZE, dtype=DOUBLE)
@@ -168,13 +171,15 @@ def indefinite(scope: Scope) -> Checks:
 
 @case
 def singular(scope: Scope) -> Checks:
-    """Three zero eigenvalues. With b in the range: the minimum-norm solution, from a closed form in the eigenbasis,
-    by the bound of ``condition_numbers``; a step adds at most n eps |A| |x| outside it, which costs 1 / (smallest
-    non-zero eigenvalue) at most, that is the same bound with the number of steps for n.
+    """Solve with three zero eigenvalues.
 
-    With a part of b outside it, and for the zero operator: the least residual, |P_null b| / |b|. Of a residual that
-    is minimal only the square sees an error of x, so the same bound more than holds. Solvers for definite systems may
-    not claim success, and do no worse than zero.
+    With b in the range: the minimum-norm solution, from a closed form in the eigenbasis, by the bound of
+    ``condition_numbers``; a step adds at most n eps |A| |x| outside it, which costs 1 / (smallest non-zero eigenvalue)
+    at most, that is the same bound with the number of steps for n.
+
+    With a part of b outside it, and for the zero operator: the least residual, |P_null b| / |b|. Of a residual that is
+    minimal only the square sees an error of x, so the same bound more than holds. Solvers for definite systems may not
+    claim success, and do no worse than zero.
     """
     condition, rank = 1e3, SIZE - 3
     values = torch.cat([logarithmic(condition, rank), torch.zeros(3, dtype=DOUBLE)])
@@ -206,8 +211,10 @@ def singular(scope: Scope) -> Checks:
 
 @case
 def units(scope: Scope) -> Checks:
-    """B = 0 gives exactly 0. b or the operator times a power of two changes no digit of the solution, out to where
-    squares of the operator's entries leave the range of the arithmetic.
+    """Solve for b = 0, which gives exactly 0, and in other units.
+
+    b or the operator times a power of two changes no digit of the solution, out to where squares of the operator's
+    entries leave the range of the arithmetic.
     """
     for dtype, powers in ((SINGLE, (-90, 90)), (DOUBLE, (-900, -600, 600, 900))):
         problem = system(logarithmic(1e3), scope.generator())
@@ -229,7 +236,7 @@ def units(scope: Scope) -> Checks:
 
 @case
 def one_parameter(scope: Scope) -> Checks:
-    """One unknown: x = b / a to a few roundings, whatever the size or (where the solver takes it) sign of a."""
+    """Solve for one unknown: x = b / a to a few roundings, whatever the size or (where it may) sign of a."""
     b = torch.tensor([6.0], dtype=DOUBLE)
     for entry in (3.0, 1e-300, 1e-20, 1e20, 1e300, -3.0):
         for name in SOLVERS:
@@ -244,8 +251,10 @@ def one_parameter(scope: Scope) -> Checks:
 
 @case
 def non_finite_operators(scope: Scope) -> Checks:
-    """NaN and inf at once or only from the third product on, in b, and a product that overflows: a status,
-    and no number that is not finite anywhere in the solution. A bad warm start is dropped and costs nothing.
+    """Solve with NaN and inf at once or only from the third product on, in b, and with overflow.
+
+    Wanted are a status, and no number that is not finite anywhere in the solution. A bad warm start is dropped and
+    costs nothing.
     """
     problem = system(logarithmic(1e3), scope.generator())
     plain, nothing = problem.matrix.mv, problem.b.clone()

@@ -23,8 +23,7 @@ from neural_sim.parameter.update import SGD, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
-from neural_sim.studies.stress.detectors import small_detector
-from neural_sim.studies.stress.rendering import block
+from neural_sim.studies.stress.subjects import block, small_detector
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.draws import HardDraws
 from neural_sim.synthesis.scene import Scene
@@ -48,6 +47,7 @@ class Worst:
     off_simplex: float = 0.0
 
     def see(self, before: Tensor, after: Tensor) -> None:
+        """Take a step into account."""
         self.not_finite += not_finite(after)
         # psi + step and its difference round by eps |psi| each.
         excess = (after - before).abs() - MAX_STEP - 2 * eps(DOUBLE) * after.abs()
@@ -57,6 +57,7 @@ class Worst:
         self.off_simplex = max(self.off_simplex, below, float((p.sum(-1) - 1.0).abs().max()))
 
     def checks(self, label: str, status: str = "", wanted: tuple[str, ...] = ()) -> Checks:
+        """Check all that was seen."""
         yield Check(f"psi not finite: {label}", self.not_finite, 0.0, status, wanted)
         yield Check(f"step beyond max_step: {label}", self.excess, 8 * eps(DOUBLE) * MAX_STEP)
         # log p carries eps |psi| of the softmax part (at most 30 nats of it show beside the floor) and k roundings.
@@ -64,7 +65,7 @@ class Worst:
 
 
 def slope(psi: Tensor, costs: Tensor) -> Tensor:
-    """Gradient in psi of each object's mean cost over its bins."""
+    """Return the gradient in psi of each object's mean cost over its bins."""
     leaf = psi.detach().requires_grad_()
     mean = (binned.log_probabilities(leaf, FLOOR).exp() * costs).sum()
     return torch.autograd.grad(mean, leaf)[0]
@@ -73,7 +74,7 @@ def slope(psi: Tensor, costs: Tensor) -> Tensor:
 def run(
     update: Update, psi: Tensor, gradients: Iterable[Callable[[Tensor], Tensor]], error: float, worst: Worst
 ) -> UpdateState:
-    """Steps along gradients that depend on psi, with standard errors of a part ``error`` of them."""
+    """Step along gradients that depend on psi, with standard errors of a part ``error`` of them."""
     state = UpdateState.zeros(psi)
     for of in gradients:
         gradient = of(psi)
@@ -86,9 +87,10 @@ def run(
 
 @case
 def learning_rates(scope: Scope) -> Checks:
-    """Rates from 1e-6 to 1e3 on noisy costs of 1e-6, 1 and 1e6 (one scale an object), from uniform p and from
-    bins 1000 nats below: at every step psi is finite, p on its simplex and the step at most ``max_step``,
-    which ``bound`` promises.
+    """Step at rates from 1e-6 to 1e3 on noisy costs of 1e-6, 1 and 1e6 (one scale an object).
+
+    From uniform p and from bins 1000 nats below: at every step psi is finite, p on its simplex and the step at most
+    ``max_step``, which ``bound`` promises.
     """
     steps = 300 if scope.full else 40
     costs = scope.normal(3, 8) * torch.tensor([[1e-6], [1.0], [1e6]], dtype=DOUBLE)
@@ -107,7 +109,7 @@ def learning_rates(scope: Scope) -> Checks:
 
 @case
 def flat_loss(scope: Scope) -> Checks:
-    """A gradient of exactly zero moves nothing, by any update at any rate, from any psi: no digit changes."""
+    """Step along a gradient of exactly zero, by any update, rate and psi: no digit changes."""
     for name, make in UPDATES.items():
         for rate in RATES:
             moved = 0.0
@@ -123,9 +125,11 @@ def flat_loss(scope: Scope) -> Checks:
 
 @case
 def cliff(scope: Scope) -> Checks:
-    """One gradient of 1e30 and above, infinite or NaN, between usual ones: the step is bounded, or refused
-    and counted, and psi stays finite and bounded in the 30 steps after it. Up to 1e100 every square is finite
-    and the step is taken; inf and NaN are refused; between, where squares overflow, either is right.
+    """Step along one gradient of 1e30 and above, infinite or NaN, between usual ones.
+
+    The step is bounded, or refused and counted, and psi stays finite and bounded in the 30 steps after it. Up to 1e100
+    every square is finite and the step is taken; inf and NaN are refused; between, where squares overflow, either is
+    right.
     """
     costs, shape = scope.normal(3, 8), scope.normal(3, 8)
     for name, make in UPDATES.items():
@@ -156,15 +160,17 @@ class Constant:
     probes_per_bin: ClassVar[int] = 0
 
     def estimate(self, losses: Any, params: Any, vector: Any, images: Any, probes: Any) -> MixedDerivative:
+        """Return the number, tilted over the bins."""
         shape = torch.linspace(-1.0, 1.0, images.psi.numel(), dtype=images.psi.dtype)
         return MixedDerivative(self.value * shape, torch.zeros_like(shape))
 
 
 @case
 def loop(scope: Scope) -> Checks:
-    """The whole psi loop on a cube of 4 bins whose estimator returns NaN, inf, 1e30 or 0: psi is finite and
-    within the bound of its steps, a gradient that is not finite moves nothing and its certificate says what
-    was done, zero moves nothing.
+    """Run the whole psi loop on a cube of 4 bins whose estimator returns NaN, inf, 1e30 or 0.
+
+    psi is finite and within the bound of its steps, a gradient that is not finite moves nothing and its certificate
+    says what was done, zero moves nothing.
     """
     iterations = 2
     actions = {"shrink": "skipped", "keep": "skipped", "skip": "skipped", "stop": "stopped"}

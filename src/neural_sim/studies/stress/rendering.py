@@ -1,113 +1,40 @@
-"""Rendering at the ends of density, size and distance. The truth is always Beer and Lambert's law along a
-closed-form chord.
+"""Rendering at the ends of density, size and distance, against Beer and Lambert's law along a closed-form chord.
 
-Constant density s over a ray's length L gives the opacity 1 - exp(-s L). The grid takes one sample a step h
-of a fixed lattice, so that it sees N h with |N h - L| <= h for every interval that the ray spends inside: the
-opacity lies between those of L - h and L + h, and N h = L where the interval's ends are h apart on the
-lattice. Rounding: a table entry r (log of the density where that is small) is known to eps |r|, a sum of N
-terms to N eps, relatively in the optical depth and hence at most as much in the opacity. The running sum over
-all rays' samples is known to N eps of float64 times the sum of their optical depths, of which one counts for
-50 at most.
+Constant density s over a ray's length L gives the opacity 1 - exp(-s L). The grid takes one sample a step h of a fixed
+lattice, so that it sees N h with |N h - L| <= h for every interval that the ray spends inside: the opacity lies between
+those of L - h and L + h, and N h = L where the interval's ends are h apart on the lattice. Rounding: a table entry r
+(log of the density where that is small) is known to eps |r|, a sum of N terms to N eps, relatively in the optical depth
+and hence at most as much in the opacity. The running sum over all rays' samples is known to N eps of float64 times the
+sum of their optical depths, of which one counts for 50 at most.
 """
 
 from __future__ import annotations
 
-import math
-
 import torch
-from torch import Tensor
 
 from neural_sim.field.base import PackedSamples
-from neural_sim.field.grid import EMPTY_DENSITY, GridField
-from neural_sim.field.mlp import MLPField
 from neural_sim.field.quadrature import composite
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, short, worst
+from neural_sim.studies.stress.subjects import (
+    EXACT,
+    along_x,
+    ball,
+    block,
+    chord,
+    opacity_of,
+    outside,
+    rounding_of,
+    running_sum,
+)
 from neural_sim.types import Rays
 
 DENSITIES = (0.0, 1e-6, 1e-3, 1.0, 1e3, 1e8)
-EXACT = NerfRenderer(termination=0.0)
-
-
-def raw_density(sigma: float, cell: float) -> float:
-    """The table entry whose softplus over the cell's edge is ``sigma``."""
-    depth = sigma * cell
-    return depth + math.log(-math.expm1(-depth)) if depth > 0.0 else EMPTY_DENSITY
-
-
-def block(
-    sigma: float, dtype: torch.dtype = SINGLE, half: float = 1.0, cells: int = 8, step_cells: float = 1.0,
-    colour: float = 0.0, hollow: bool = False,
-) -> GridField:  # fmt: skip
-    """A cube of constant density round the origin; ``hollow`` leaves only its outermost cells."""
-    field = GridField(step_cells=step_cells, density_gain=1.0).to(dtype)
-    occupied = torch.ones(cells, cells, cells, dtype=torch.bool)
-    if hollow:
-        occupied[1:-1, 1:-1, 1:-1] = False
-    cell = 2.0 * half / cells
-    field.reset(occupied, torch.full((3,), -half, dtype=dtype), cell)
-    with torch.no_grad():
-        field.table[:-1, 0] = raw_density(sigma, cell)
-        field.table[:-1, 1:] = colour
-    return field.eval().requires_grad_(False)
-
-
-def ball(sigma: float, dtype: torch.dtype = SINGLE) -> MLPField:
-    """The network with all weights zero: constant density in the unit sphere."""
-    scale = 1.0 if sigma == 0.0 else sigma
-    field = MLPField(
-        width=4, depth=2, position_frequencies=1, direction_frequencies=1, density_scale=scale
-    ).to(dtype)
-    with torch.no_grad():
-        for name, value in field.named_parameters():
-            value.zero_()
-            if name.endswith("sigma.bias"):
-                value.fill_(EMPTY_DENSITY if sigma == 0.0 else math.log(math.expm1(1.0)))
-    return field.eval().requires_grad_(False)
-
-
-def chord(rays: Rays, half: float) -> Tensor:
-    """Length of each ray inside the cube [-half, half]^3, by its six planes, in float64."""
-    origins, directions = rays.origins.double(), rays.directions.double()
-    inside = origins.abs() < half
-    with torch.no_grad():
-        low, high = (-half - origins) / directions, (half - origins) / directions
-        near, far = torch.minimum(low, high), torch.maximum(low, high)
-        parallel = directions == 0.0
-        near = torch.where(parallel, torch.where(inside, -math.inf, math.inf), near)
-        far = torch.where(parallel, torch.where(inside, math.inf, -math.inf), far)
-    return (far.amin(-1) - near.amax(-1).clamp_min(0.0)).clamp_min(0.0)
-
-
-def opacity_of(depth: Tensor | float) -> Tensor:
-    return -torch.expm1(-torch.as_tensor(depth, dtype=DOUBLE).clamp_min(0.0))
-
-
-def outside(opacity: Tensor, sigma: float, shortest: Tensor, longest: Tensor) -> float:
-    """How far opacities lie outside those of lengths from ``shortest`` to ``longest``."""
-    low, high = opacity_of(sigma * shortest), opacity_of(sigma * longest)
-    return float(torch.maximum(low - opacity.double(), opacity.double() - high).clamp_min(0.0).max())
-
-
-def rounding_of(sigma: float, dtype: torch.dtype, cell: float = 0.25) -> float:
-    """What the table's entry and a ray's sum of samples may round an opacity by."""
-    return (abs(raw_density(sigma, cell)) + 32) * eps(dtype) if sigma else 0.0
-
-
-def running_sum(samples: int, depth: float) -> float:
-    """What the running sum over a pack may lose, for the sum of optical depths of all its samples."""
-    return samples * eps(DOUBLE) * (min(depth, 50.0 * samples) + samples)
-
-
-def along_x(*offsets: tuple[float, float], dtype: torch.dtype = SINGLE, start: float = 3.0) -> Rays:
-    origins = torch.tensor([[start, y, z] for y, z in offsets], dtype=dtype)
-    directions = torch.tensor([[-1.0, 0.0, 0.0]], dtype=dtype).expand(len(offsets), 3)
-    return Rays(origins, directions.contiguous())
 
 
 @case
 def slab_opacity(scope: Scope) -> Checks:
-    """Densities from 0 to 1e8 through a cube of edge 2 on the lattice: 1 - exp(-2 s), relatively."""
+    """Render densities from 0 to 1e8 through a cube of edge 2 on the lattice: 1 - exp(-2 s), relatively."""
     for dtype in (DOUBLE, SINGLE):
         for sigma in DENSITIES:
             rgb, opacity = EXACT.render_rays(block(sigma, dtype), along_x((0.1, 0.2), dtype=dtype))
@@ -121,12 +48,11 @@ def slab_opacity(scope: Scope) -> Checks:
 
 @case
 def ball_opacity(scope: Scope) -> Checks:
-    """The network's samples partition a ray's chord of the unit sphere: their widths add up to it, whatever the
-    density.
+    """Render the unit sphere by the network, whose samples partition a ray's chord whatever the density.
 
-    Rays from outside, from inside and almost tangent. Rounding: the near and far ends to a few eps of the
-    distance, which half a chord of 1e-3 takes up 1e3-fold through the square root, and 192 widths; and the
-    running sum's.
+    Rays come from outside, from inside and almost tangent. Rounding: the near and far ends to a few eps of the
+    distance, which half a chord of 1e-3 takes up 1e3-fold through the square root, and 192 widths; and the running
+    sum's.
     """
     distances = torch.tensor([0.0, 0.5, 0.999, 1.0 - 5e-7, 1.001], dtype=DOUBLE)
     half = (1.0 - distances.square()).clamp_min(0.0).sqrt()
@@ -145,8 +71,10 @@ def ball_opacity(scope: Scope) -> Checks:
 
 @case
 def mixed_densities(scope: Scope) -> Checks:
-    """A faint ray behind a thousand opaque ones in the same pack: 1 - exp(-0.5) for each density of the
-    others, to the rounding of the running sum and of the ray's own 20 samples.
+    """Composite a faint ray behind a thousand opaque ones in the same pack.
+
+    Its opacity is 1 - exp(-0.5) for each density of the others, to the rounding of the running sum and of the ray's own
+    20 samples.
     """
     rays, each, width = 1001, 20, 0.05
     for dtype in (DOUBLE, SINGLE):
@@ -165,9 +93,11 @@ def mixed_densities(scope: Scope) -> Checks:
 
 @case
 def thin_shell(scope: Scope) -> Checks:
-    """Walls half as thick as a step. A lattice may miss one, but over 64 equally spaced phases of the lattice
-    the mean of N h is that of a lattice 64 times as fine: within h / 64 of each wall's length. At one phase
-    it is within h of each, and at the default step, one cell, no wall that a ray crosses fully is missed.
+    """Render walls half as thick as a step.
+
+    A lattice may miss one, but over 64 equally spaced phases of the lattice the mean of N h is that of a lattice 64
+    times as fine: within h / 64 of each wall's length. At one phase it is within h of each, and at the default step,
+    one cell, no wall that a ray crosses fully is missed.
     """
     half, cells, phases = 1.0, 8, 64
     targets = 0.7 * (2 * torch.rand(300, 3, generator=scope.generator(), dtype=DOUBLE) - 1.0)
@@ -193,7 +123,7 @@ def thin_shell(scope: Scope) -> Checks:
 
 @case
 def camera_inside(scope: Scope) -> Checks:
-    """From within the cube: the length to its wall, within a step; the default early end errs by 1e-3 at most."""
+    """Render from within the cube: the length to its wall, within a step; the early end errs by 1e-3 at most."""
     for dtype in (DOUBLE, SINGLE):
         origins = (1.8 * torch.rand(500, 3, generator=scope.generator(), dtype=DOUBLE) - 0.9).to(dtype)
         rays = Rays(origins, torch.nn.functional.normalize(scope.normal(500, 3).to(dtype), dim=-1))
@@ -210,9 +140,10 @@ def camera_inside(scope: Scope) -> Checks:
 
 @case
 def grazing_rays(scope: Scope) -> Checks:
-    """Rays almost in the plane of a face, by closed form and a step; on planes between cells no cell counts
-    twice or not at all; in the very plane of a face either side is right. Rays past the object and away from it see
-    exactly 0, with derivatives that are exactly 0.
+    """Render rays almost in the plane of a face, by closed form and a step.
+
+    On planes between cells no cell counts twice or not at all; in the very plane of a face either side is right. Rays
+    past the object and away from it see exactly 0, with derivatives that are exactly 0.
     """
     slopes = (0.0, 1e-12, -1e-12, 1e-9, -1e-9, 1e-6, -1e-6, 1e-3, -1e-3)
     pairs = [(gap, slope) for gap in (1e-3, 1e-2, -1e-3) for slope in slopes]

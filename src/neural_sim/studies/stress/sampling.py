@@ -31,7 +31,7 @@ CAP = 0.1
 
 
 def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
-    """Deviation of a frequency in ``draws`` from p, exceeded with probability ``alarm`` (Bernstein's inequality)."""
+    """Return the deviation of a frequency in ``draws`` from p, exceeded with probability ``alarm`` (Bernstein)."""
     logarithm = math.log(2.0 / alarm)
     linear = logarithm / (3.0 * draws)
     return linear + (linear**2 + 2.0 * p * (1.0 - p) * logarithm / draws).sqrt()
@@ -39,9 +39,10 @@ def bernstein(p: Tensor, draws: int, alarm: float) -> Tensor:
 
 @case
 def one_hot(scope: Scope) -> Checks:
-    """Psi = 1000 on one bin without a floor: p is 1 there to the last bit, log p elsewhere is -1000 to a few
-    roundings, every draw is of that bin (Gumbel noise spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000)
-    underflows to 0.
+    """Draw from psi = 1000 on one bin without a floor.
+
+    p is 1 there to the last bit, log p elsewhere is -1000 to a few roundings, every draw is of that bin (Gumbel noise
+    spans 31 at most), and dp/dpsi = p (1 - p) = exp(-1000) underflows to 0.
     """
     scene = SceneDistribution.of([Pose(floor=0.0)])
     (pose,) = scene.binned
@@ -67,12 +68,11 @@ def one_hot(scope: Scope) -> Checks:
 
 @case
 def floor(scope: Scope) -> Checks:
-    """Psi far below: p = (1 - k f) softmax(psi) + f, with its derivative (1 - k f) s_i (1 - s_i) / p_i of log
-    p_i.
+    """Take p of psi far below: (1 - k f) softmax(psi) + f.
 
-    Rounding: log_softmax of entries of size up to |psi| costs eps |psi| in the exponent, the sum in logaddexp
-    a few eps more. At psi = -800 the derivative is 0 and p is f exactly; the sum over k bins is 1 within k
-    roundings.
+    The derivative of log p_i is (1 - k f) s_i (1 - s_i) / p_i. Rounding: log_softmax of entries of size up to |psi|
+    costs eps |psi| in the exponent, the sum in logaddexp a few eps more. At psi = -800 the derivative is 0 and p is f
+    exactly; the sum over k bins is 1 within k roundings.
     """
     count, smallest = 8, 0.005
     for dtype in (DOUBLE, SINGLE):
@@ -94,12 +94,12 @@ def floor(scope: Scope) -> Checks:
 
 @case
 def temperatures(scope: Scope) -> Checks:
-    """Tau from 1e-4 to 1e3 over the same draws.
+    """Relax the same draws at tau from 1e-4 to 1e3.
 
-    Against the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, 2 eps
-    |z| in the exponent each way: y to exp(4 eps max|z|) - 1 relatively. As tau falls 1 - max y <= (k - 1)
-    exp(-gap / tau); as it rises |y - 1 / k| <= (exp(range / tau) - 1) / k. The derivative (diag y - y y^T) /
-    tau has no entry above 1 / (4 tau).
+    Against the float64 softmax of the same numbers, float32 rounds G + log p and its quotient by tau, 2 eps |z| in the
+    exponent each way: y to exp(4 eps max|z|) - 1 relatively. As tau falls 1 - max y <= (k - 1) exp(-gap / tau); as it
+    rises |y - 1 / k| <= (exp(range / tau) - 1) / k. The derivative (diag y - y y^T) / tau has no entry above 1 / (4
+    tau).
     """
     count, draws = 8, 500
     log_p = torch.log_softmax(scope.normal(count), -1)
@@ -136,8 +136,9 @@ def temperatures(scope: Scope) -> Checks:
 
 @case
 def gumbel_max(scope: Scope) -> Checks:
-    """Frequencies of drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at
-    every tau; the noise is finite where it is drawn for (float64, float32, float16, bfloat16).
+    """Count drawn bins against p, by Bernstein's inequality over all bins, for hard and relaxed draws at every tau.
+
+    The noise is finite where it is drawn for (float64, float32, float16, bfloat16).
     """
     draws = 200_000 if scope.full else 20_000
     for count in (1, 2, 8, 64):
@@ -160,10 +161,9 @@ def gumbel_max(scope: Scope) -> Checks:
 
 @case
 def bin_counts(scope: Scope) -> Checks:
-    """K of 1, 2 and 64: hard draws lie in their bin, also at its very edges.
+    """Draw from k of 1, 2 and 64 bins: hard draws lie in their bin, also at its very edges.
 
-    An angle at an edge belongs to the bin within the rounding of the angle, 4 eps 2 pi; a miss is by that at
-    most.
+    An angle at an edge belongs to the bin within the rounding of the angle, 4 eps 2 pi; a miss is by that at most.
     """
     for dtype in (DOUBLE, SINGLE):
         for count in (1, 2, 64):
@@ -185,11 +185,10 @@ def bin_counts(scope: Scope) -> Checks:
 
 @case
 def opposite_bins(scope: Scope) -> Checks:
-    """Two opposite bins from 0.5 + d and 0.5 - d, where the circular mean has no derivative at d = 0: R = 2
-    d.
+    """Mix two opposite bins, 0.5 + d and 0.5 - d, where the circular mean has no derivative at d = 0: R = 2 d.
 
-    |d angle / dy_i| = R |sin(B_i - angle)| / max(R, cap)^2: at most 1 / cap, and the closed form to the
-    rounding (k + 8) eps / cap^2.
+    |d angle / dy_i| = R |sin(B_i - angle)| / max(R, cap)^2: at most 1 / cap, and the closed form to the rounding (k +
+    8) eps / cap^2.
     """
     count = 8
     angles = (torch.arange(count, dtype=DOUBLE) + 0.5) * CIRCLE / count

@@ -13,11 +13,10 @@ from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope
 
 
 def exact_projection(values: Tensor) -> list[float]:
-    """The projection of one vector without any rounding, from the optimality conditions of the quadratic
-    programme.
+    """Project one vector without any rounding, from the optimality conditions of the quadratic programme.
 
-    ``w = max(v - t, 0)`` with the t that makes the sum 1; the sum falls in t, so among the thresholds that
-    the m largest entries give the largest one is t.
+    ``w = max(v - t, 0)`` with the t that makes the sum 1; the sum falls in t, so among the thresholds that the m
+    largest entries give the largest one is t.
     """
     entries = [Fraction(float(value)) for value in values]
     ordered = sorted(entries, reverse=True)
@@ -49,12 +48,12 @@ def _extremes(dtype: torch.dtype, noise: Tensor) -> dict[str, Tensor]:
 
 @case
 def projection(scope: Scope) -> Checks:
-    """The projection of the very float given, in exact rational arithmetic, against the code.
+    """Project vectors, against the projection of the very float given in exact rational arithmetic.
 
-    Differences to the largest entry are at most 1 after clamping and rounded once (eps / 2 of at most 1), the
-    sum of k of them by k eps, the threshold and the result once more: (k + 4) eps. The weights then sum to 1
-    within k times that. On the plane of sum 1, v - (mean(v) - 1 / k): mean and differences round by k eps max|v|
-    each, and k of them are summed.
+    Differences to the largest entry are at most 1 after clamping and rounded once (eps / 2 of at most 1), the sum of k
+    of them by k eps, the threshold and the result once more: (k + 4) eps. The weights then sum to 1 within k times
+    that. On the plane of sum 1, v - (mean(v) - 1 / k): mean and differences round by k eps max|v| each, and k of them
+    are summed.
     """
     for dtype in (DOUBLE, SINGLE):
         for label, values in _extremes(dtype, scope.normal(64)).items():

@@ -1,27 +1,152 @@
-"""Stage ``stress``: the suite of stiff and extreme cases, as conf/experiment/stress.yaml says."""
+"""``+experiment=stress``: runs families of stiff and extreme cases one after another, and says what failed."""
 
 from __future__ import annotations
 
+import importlib
+import logging
+import math
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
-from neural_sim.studies.stress.cases import Suite
-from neural_sim.studies.stress.report import report
+from tqdm import tqdm
+
+from neural_sim.documents import markdown_table
+from neural_sim.studies.stress.cases import CASES, Check, Checks, Scope
 from neural_sim.tasks.context import Context, TaskFailure
+
+FAMILIES = ("linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer")
+"""One file each, in the order of the loop: its cases are the functions marked ``@case``."""
 
 
 @dataclass(frozen=True)
-class StressStep(Suite):
-    """See :class:`Suite`."""
+class Stress:
+    """Runs every case of ``families``; ``full`` False takes smaller versions of the heavy ones.
+
+    Raises:
+        ValueError: an unknown family, or none.
+    """
+
+    families: Sequence[str] = FAMILIES
+    full: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.families or not set(self.families) <= set(FAMILIES):
+            raise ValueError(
+                f"stress.families wants some of {', '.join(FAMILIES)}, got {list(self.families)}"
+            )
 
     def run(self, context: Context) -> None:
-        """Every check to the run's folder and to MLflow.
+        """Run and publish every check.
 
         Raises:
-            TaskFailure: where a check failed, when all is written.
+            TaskFailure: a check failed, when all is written.
         """
-        config, begun = context.config, time.time()
-        failed = report(self.run_all(config["seed"], config["progress"]), config, context.folder, begun)
+        checks = self.run_all(context.config["seed"], context.config["progress"])
+        (context.folder / "stress.md").write_text(markdown(checks), encoding="utf-8")
+        print(table(checks))
+        context.publish("stress", [check.record() for check in checks], metrics=metrics(checks))
+        failed = failures(checks)
         if failed:
-            raise TaskFailure(f"stress: {failed} checks failed")
+            raise TaskFailure(f"stress: {len(failed)} checks failed")
         context.returned = 0.0
+
+    def run_all(self, seed: int, progress: bool = False) -> list[Check]:
+        """Run all checks; a case that fails or raises does not keep the others from running."""
+        for family in self.families:
+            importlib.import_module(f"{__package__}.{family}")
+        names = [name for family in self.families for name in CASES if name.split("/")[0] == family]
+        shown = tqdm(names, desc="stress", disable=not progress, leave=False)
+        with _quiet():
+            return [check for name in shown for check in run_case(name, Scope(seed, self.full))]
+
+
+def run_case(name: str, scope: Scope) -> Checks:
+    """Yield a case's checks as they come; one that raises, or checks nothing, has failed."""
+    checks, count = CASES[name](scope), 0
+    while True:
+        begin, ended = time.perf_counter(), True
+        try:
+            check = next(checks, None)
+            ended = check is None
+        except Exception as error:  # whatever a case raises is its result
+            check = Check("runs to its end", math.nan, 0.0, f"{type(error).__name__}: {error}".split("\n")[0])
+        if check is None and count == 0:
+            check = Check("checks something", math.nan, 0.0, "no check")
+        if check is not None:
+            yield replace(check, case=name, seconds=time.perf_counter() - begin)
+        if ended:
+            return
+        count += 1
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep warnings out of the log: the cases provoke them, and statuses are what they check."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def failures(checks: Sequence[Check]) -> list[Check]:
+    """Return the checks that failed."""
+    return [check for check in checks if not check.passed]
+
+
+def _by_case(checks: Sequence[Check]) -> dict[str, list[Check]]:
+    cases: dict[str, list[Check]] = {}
+    for check in checks:
+        cases.setdefault(check.case, []).append(check)
+    return cases
+
+
+def metrics(checks: Sequence[Check]) -> dict[str, float]:
+    """Return what MLflow keeps: counts, and of each case failures, the part of a tolerance used up, and seconds."""
+    found = {"checks": float(len(checks)), "failed": float(len(failures(checks)))}
+    for name, own in _by_case(checks).items():
+        found |= {
+            f"{name}/failed": float(len(failures(own))),
+            f"{name}/used": max(check.used for check in own),
+            f"{name}/seconds": sum(check.seconds for check in own),
+        }
+    return found
+
+
+def table(checks: Sequence[Check]) -> str:
+    """Return a line a case (checks, the largest part of a tolerance used up, seconds), then what failed."""
+    lines = [f"{'case':<38}{'checks':>7}{'failed':>7}{'used':>9}{'seconds':>9}"]
+    for name, own in _by_case(checks).items():
+        used = max(check.used for check in own)
+        spent = sum(check.seconds for check in own)
+        lines.append(f"{name:<38}{len(own):>7}{len(failures(own)):>7}{used:>9.1g}{spent:>9.2f}")
+    wrong = failures(checks)
+    lines += [
+        f"FAILED {c.case}: {c.quantity}: {c.value:.3g}, tolerance {c.tolerance:.3g} {c.status}" for c in wrong
+    ]
+    spent = sum(check.seconds for check in checks)
+    lines.append(f"{len(checks)} checks in {len(_by_case(checks))} cases, {len(wrong)} failed, {spent:.1f} s")
+    return "\n".join(lines)
+
+
+def markdown(checks: Sequence[Check]) -> str:
+    """Return every check as a table, case by case."""
+    parts = ["# Stress suite", f"{len(checks)} checks, {len(failures(checks))} failed."]
+    head = ["quantity", "value", "tolerance", "status", "", "seconds"]
+    for name, own in _by_case(checks).items():
+        rows = [
+            (
+                check.quantity,
+                f"{check.value:.3g}",
+                f"{check.tolerance:.3g}",
+                check.status,
+                "passed" if check.passed else "**failed**",
+                f"{check.seconds:.3f}",
+            )
+            for check in own
+        ]
+        parts += [f"## {name}", markdown_table(head, rows)]
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,101 @@
+"""What cases render and train: a cube and a ball of constant density, their closed forms, and a small detector."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neural_sim.detector.retinanet import RetinaNet
+from neural_sim.detector.settings import Anchors, Head
+from neural_sim.field.grid import EMPTY_DENSITY, GridField
+from neural_sim.field.mlp import MLPField
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.studies.stress.cases import DOUBLE, SINGLE, eps
+from neural_sim.types import Rays
+
+EXACT = NerfRenderer(termination=0.0)
+
+
+def raw_density(sigma: float, cell: float) -> float:
+    """Return the table entry whose softplus over the cell's edge is ``sigma``."""
+    depth = sigma * cell
+    return depth + math.log(-math.expm1(-depth)) if depth > 0.0 else EMPTY_DENSITY
+
+
+def block(
+    sigma: float, dtype: torch.dtype = SINGLE, half: float = 1.0, cells: int = 8, step_cells: float = 1.0,
+    colour: float = 0.0, hollow: bool = False,
+) -> GridField:  # fmt: skip
+    """Make a cube of constant density round the origin; ``hollow`` leaves only its outermost cells."""
+    field = GridField(step_cells=step_cells, density_gain=1.0).to(dtype)
+    occupied = torch.ones(cells, cells, cells, dtype=torch.bool)
+    if hollow:
+        occupied[1:-1, 1:-1, 1:-1] = False
+    cell = 2.0 * half / cells
+    field.reset(occupied, torch.full((3,), -half, dtype=dtype), cell)
+    with torch.no_grad():
+        field.table[:-1, 0] = raw_density(sigma, cell)
+        field.table[:-1, 1:] = colour
+    return field.eval().requires_grad_(False)
+
+
+def ball(sigma: float, dtype: torch.dtype = SINGLE) -> MLPField:
+    """Make the network with all weights zero: constant density in the unit sphere."""
+    scale = 1.0 if sigma == 0.0 else sigma
+    field = MLPField(
+        width=4, depth=2, position_frequencies=1, direction_frequencies=1, density_scale=scale
+    ).to(dtype)
+    with torch.no_grad():
+        for name, value in field.named_parameters():
+            value.zero_()
+            if name.endswith("sigma.bias"):
+                value.fill_(EMPTY_DENSITY if sigma == 0.0 else math.log(math.expm1(1.0)))
+    return field.eval().requires_grad_(False)
+
+
+def chord(rays: Rays, half: float) -> Tensor:
+    """Return the length of each ray inside the cube [-half, half]^3, by its six planes, in float64."""
+    origins, directions = rays.origins.double(), rays.directions.double()
+    inside = origins.abs() < half
+    with torch.no_grad():
+        low, high = (-half - origins) / directions, (half - origins) / directions
+        near, far = torch.minimum(low, high), torch.maximum(low, high)
+        parallel = directions == 0.0
+        near = torch.where(parallel, torch.where(inside, -math.inf, math.inf), near)
+        far = torch.where(parallel, torch.where(inside, math.inf, -math.inf), far)
+    return (far.amin(-1) - near.amax(-1).clamp_min(0.0)).clamp_min(0.0)
+
+
+def opacity_of(depth: Tensor | float) -> Tensor:
+    """Return the opacity of an optical depth, by Beer and Lambert's law."""
+    return -torch.expm1(-torch.as_tensor(depth, dtype=DOUBLE).clamp_min(0.0))
+
+
+def outside(opacity: Tensor, sigma: float, shortest: Tensor, longest: Tensor) -> float:
+    """Return how far opacities lie outside those of lengths from ``shortest`` to ``longest``."""
+    low, high = opacity_of(sigma * shortest), opacity_of(sigma * longest)
+    return float(torch.maximum(low - opacity.double(), opacity.double() - high).clamp_min(0.0).max())
+
+
+def rounding_of(sigma: float, dtype: torch.dtype, cell: float = 0.25) -> float:
+    """Return what the table's entry and a ray's sum of samples may round an opacity by."""
+    return (abs(raw_density(sigma, cell)) + 32) * eps(dtype) if sigma else 0.0
+
+
+def running_sum(samples: int, depth: float) -> float:
+    """Return what the running sum over a pack may lose, for the sum of optical depths of all its samples."""
+    return samples * eps(DOUBLE) * (min(depth, 50.0 * samples) + samples)
+
+
+def along_x(*offsets: tuple[float, float], dtype: torch.dtype = SINGLE, start: float = 3.0) -> Rays:
+    """Make rays along -x from ``start``, at the given y and z."""
+    origins = torch.tensor([[start, y, z] for y, z in offsets], dtype=dtype)
+    directions = torch.tensor([[-1.0, 0.0, 0.0]], dtype=dtype).expand(len(offsets), 3)
+    return Rays(origins, directions.contiguous())
+
+
+def small_detector(num_classes: int) -> RetinaNet:
+    """Make a RetinaNet for images of 32 x 32 pixels."""
+    return RetinaNet(num_classes, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
