@@ -27,7 +27,7 @@ def world():
 
 
 def test_every_estimator_has_a_point_for_every_number_of_images(world):
-    family = Estimators((4, 8), default=16, repeats=1, truth_per_bin=6, pathwise=("circular, boxes",))
+    family = Estimators((4, 8), default=16, repeats=1, truth_per_bin=6, pathwise=("circular",))
     error, cosines = family.measure(world, Timing(1), 0)
     assert [error.name, cosines.name] == ["estimator/relative error", "estimator/1 - cosine"]
     counts = {}
@@ -35,7 +35,7 @@ def test_every_estimator_has_a_point_for_every_number_of_images(world):
         counts.setdefault(point.line, []).append(int(point.setting.split()[-2]))
     # Strata want two images of each of four bins, for the noise; the default is measured beside the others.
     assert counts == {
-        "pathwise, circular, boxes": [4, 8], "stratified": [8, 16], "stratified, shrunk": [8, 16], "reinforce": [4, 8]
+        "pathwise, circular": [4, 8], "stratified": [8, 16], "stratified, shrunk": [8, 16], "reinforce": [4, 8]
     }  # fmt: skip
     assert [point.setting for point in error.points if point.default] == ["stratified, 16 images"]
     assert all(math.isfinite(p.error) and p.seconds > 0.0 for p in (*error.points, *cosines.points))
