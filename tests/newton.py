@@ -12,11 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import HessianOperator, Term
-from neural_sim.solver.operator import Matvec, Shifted, dot, norm
-from neural_sim.solver.solution import Status
+from neural_sim.solver.operator import Matvec, Shifted, dot, flatten, norm, unflatten
 
 
 @dataclass(frozen=True)

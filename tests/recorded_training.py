@@ -12,7 +12,7 @@ from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.unrolled import Examples
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 
 DOUBLE = torch.float64

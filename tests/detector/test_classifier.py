@@ -15,7 +15,7 @@ from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.settings import Backbone
 from neural_sim.detector.targets import IGNORED
 from neural_sim.detector.training import train_detector
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 
 

@@ -19,7 +19,7 @@ from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.detector.targets import BACKGROUND
 from neural_sim.detector.training import train_detector
 from neural_sim.extras import require
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 
 SIZE = 64
 

@@ -18,7 +18,7 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.motion import pose_rates
 from neural_sim.synthesis.training_set import Synthesizer

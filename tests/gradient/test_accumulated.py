@@ -22,7 +22,7 @@ from neural_sim.gradient.stratified import stratified
 from neural_sim.gradient.unrolled import Examples, reversed_steps
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import SceneDraw
 
 RULE = AdamW(0.05)

@@ -19,13 +19,12 @@ from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
-from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.operator import Shifted
-from neural_sim.solver.solution import Status
+from neural_sim.solver.operator import Shifted, flatten, unflatten
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import moved_by
 from neural_sim.synthesis.scene import Scene

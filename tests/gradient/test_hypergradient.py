@@ -11,9 +11,9 @@ from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.stratified import importance_weights, stratified
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
-from neural_sim.solver.solution import Status
 from neural_sim.synthesis.motion import moved_by
 
 DOUBLE = torch.float64

@@ -15,7 +15,7 @@ from neural_sim.detector.settings import Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
 from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.unrolled import Examples, reversed_steps
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.operator import flatten, unflatten
 
 
 @pytest.fixture(scope="module")

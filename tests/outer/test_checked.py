@@ -12,8 +12,8 @@ from neural_sim.outer.checked import CheckedSteps
 from neural_sim.outer.settings import Checks, Trust
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.solver.base import Solution, Status
 from neural_sim.solver.damping import Damped
-from neural_sim.solver.solution import Solution, Status
 
 POSE = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi)
 NAMES = ("a", "b")

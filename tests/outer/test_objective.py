@@ -10,8 +10,8 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.smooth_accuracy import SmoothAccuracy
 from neural_sim.detector.smooth_ap import SmoothAP
 from neural_sim.outer.objective import Objective
-from neural_sim.solver.flatten import flatten, unflatten
 from neural_sim.solver.hvp import gradient
+from neural_sim.solver.operator import flatten, unflatten
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from neural_sim.gradient.base import Probes
 from neural_sim.gradient.hypergradient import hypergradient
 from neural_sim.outer.response import centred_cosine
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping
-from neural_sim.solver.exact import Exact
-from neural_sim.solver.solution import Status
+from neural_sim.solver.direct import Exact
 from neural_sim.types import LabelledImages
 
 DOUBLE = torch.float64

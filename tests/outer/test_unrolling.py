@@ -25,8 +25,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Status
 from neural_sim.solver.hvp import gradient
-from neural_sim.solver.solution import Status
 
 MICRO = {
     "backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)), reference=48), "head": Head(8, 1)

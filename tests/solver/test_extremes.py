@@ -7,12 +7,11 @@ import math
 import pytest
 import torch
 
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.exact import Exact
-from neural_sim.solver.identity import Identity
+from neural_sim.solver.direct import Exact, Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import norm
-from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
 SIZE = 24

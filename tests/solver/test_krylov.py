@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.base import Search
+from neural_sim.solver.base import Search, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.solver.exact import Exact
+from neural_sim.solver.direct import Exact
 from neural_sim.solver.lanczos import lanczos
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted
-from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
 

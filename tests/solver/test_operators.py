@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
-from neural_sim.solver.exact import Exact
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.lanczos import lanczos, random_start
-from neural_sim.solver.operator import Shifted, columns
-from neural_sim.solver.solution import Status
+from neural_sim.solver.operator import Shifted, columns, flatten, unflatten
 
 DOUBLE = torch.float64
 MODES = ["reverse_over_reverse", "central_difference"]

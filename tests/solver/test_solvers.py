@@ -10,10 +10,10 @@ import pytest
 import scipy.sparse.linalg
 import torch
 
+from neural_sim.solver.base import Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.identity import Identity
+from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.solution import Status
 
 DOUBLE = torch.float64
 SIZE = 24

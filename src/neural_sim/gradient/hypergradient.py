@@ -21,11 +21,10 @@ from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
 from neural_sim.gradient.unrolled import Examples, Wanted
 from neural_sim.solver.adjoint import Adjoint, AdjointSolver
+from neural_sim.solver.base import Solution, Status
 from neural_sim.solver.damping import Damped
-from neural_sim.solver.flatten import unflatten
 from neural_sim.solver.hvp import Term, gradient
-from neural_sim.solver.operator import norm
-from neural_sim.solver.solution import Solution, Status
+from neural_sim.solver.operator import norm, unflatten
 
 Estimate = Callable[[Params], MixedDerivative]
 UnrolledEstimate = Callable[[Accumulated], MixedDerivative]

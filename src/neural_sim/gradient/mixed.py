@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.base import ImageLoss, IndexedLoss, Params
-from neural_sim.solver.flatten import flatten
 from neural_sim.solver.hvp import difference_length
+from neural_sim.solver.operator import flatten
 
 ThetaMode = Literal["forward", "central_difference"]
 

@@ -24,8 +24,7 @@ from torch import Tensor
 from neural_sim.detector.optimiser import pulled_back
 from neural_sim.detector.trajectory import Trajectory
 from neural_sim.gradient.base import Params
-from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.operator import plain_norm
+from neural_sim.solver.operator import flatten, plain_norm, unflatten
 
 Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
 Wanted = Literal["probes", "weights", "inputs"]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.settings import OnUntrusted, Trust
-from neural_sim.solver.solution import Status
+from neural_sim.solver.base import Status
 
 Action = Literal["kept", "shrunk", "waited", "skipped", "stopped"]
 _ACTIONS: Mapping[OnUntrusted, Action] = {

@@ -21,8 +21,8 @@ from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.inner import InnerLoop
 from neural_sim.parameter.factor import Factor
+from neural_sim.solver.base import Solution, Status
 from neural_sim.solver.damping import Damped
-from neural_sim.solver.solution import Solution, Status
 from neural_sim.synthesis.assembly import RenderedImages
 
 PART = 0.15

@@ -11,20 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.base import LinearSolver
+from neural_sim.solver.base import LinearSolver, Solution, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import Damped, Damping, LanczosDamping
 from neural_sim.solver.hvp import HessianOperator, Mode, Term
 from neural_sim.solver.operator import Matvec, Shifted
-from neural_sim.solver.solution import Solution, Status
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Adjoint:
-    """The solution and its damping. ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at
-    twice the final lambda, None unless asked for. The solution's ``products`` are those of all these solves.
+    """The solution and its damping.
+
+    ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at twice the final lambda, None unless
+    asked for. The solution's ``products`` are those of all these solves.
     """
 
     solution: Solution
@@ -35,6 +36,7 @@ class Adjoint:
 
     @property
     def vector(self) -> Float[Tensor, "n"]:
+        """``(H + lambda I)^-1 b``."""
         return self.solution.value
 
 
@@ -69,9 +71,7 @@ class AdjointSolver:
         x0: Float[Tensor, "n"] | None,
         generator: torch.Generator,
     ) -> Adjoint:
-        """V for the right-hand side ``b``, warm-started from ``x0``; ``generator`` seeds a random
-        Lanczos start.
-        """
+        """Solve for the right-hand side ``b``, warm-started from ``x0``; ``generator`` draws a Lanczos start."""
         began = time.perf_counter()
         operator = self.operator(terms, params)
         damped = self.damping.choose(operator, b, generator)
@@ -99,10 +99,10 @@ class AdjointSolver:
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
 
     def operator(self, terms: Sequence[Term], params: Mapping[str, Tensor]) -> Matvec:
-        """Products with the undamped Hessian."""
+        """Make the operator of products with the undamped Hessian."""
         return HessianOperator(terms, params, self.mode, self.retain_graph)
 
 
 def _after(other: Solution, solution: Solution) -> Solution:
-    """The solution with the products of another solve added to its own."""
+    """Add the products of another solve to the solution's own."""
     return replace(solution, products=other.products + solution.products)

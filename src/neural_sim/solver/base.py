@@ -1,8 +1,9 @@
-"""Base of all solvers: scaling, warm start, recomputed residual, status. Each solver adds its iteration."""
+"""Base of all solvers: scaling, warm start, recomputed residual, and a result that says how far to trust it."""
 
 from __future__ import annotations
 
 import abc
+import enum
 import logging
 import math
 from dataclasses import dataclass, replace
@@ -12,9 +13,44 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
-from neural_sim.solver.solution import Solution, Status
 
 logger = logging.getLogger(__name__)
+
+
+class Status(enum.Enum):
+    """How a solve ended; the value says what to change."""
+
+    CONVERGED = "residual below tolerance"
+    APPROXIMATE = "a fixed approximation, not iterated to a tolerance: read the residual"
+    MAX_STEPS = "step budget spent: raise max_steps or damping"
+    STAGNATED = "residual stopped falling: the limit of this arithmetic, raise damping or precision"
+    NEGATIVE_CURVATURE = "operator is not positive definite: raise damping"
+    LEAST_SQUARES = "singular and inconsistent: the value minimises the residual, which cannot vanish"
+    SINGULAR = "operator is singular to rounding: the value is the minimum-norm solution on its range"
+    UNROLLED = "no system was solved: the derivative is that of the training that was run"
+    MEASURED = "no system was solved: trainings were compared"
+    NON_FINITE = "operator, right-hand side or solution is not finite"
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of ``A x = b``; every field is finite whatever the inputs were.
+
+    ``residual`` is ``|b - A x| / |b|`` recomputed from a fresh product, never the recursion's, hence
+    unchanged when A and b are rescaled; 0 for b = 0, and 1 where no value is finite and ``value`` is
+    zero. Only an APPROXIMATE value may have a residual above 1. ``curvature`` is the smallest and largest
+    Rayleigh quotient ``p^T A p / p^T p`` of all products taken (0, 0 if none). ``products`` counts all
+    applications of A, ``steps`` the solver's own iterations. ``warm_started`` says whether x0 was used (it is
+    dropped when its residual is no better than that of zero).
+    """
+
+    value: Float[Tensor, "n"]
+    status: Status
+    steps: int
+    residual: float
+    curvature: tuple[float, float]
+    products: int
+    warm_started: bool
 
 
 @dataclass(frozen=True)
@@ -32,8 +68,10 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Search:
-    """State of a search by conjugate directions, to be continued: iterate, ``b - A value`` by the recurrence, and next
-    direction. Solvers other than conjugate gradients use the iterate alone.
+    """State of a search by conjugate directions, to be continued.
+
+    ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next one. Solvers other than conjugate
+    gradients use the iterate ``value`` alone.
     """
 
     value: Float[Tensor, "n"]
@@ -41,7 +79,7 @@ class Search:
     direction: Float[Tensor, "n"]
 
     def divided(self, scale: float) -> Search:
-        """The same search for the right-hand side over ``scale``."""
+        """Divide the right-hand side, and with it the whole state, by ``scale``."""
         return Search(self.value / scale, self.residual / scale, self.direction / scale)
 
 
@@ -78,11 +116,20 @@ class LinearSolver(abc.ABC):
         rtol: float = 1e-3,
         max_steps: int = 40,
     ) -> Solution:
-        """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps, starting from ``x0`` (default
-        0), a vector or a search to continue.
+        """Solve to ``|b - A x| <= rtol |b|`` in at most ``max_steps`` steps.
 
-        Bad numbers give a status, never a NaN. Raises ``ValueError`` for shapes and settings that make no
-        sense.
+        Args:
+            matvec: products with A.
+            b: the right-hand side.
+            x0: where to start, a vector or a search to continue; None: at zero.
+            rtol: relative residual at which to stop.
+            max_steps: most steps; what a step costs depends on the solver.
+
+        Returns:
+            The solution and its status. Bad numbers give a status, never a NaN.
+
+        Raises:
+            ValueError: shapes or settings that make no sense.
         """
         _check(b, x0.value if isinstance(x0, Search) else x0, rtol, max_steps)
         operator = Watched(matvec)
@@ -122,14 +169,14 @@ class LinearSolver(abc.ABC):
 
 
 def _verified(claimed: Status, residual: float, rtol: float) -> Status:
-    """The status that the recomputed residual supports."""
+    """Reduce a claimed status to what the recomputed residual supports."""
     if residual <= rtol and claimed is not Status.SINGULAR:
         return Status.CONVERGED
     return Status.STAGNATED if claimed is Status.CONVERGED else claimed
 
 
 def _power_of_two(size: float) -> float:
-    """The power of two below ``size``: scaling by it is exact, so the scaled residual is the original one's."""
+    """Find the power of two below ``size``: scaling by it is exact, so the scaled residual is the original one's."""
     return 2.0 ** (math.frexp(size)[1] - 1)
 
 
@@ -150,7 +197,7 @@ def _started(
     tolerance: float,
     max_steps: int,
 ) -> System:
-    """The system at the guess where its residual beats that of zero (which is 1), else at zero."""
+    """Start the system at the guess where its residual beats that of zero (which is 1), else at zero."""
     cold = System(operator, rhs, torch.zeros_like(rhs), rhs, None, tolerance, max_steps)
     value = guess.value if isinstance(guess, Search) else guess
     if value is None or not bool(torch.isfinite(value).all()) or not bool(value.any()):
@@ -171,7 +218,11 @@ def _started(
 
 
 def check_restart_gain(solver: str, restart_gain: float) -> None:
-    """Raises ``ValueError`` unless the factor by which a restart must shrink the residual lies in (0, 1)."""
+    """Check the factor by which a restart must shrink the residual.
+
+    Raises:
+        ValueError: it does not lie in (0, 1).
+    """
     if not 0.0 < restart_gain < 1.0:
         raise ValueError(f"{solver}: restart_gain must lie in (0, 1), got {restart_gain}")
 

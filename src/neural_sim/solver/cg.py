@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from typing_extensions import override
 
-from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
+from neural_sim.solver.base import Iterate, LinearSolver, Status, System, check_restart_gain
 from neural_sim.solver.operator import dot, in_range, norm, numbers, plain_dot, plain_norm
-from neural_sim.solver.solution import Status
 
 
 @dataclass(frozen=True)
 class ConjugateGradient(LinearSolver):
-    """For positive definite operators. ``restart_gain``: where the recursion's residual converges and the recomputed
-    one does not, iteration restarts from the latter, as long as each restart shrinks it by this factor.
+    """Conjugate gradients, for positive definite operators.
+
+    ``restart_gain``: where the recursion's residual converges and the recomputed one does not, iteration restarts from
+    the latter, as long as each restart shrinks it by this factor.
     """
 
     restart_gain: float = 0.5
@@ -22,14 +24,15 @@ class ConjugateGradient(LinearSolver):
     def __post_init__(self) -> None:
         check_restart_gain("cg", self.restart_gain)
 
+    @override
     def iterate(self, system: System) -> Iterate:
-        """Iterate from the start, or go on with a search where the system has its direction."""
         operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
         value = best = system.start
         residual = system.residual
         confirmed = best_norm = norm(residual)
         if confirmed <= tolerance:
             return Iterate(best, Status.CONVERGED, 0, confirmed)
+        # A direction given is that of a search to go on with.
         direction = residual if system.direction is None else system.direction
         energy = dot(residual, residual)
         for step in range(1, system.max_steps + 1):

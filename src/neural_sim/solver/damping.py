@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.solver.base import Search
 from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
@@ -35,7 +36,7 @@ class Damped:
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
     def search(self, times: float = 1.0) -> Search | None:
-        """The solve at ``times`` lambda from the estimate's own products; None without them."""
+        """Solve at ``times`` lambda from the estimate's own products; None without them."""
         return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
@@ -44,17 +45,16 @@ class Damping(abc.ABC):
 
     @abc.abstractmethod
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
-        """Lambda for ``matvec`` and the right-hand side ``b``."""
+        """Choose lambda for ``matvec`` and the right-hand side ``b``."""
 
     def raised(self, damped: Damped, lowest: float) -> Damped | None:
-        """A larger lambda after a solve met the curvature ``lowest`` < -lambda, or None: lambda is fixed."""
+        """Raise lambda after a solve met the curvature ``lowest`` < -lambda; None: lambda is fixed."""
         return None
 
 
 @dataclass(frozen=True)
 class FixedDamping(Damping):
-    """A given lambda, for instance 0 where the inner problem's own proximal term already bounds its
-    curvature.
+    """A given lambda, for instance 0 where the inner problem's own proximal term bounds its curvature.
 
     ``lanczos_steps`` > 0 estimates the spectrum all the same, for the log.
     """
@@ -65,13 +65,14 @@ class FixedDamping(Damping):
     def __post_init__(self) -> None:
         _check("fixed", self.value, self.lanczos_steps)
 
+    @override
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
 @dataclass(frozen=True)
 class LanczosDamping(Damping):
-    """lambda past the most negative curvature, and large enough for a wanted condition number.
+    """A lambda past the most negative curvature, and large enough for a wanted condition number.
 
     With the Ritz value lowered by its own error bound, ``m = smallest - error``:
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
@@ -96,6 +97,7 @@ class LanczosDamping(Damping):
                 f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
             )
 
+    @override
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         # A zero or non-finite right-hand side has no Krylov space; the solve reports it.
         usable = bool(torch.isfinite(b).all()) and bool(b.any())
@@ -111,6 +113,7 @@ class LanczosDamping(Damping):
         value = self._past(spectrum.smallest - spectrum.smallest_error, spectrum.largest)
         return Damped(value, spectrum, spectrum.krylov if usable else None)
 
+    @override
     def raised(self, damped: Damped, lowest: float) -> Damped:
         largest = damped.spectrum.largest if damped.spectrum is not None else 0.0
         return Damped(max(2.0 * damped.value, self._past(lowest, largest)), damped.spectrum, damped.krylov)

@@ -13,21 +13,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.solver.flatten import flatten, unflatten
-from neural_sim.solver.operator import columns, norm
+from neural_sim.solver.operator import columns, flatten, norm, unflatten
 
 Term = Callable[[dict[str, Tensor]], Tensor]
 Mode = Literal["reverse_over_reverse", "central_difference"]
 
 
 class HessianOperator:
-    """``vector -> H vector`` for ``H`` the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
+    """The operator ``vector -> H vector``, H the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
 
-    Vectors are flattened in the order of ``params``. Modes: ``reverse_over_reverse`` (exact) and
-    ``central_difference`` (two gradients at ``theta +- h v``; error of relative order eps^(2/3)).
-    ``retain_graph`` keeps the first gradient's graph of all terms for reverse_over_reverse: a product falls
-    to one backward pass, memory grows to all chunks. Raises ``ValueError`` without terms or for an unknown
-    mode.
+    Args:
+        terms: of the loss.
+        params: the point; vectors are flattened in this order.
+        mode: ``reverse_over_reverse`` (exact) or ``central_difference`` (two gradients at ``theta +- h v``; error of
+            relative order eps^(2/3)).
+        retain_graph: keep the first gradient's graph of all terms for reverse_over_reverse: a product falls to one
+            backward pass, memory grows to all chunks.
+
+    Raises:
+        ValueError: no terms, or an unknown mode.
     """
 
     def __init__(
@@ -51,19 +55,21 @@ class HessianOperator:
 
     @property
     def size(self) -> int:
+        """Number of parameters."""
         return self._point.numel()
 
     def gradient(self, at: Float[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
-        """The loss's gradient at ``params``, or at the flattened point ``at``."""
+        """Differentiate the loss at ``params``, or at the flattened point ``at``."""
         return gradient(self._terms, self._params if at is None else unflatten(at, self._params))
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Multiply a vector."""
         if self._mode == "central_difference":
             return self._central_difference(vector)
         return self._reverse_over_reverse(vector)
 
     def dense(self, batch: int = 64) -> Float[Tensor, "n n"]:
-        """The matrix itself: ``batch`` columns at a time on a retained graph, else one product a column."""
+        """Build the matrix: ``batch`` columns at a time on a retained graph, else one product a column."""
         if self._retained is None:
             return columns(self, self._point)
         basis = torch.eye(self.size, dtype=self._point.dtype, device=self._point.device)
@@ -80,7 +86,7 @@ class HessianOperator:
         return total
 
     def _gradient_graphs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """For each term a leaf point, and the gradient there with its graph."""
+        """Yield for each term a leaf point, and the gradient there with its graph."""
         for term in self._terms:
             point = self._point.clone().requires_grad_()
             with torch.enable_grad():
@@ -107,7 +113,7 @@ class HessianOperator:
 
 
 def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
-    """H of the central difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
+    """Choose h of the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
 
     Truncation (h |vector|)^2 and rounding eps / (h |vector|) balance at eps^(1/3), relative to the point's own size.
     """
@@ -117,7 +123,7 @@ def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> 
 
 
 def gradient(terms: Sequence[Term], params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
-    """The flattened gradient of ``sum(term(params) for term in terms)``, one term in memory at a time."""
+    """Differentiate ``sum(term(params) for term in terms)``, flattened, with one term in memory at a time."""
     if not terms:
         raise ValueError("gradient: got no loss terms, want at least one")
     leaves = {name: tensor.detach().requires_grad_() for name, tensor in params.items()}

@@ -26,9 +26,9 @@ class Krylov:
     beyond: Float[Tensor, "n"]
 
     def search(self, shift: float) -> Search | None:
-        """Where m steps of conjugate gradients from zero on ``(A + shift I) x = b`` end; no products, whatever the
-        shift (Krylov spaces do not depend on it). None where the shifted matrix is not positive definite on this
-        space.
+        """Find where m steps of conjugate gradients from zero on ``(A + shift I) x = b`` end, without a product.
+
+        Krylov spaces do not depend on the shift. None where the shifted matrix is not positive definite on this space.
 
         With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m: the value is Q y, its residual r = -y_m
         times ``beyond``, and Q z the only direction in the space that is conjugate to all others before it, which
@@ -50,8 +50,7 @@ class Krylov:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Extreme Ritz values. Some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the
-    largest).
+    """Extreme Ritz values: some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the largest).
 
     ``finite`` is False where the operator returned inf or nan; the values are those found until then (0 if
     none). ``krylov`` is the space that was searched, None if no product was finite.
@@ -72,12 +71,13 @@ class Spectrum:
 
 
 def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
-    """Ritz values of a symmetric operator after at most ``steps`` products from ``start`` (any non-zero
-    vector).
+    """Find Ritz values of a symmetric operator by at most ``steps`` products from ``start``, any non-zero vector.
 
-    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue that the
-    start vector has a part in. Memory: steps vectors. Raises ``ValueError`` for a zero or non-finite start or
-    steps < 1.
+    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue that the start
+    vector has a part in. Memory: ``steps`` vectors.
+
+    Raises:
+        ValueError: a start that is zero or not finite, or fewer steps than 1.
     """
     if steps < 1:
         raise ValueError(f"lanczos: steps must be at least 1, got {steps}")
@@ -124,7 +124,7 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
 def random_start(
     size: int, generator: torch.Generator, *, dtype: torch.dtype, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """A Gaussian start vector, which almost surely has a part in every eigenvector."""
+    """Draw a Gaussian start vector, which almost surely has a part in every eigenvector."""
     return torch.randn(size, generator=generator, dtype=dtype, device=generator.device).to(device)
 
 

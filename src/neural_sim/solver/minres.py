@@ -8,16 +8,18 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.solver.base import Iterate, LinearSolver, System, check_restart_gain
+from neural_sim.solver.base import Iterate, LinearSolver, Status, System, check_restart_gain
 from neural_sim.solver.operator import Watched, dot, norm
-from neural_sim.solver.solution import Status
 
 
 @dataclass(frozen=True)
 class MinimumResidual(LinearSolver):
-    """For any symmetric operator. The residual falls monotonically; on an inconsistent singular system it
-    ends at a least-squares solution and says so. ``restart_gain`` as in ``ConjugateGradient``.
+    """Minimum residuals, for any symmetric operator.
+
+    The residual falls monotonically. On an inconsistent singular system it ends at a least-squares solution and says
+    so. ``restart_gain`` as in ``ConjugateGradient``.
     """
 
     restart_gain: float = 0.5
@@ -25,6 +27,7 @@ class MinimumResidual(LinearSolver):
     def __post_init__(self) -> None:
         check_restart_gain("minres", self.restart_gain)
 
+    @override
     def iterate(self, system: System) -> Iterate:
         operator, rhs, tolerance = system.operator, system.rhs, system.tolerance
         value, steps = system.start, 0
@@ -52,8 +55,10 @@ class MinimumResidual(LinearSolver):
 
 
 def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
-    """Whether ``|A r| <= 10 sqrt(eps) |A| |r|`` of the true residual: the recurrence's own estimate is of a residual
-    that rounding no longer lets it reach where the condition number exceeds 1 / sqrt(eps).
+    """Whether ``|A r| <= 10 sqrt(eps) |A| |r|`` for the true residual.
+
+    The recurrence's own estimate is of a residual that rounding no longer lets it reach where the condition number
+    exceeds 1 / sqrt(eps).
     """
     limit = 10.0 * torch.finfo(residual.dtype).eps ** 0.5 * max(abs(end) for end in operator.curvature)
     return norm(operator(residual)) <= limit * norm(residual)
@@ -71,7 +76,7 @@ class _Cycle:
 
 
 def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, budget: int) -> _Cycle:
-    """Lanczos three-term recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
+    """Run Lanczos' recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
     eta = norm(residual)  # the signed residual norm: last entry of the rotated right-hand side
     basis, before = residual / eta, torch.zeros_like(residual)
     direction, older = torch.zeros_like(residual), torch.zeros_like(residual)

@@ -1,9 +1,9 @@
-"""Linear operators as callables: the shift, a wrapper that counts and checks products, the dense matrix."""
+"""Vectors and linear operators: flat parameters, norms, the shift, a wrapper that counts and checks products."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -13,43 +13,72 @@ from torch import Tensor
 Matvec = Callable[[Tensor], Tensor]
 
 
+def flatten(params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
+    """Join all entries of parameters in one vector, in the dictionary's own order; differentiable.
+
+    Raises:
+        ValueError: an empty dictionary.
+    """
+    if not params:
+        raise ValueError("flatten: got no parameters, want at least one")
+    return torch.cat([tensor.reshape(-1) for tensor in params.values()])
+
+
+def unflatten(vector: Float[Tensor, "n"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Split a vector as ``flatten`` joined it, by names and shapes of ``like``; views, differentiable.
+
+    Raises:
+        ValueError: a vector of another length.
+    """
+    wanted = sum(tensor.numel() for tensor in like.values())
+    if vector.shape != (wanted,):
+        raise ValueError(
+            f"unflatten: got shape {tuple(vector.shape)}, want ({wanted},) for {len(like)} parameters"
+        )
+    pieces = vector.split([tensor.numel() for tensor in like.values()])
+    return {
+        name: piece.view(tensor.shape) for (name, tensor), piece in zip(like.items(), pieces, strict=True)
+    }
+
+
 class NonFiniteProduct(ArithmeticError):
     """An operator returned inf or nan. Raised by ``Watched`` and turned into a status by the solver's base."""
 
 
 @dataclass(frozen=True)
 class Shifted:
-    """``x -> A x + shift x``: a Hessian with its damping."""
+    """The operator ``x -> A x + shift x``: a Hessian with its damping."""
 
     matvec: Matvec
     shift: float
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Multiply a vector."""
         return self.matvec(vector) + self.shift * vector
 
 
 def numbers(*scalars: Float[Tensor, ""]) -> list[float]:
-    """Several scalars as Python numbers, by one transfer: the host waits for the device once."""
+    """Read several scalars as Python numbers by one transfer: the host waits for the device once."""
     return torch.stack([scalar.double() for scalar in scalars]).tolist()
 
 
 def plain_norm(vector: Tensor) -> Float[Tensor, ""]:
-    """Euclidean norm accumulated in float64, where squares stay in its range; still on the device."""
+    """Take the Euclidean norm in float64, where squares stay in its range; still on the device."""
     return torch.linalg.vector_norm(vector, dtype=torch.float64)
 
 
 def plain_dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Inner product accumulated in float64, still on the device."""
+    """Take the inner product in float64, still on the device."""
     return left.double() @ right.double()
 
 
 def norm(vector: Tensor) -> float:
-    """Euclidean norm accumulated in float64, of float32 entries up to 1e38 and float64 entries of any size."""
+    """Take the Euclidean norm in float64, of float32 entries up to 1e38 and float64 entries of any size."""
     return in_range(float(plain_norm(vector)), vector)
 
 
 def in_range(size: float, vector: Tensor) -> float:
-    """``norm`` of a vector whose ``plain_norm`` is ``size``: measured again only where that left float64's range."""
+    """Correct the ``plain_norm`` of a vector, ``size``: measured again only where it left float64's range."""
     if 1e-140 < size < 1e150 or not bool(torch.isfinite(vector).all()):
         return size
     # Squares leave the range of float64: the same after scaling by a power of two, which is exact.
@@ -59,7 +88,7 @@ def in_range(size: float, vector: Tensor) -> float:
 
 
 def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
-    """Inner product accumulated in float64."""
+    """Take the inner product in float64."""
     return float(plain_dot(left, right))
 
 
@@ -83,13 +112,20 @@ class Watched:
 
     @property
     def curvature(self) -> tuple[float, float]:
+        """Smallest and largest Rayleigh quotient of all products so far; 0, 0 for none."""
         return (self._low, self._high) if self._low <= self._high else (0.0, 0.0)
 
     def __call__(self, vector: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Multiply a vector."""
         return self.measured(vector).value
 
     def measured(self, vector: Float[Tensor, "n"]) -> Product:
-        """The product with its energy and norms, by one transfer to the host."""
+        """Multiply a vector; its energy and norms come by one transfer to the host.
+
+        Raises:
+            NonFiniteProduct: a product that is not finite.
+            ValueError: a product of another shape.
+        """
         product = self._matvec(vector)
         if product.shape != vector.shape:
             raise ValueError(
@@ -108,7 +144,11 @@ class Watched:
         return Product(product, energy, size, length)
 
     def dense(self, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-        """The operator's matrix, by its own ``dense`` where it has one; counted as a product a column."""
+        """Build the operator's matrix, by its own ``dense`` where it has one; counted as a product a column.
+
+        Raises:
+            NonFiniteProduct: a matrix that is not finite.
+        """
         matrix = _own_matrix(self._matvec)
         if matrix is None:
             return columns(self, like)
@@ -124,7 +164,7 @@ class Watched:
 
 
 def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-    """The operator's matrix, one product a column: an oracle for small problems. Type and device as ``like``."""
+    """Build an operator's matrix, one product a column, for small problems. Type and device are those of ``like``."""
     matrix = like.new_empty(like.numel(), like.numel())
     basis = torch.zeros_like(like)
     for column in range(like.numel()):
@@ -135,7 +175,7 @@ def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
 
 
 def _own_matrix(matvec: Matvec) -> Tensor | None:
-    """The matrix of an operator that has a faster way to it than column by column, else None."""
+    """Build the matrix of an operator that has a faster way to it than column by column, else None."""
     if isinstance(matvec, Shifted):
         matrix = _own_matrix(matvec.matvec)
         return None if matrix is None else matrix + matvec.shift * torch.eye(len(matrix)).to(matrix)

@@ -20,7 +20,7 @@ from neural_sim.outer.binding import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.flatten import unflatten
+from neural_sim.solver.operator import unflatten
 from neural_sim.synthesis.scene import Scene
 from neural_sim.tasks.context import Context
 from neural_sim.types import LabelledImages

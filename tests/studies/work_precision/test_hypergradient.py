@@ -17,7 +17,7 @@ from neural_sim.outer.settings import Outer
 from neural_sim.parameter.update import Mirror
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import LanczosDamping
-from neural_sim.solver.flatten import flatten
+from neural_sim.solver.operator import flatten
 from neural_sim.studies.work_precision import hypergradient as family
 from neural_sim.studies.work_precision.hypergradient import DEFAULT, Hypergradients, correlation, slopes, ways
 from neural_sim.studies.work_precision.micro import PSI, small_scene

@@ -10,7 +10,7 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.identity import Identity
+from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.studies.work_precision import solver as family
 from neural_sim.studies.work_precision.series import Timing

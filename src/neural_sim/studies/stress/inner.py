@@ -12,14 +12,13 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative, Params
 from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.base import LinearSolver
+from neural_sim.solver.base import LinearSolver, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping, LanczosDamping
-from neural_sim.solver.exact import Exact
-from neural_sim.solver.flatten import flatten, unflatten
+from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.solution import Status
+from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite, worst
 from neural_sim.studies.stress.linear import UNTRUSTED, ended, logarithmic, relative, system
 from neural_sim.studies.stress.subjects import small_detector

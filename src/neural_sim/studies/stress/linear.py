@@ -15,12 +15,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neural_sim.solver.base import LinearSolver
+from neural_sim.solver.base import LinearSolver, Solution, Status
 from neural_sim.solver.cg import ConjugateGradient
-from neural_sim.solver.exact import Exact
-from neural_sim.solver.identity import Identity
+from neural_sim.solver.direct import Exact, Identity
 from neural_sim.solver.minres import MinimumResidual
-from neural_sim.solver.solution import Solution, Status
 from neural_sim.studies.stress.cases import (
     DOUBLE,
     SINGLE,

@@ -21,7 +21,7 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import centred_cosine, response
 from neural_sim.outer.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.solver.identity import Identity
+from neural_sim.solver.direct import Identity
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.suite import World
 

@@ -15,7 +15,7 @@ from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import FixedDamping
-from neural_sim.solver.exact import Exact
+from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
 from neural_sim.studies.work_precision.micro import as_double, trained_problem
 from neural_sim.studies.work_precision.series import Point, Series, Timing

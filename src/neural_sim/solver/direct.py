@@ -1,26 +1,31 @@
-"""The dense solve, an oracle for small problems: every column of the matrix costs one product."""
+"""Solvers without an iteration: a dense factorisation, and a multiple of the identity."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.solver.base import Iterate, LinearSolver, System
+from neural_sim.solver.base import Iterate, LinearSolver, Status, System
 from neural_sim.solver.operator import norm
-from neural_sim.solver.solution import Status
 
 
 @dataclass(frozen=True)
 class Exact(LinearSolver):
-    """By eigenvalues: any symmetric system (minimum norm on the range of a singular one), the extreme eigenvalues
-    being the curvature. ``max_steps`` does not bind. Systems above ``max_size`` raise ``ValueError``.
+    """The dense solve by eigenvalues, an oracle for small problems: every column of the matrix costs one product.
+
+    It solves any symmetric system (by minimum norm on the range of a singular one). The extreme eigenvalues are the
+    curvature. ``max_steps`` does not bind. Systems above ``max_size`` raise ``ValueError``.
     """
 
     max_size: int = 5000
 
+    @override
     def iterate(self, system: System) -> Iterate:
         operator, rhs, size = system.operator, system.rhs, system.rhs.numel()
         if size > self.max_size:
@@ -50,8 +55,25 @@ class Exact(LinearSolver):
         return Iterate(value, Status.SINGULAR if consistent else Status.LEAST_SQUARES, 1)
 
 
-def _refined(inverse, matrix: Float[Tensor, "n n"], rhs: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """One step of iterative refinement on the factorisation's answer, kept if it lowers the residual."""
+def _refined(
+    inverse: Callable[[Tensor], Tensor], matrix: Float[Tensor, "n n"], rhs: Float[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """Refine the factorisation's answer by one iteration, kept if it lowers the residual."""
     value = inverse(rhs)
     better = value + inverse(rhs - matrix @ value)
     return better if norm(rhs - matrix @ better) < norm(rhs - matrix @ value) else value
+
+
+@dataclass(frozen=True)
+class Identity(LinearSolver):
+    """``x = scale b``, the one-step choice T1-T2 (Luketina et al. 2016). One product is spent on the residual."""
+
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.scale) and self.scale != 0.0):
+            raise ValueError(f"identity: scale must be finite and not 0, got {self.scale}")
+
+    @override
+    def iterate(self, system: System) -> Iterate:
+        return Iterate(self.scale * system.rhs, Status.APPROXIMATE, 0)
