@@ -22,7 +22,7 @@ import pkgutil
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar, Union
 
 from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, MultipleOf
@@ -144,6 +144,9 @@ def misfit(value: Any, hint: Any, where: str) -> Misfit | None:
         found = None if _fits(value, hint) else Misfit(where, words_of(hint), repr(value))
     else:
         return None
+    described = next((marker.wanted for marker in markers if isinstance(marker, Matching)), None)
+    if found is not None and found.where == where and described is not None:
+        return replace(found, wanted=described)
     return found or _misfit_of_markers(value, markers, where)
 
 

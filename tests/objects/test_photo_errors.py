@@ -8,8 +8,7 @@ from captures import capture
 from PIL import Image
 
 from neural_sim.objects.photos import Photos
-from neural_sim.objects.pictures import Pictures
-from neural_sim.objects.scene_masks import box_of
+from neural_sim.objects.pictures import Pictures, box_of
 
 KINDS = ("transforms", "colmap_text", "colmap_binary")
 
@@ -129,9 +128,15 @@ def test_a_model_that_colmap_cannot_read_is_named(made, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"up": "up"}, r"objects\.up: want one of \+x.* for can, got 'up'"),
-        ({"up": [0, 0]}, r"objects\.up"),
-        ({"size": -1.0}, r"objects\.size: want metres above 0 for can, got -1"),
+        (
+            {"up": "up"},
+            r"Photos\.up: want one of \+x, .* or three numbers, .* or a mapping or null, got 'up'",
+        ),
+        ({"up": [0, 0]}, r"Photos\.up"),
+        ({"up": {"can": [0, 0, 0]}}, r"Photos\.up\.can: want .* three numbers, not all of them zero"),
+        ({"size": -1.0}, r"Photos\.size: want more than 0 or a mapping or null, got -1"),
+        ({"size": {"can": float("inf")}}, r"Photos\.size\.can: want more than 0 and finite or null, got inf"),
+        ({"names": []}, r"Photos\.names: want 1 or more values or null, got \[\]"),
         ({"names": ["mug"]}, r"objects\.names: 'mug' is not in"),
         ({"masks": "scene"}, r"objects\.masks=scene: want objects\.scene, which computes masks, got none"),
         (
@@ -157,11 +162,9 @@ def test_bad_options_are_refused(made, options, message):
         {"can": [0, 1]},
     ],
 )
-def test_bad_boxes_are_refused(box):
-    with pytest.raises(
-        ValueError, match=r"objects\.box: want \[\[x0, y0, z0\], \[x1, y1, z1\]\] .* for can, got"
-    ):
-        box_of(box, "can")
+def test_bad_boxes_are_refused(made, box):
+    with pytest.raises(ValueError, match=r"Photos\.box(\.can|\[\d\])*: want .*, got"):
+        Photos(made["transforms"].folder.parent, box=box)
 
 
 def test_a_box_is_everyones_or_one_objects():

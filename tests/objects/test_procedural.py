@@ -58,8 +58,12 @@ def test_same_seed_same_bytes_and_independent_of_the_others(objects):
 def test_unknown_names_are_refused_with_the_known_ones():
     with pytest.raises(ValueError, match=r"can, pitcher.*got \['kettle'\]"):
         Procedural(["kettle"])
-    with pytest.raises(ValueError, match="seed"):
+    with pytest.raises(ValueError, match=r"Procedural\.seed: want at least 0, got -1"):
         Procedural(seed=-1)
+    with pytest.raises(
+        ValueError, match=r"Procedural\.names: want 1 or more values and no value twice or null"
+    ):
+        Procedural(["can", "can"])
 
 
 def test_every_bin_of_every_object_renders_differently(bin_views):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import MinLen
 
 from neural_sim.objects.files import MeshFiles, file_digest, folder_of, load_file
 from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
 
@@ -18,6 +21,7 @@ MILLIMETRE = 1e-3
 DIAMETER_TOLERANCE = 0.05
 
 
+@validated
 class BOP(MeshFiles):
     """Objects of a BOP models folder.
 
@@ -29,7 +33,7 @@ class BOP(MeshFiles):
         ValueError: no ``obj_*.ply`` in the folder, or an unknown name.
     """
 
-    def __init__(self, root: str | Path, names: list[str | int] | None = None) -> None:
+    def __init__(self, root: str | Path, names: Annotated[list[str | int], MinLen(1)] | None = None) -> None:
         folder = folder_of(root)
         files = {path.stem: path for path in folder.glob("obj_*.ply")}
         aliases: dict[str, str] = {}

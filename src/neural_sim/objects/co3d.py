@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
+from neural_sim.objects.files import Names
 from neural_sim.objects.photos import Photos, PoseCorrector, Up
-from neural_sim.objects.pictures import Masks
-from neural_sim.objects.scene_masks import Box, SceneMaskMaker
+from neural_sim.objects.pictures import Box, Masks, SceneMaskMaker
 from neural_sim.objects.transforms_json import image_size
+from neural_sim.ranges import Positive, validated
 
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 FORMATS = ("ndc_norm_image_bounds", "ndc_isotropic")
@@ -28,6 +29,7 @@ OPENGL = np.diag([-1.0, 1.0, -1.0])
 """PyTorch3D's camera axes to OpenGL's, and back."""
 
 
+@validated
 class Co3d(Photos):
     """One sequence of each category, as an object with the category's name.
 
@@ -46,12 +48,12 @@ class Co3d(Photos):
     def __init__(
         self,
         root: str | Path,
-        names: list[str] | None = None,
+        names: Names = None,
         sequences: Mapping[str, str] | None = None,
         masks: Masks = "auto",
-        up: Up | Mapping[str, Up] = None,
-        size: float | Mapping[str, float] | None = None,
-        box: Box | Mapping[str, Box] = None,
+        up: Up | Mapping[str, Up | None] | None = None,
+        size: Positive | Mapping[str, Positive | None] | None = None,
+        box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
         poses: PoseCorrector | None = None,
     ) -> None:

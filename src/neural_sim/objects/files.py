@@ -6,13 +6,17 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import trimesh
+from annotated_types import MinLen
 
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.objects.repair import repair
 
+Names = Annotated[list[str], MinLen(1)] | None
+"""Which objects of a folder, None: all."""
 COMPANIONS = (".mtl", ".png", ".jpg", ".jpeg")
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -73,7 +77,7 @@ def choose(
     """The available names of ``names``, which may be aliases, in their order; for None all of them, sorted.
 
     Raises:
-        ValueError: an unknown name, one object twice, or no name.
+        ValueError: an unknown name, or one object twice.
     """
     if names is None:
         return sorted(available)
@@ -87,8 +91,6 @@ def choose(
         if key in chosen:
             raise ValueError(f"objects.names: {name!r} names the object {key!r} twice")
         chosen.append(key)
-    if not chosen:
-        raise ValueError(f"objects.names: want at least one of {', '.join(sorted(available))}, got none")
     return chosen
 
 

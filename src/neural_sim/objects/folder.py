@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from neural_sim.objects.files import MeshFiles, folder_of
+from neural_sim.objects.files import MeshFiles, Names, folder_of
+from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
 
@@ -13,6 +14,7 @@ log = logging.getLogger(__name__)
 FORMATS = (".glb", ".obj", ".ply", ".stl")
 
 
+@validated
 class MeshFolder(MeshFiles):
     """Meshes of a folder (.glb, .obj, .ply, .stl), +z up, in metres (rendering does not depend on the unit).
 
@@ -23,7 +25,7 @@ class MeshFolder(MeshFiles):
         ValueError: an empty folder, an unknown name, or two objects of one name.
     """
 
-    def __init__(self, root: str | Path, names: list[str] | None = None) -> None:
+    def __init__(self, root: str | Path, names: Names = None) -> None:
         folder = folder_of(root)
         super().__init__(folder, _find(folder), names, {}, f"mesh ({', '.join(FORMATS)})")
 

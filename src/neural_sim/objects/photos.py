@@ -6,24 +6,27 @@ import logging
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.objects.capture import Capture, Frame
 from neural_sim.objects.colmap import model_folder, read_colmap
-from neural_sim.objects.files import choose, content_digest, folder_of
-from neural_sim.objects.pictures import Masks, Pictures, mask_of
+from neural_sim.objects.files import Names, choose, content_digest, folder_of
+from neural_sim.objects.pictures import Box, Direction, Masks, Pictures, SceneMaskMaker, box_of, mask_of
 from neural_sim.objects.placing import AXES, Placement, place
 from neural_sim.objects.resampling import pixels_per_pixel, resample
-from neural_sim.objects.scene_masks import Box, SceneMaskMaker, box_of
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
+from neural_sim.ranges import Matching, Positive, validated
 from neural_sim.types import PosedViews
 
 _log = logging.getLogger(__name__)
 
-Up = str | list[float] | None
+Up = (
+    Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+    | Annotated[Direction, Matching(any, "three numbers, not all of them zero")]
+)
 
 
 class PoseCorrector(Protocol):
@@ -34,6 +37,7 @@ class PoseCorrector(Protocol):
         ...
 
 
+@validated
 class Photos:
     """Captures of a folder; an object has the name of its folder.
 
@@ -51,19 +55,18 @@ class Photos:
         poses: what corrects the cameras' poses; null: they stay as they are given.
 
     Raises:
-        ValueError: a missing folder, one without captures, an unknown name, a bad ``up``, ``size`` or ``box``,
-            ``masks="scene"`` without ``scene``, ``box`` without ``masks="scene"``, or a capture that its reader
-            refuses.
+        ValueError: a missing folder, one without captures, an unknown name, ``masks="scene"`` without ``scene``,
+            ``box`` without ``masks="scene"``, or a capture that its reader refuses.
     """
 
     def __init__(
         self,
         root: str | Path,
-        names: list[str] | None = None,
+        names: Names = None,
         masks: Masks = "auto",
-        up: Up | Mapping[str, Up] = None,
-        size: float | Mapping[str, float] | None = None,
-        box: Box | Mapping[str, Box] = None,
+        up: Up | Mapping[str, Up | None] | None = None,
+        size: Positive | Mapping[str, Positive | None] | None = None,
+        box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
         poses: PoseCorrector | None = None,
     ) -> None:
@@ -76,10 +79,6 @@ class Photos:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
             raise ValueError(f"objects.box wants objects.masks=scene, got objects.masks={masks}")
-        for name in self._folders:
-            self._up(name)
-            self.radius(name)
-            box_of(box, name)
         _ = self.captures  # errors in a file are raised here, not in a later stage
 
     def _found(self) -> dict[str, Path]:
@@ -110,11 +109,7 @@ class Photos:
     def radius(self, name: str) -> float | None:
         """Radius of an object's bounding sphere in metres, None if unknown."""
         size = self.size.get(name) if isinstance(self.size, Mapping) else self.size
-        if size is None:
-            return None
-        if type(size) not in (int, float) or not 0.0 < size < float("inf"):
-            raise ValueError(f"objects.size: want metres above 0 for {name}, got {size!r}")
-        return 0.5 * float(size)
+        return None if size is None else 0.5 * float(size)
 
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
         """At most ``count`` training frames and ``held_out`` test frames, evenly spread.
@@ -170,14 +165,8 @@ class Photos:
         up: Any = self.up.get(name) if isinstance(self.up, Mapping) else self.up
         if up is None:
             return None
-        if isinstance(up, str) and up in AXES:
-            up = AXES[up]
-        numbers = isinstance(up, (list, tuple)) and len(up) == 3 and all(type(x) in (int, float) for x in up)
-        if not numbers or not any(up):
-            raise ValueError(
-                f"objects.up: want one of {', '.join(AXES)} or three numbers for {name}, got {up!r}"
-            )
-        return float(up[0]), float(up[1]), float(up[2])
+        x, y, z = AXES[up] if isinstance(up, str) else up
+        return float(x), float(y), float(z)
 
     def _digest(self, name: str) -> str:
         capture, folder = self.captures[name], self._folders[name]

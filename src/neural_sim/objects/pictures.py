@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,13 +15,49 @@ from torch import Tensor
 from torch.nn import functional
 
 from neural_sim.objects.capture import Capture, Frame
+from neural_sim.ranges import Matching, validated
 
 Masks = Literal["auto", "alpha", "files", "scene"]
+Direction = tuple[float, float, float]
+Corners = tuple[Direction, Direction]
+"""The lowest and the highest corner of a box along the axes of the capture's frame, in its unit."""
+Box = Annotated[
+    Corners,
+    Matching(
+        lambda box: all(low < high for low, high in zip(*box, strict=True)),
+        "[[x0, y0, z0], [x1, y1, z1]] with x0 < x1, y0 < y1 and z0 < z1",
+    ),
+]
 FOLDER = "masks"
 SHARPNESS = 4.0
 """Slope of the masks' opacity about a half, where a computed mask has its edge: an object is opaque, fog is nothing."""
 
 
+@runtime_checkable
+class SceneMaskMaker(Protocol):
+    """Computes masks from photographs and cameras alone."""
+
+    def masks(
+        self, capture: Capture, up: Direction | None, box: Corners | None
+    ) -> tuple[Float[Tensor, "_ _"], ...]:
+        """Compute the opacity of the object in [0, 1] for each of the capture's frames, at any size.
+
+        Raises:
+            ValueError: no object found.
+        """
+        ...
+
+
+def box_of(box: Box | Mapping[str, Box | None] | None, name: str) -> Corners | None:
+    """Return an object's box, from one for all objects or a mapping by name."""
+    given = box.get(name) if isinstance(box, Mapping) else box
+    if given is None:
+        return None
+    (x0, y0, z0), (x1, y1, z1) = given
+    return (float(x0), float(y0), float(z0)), (float(x1), float(y1), float(z1))
+
+
+@validated
 @dataclass(frozen=True)
 class Pictures:
     """Reads the photographs of a capture.
@@ -31,7 +68,7 @@ class Pictures:
     their order.
 
     Raises:
-        ValueError: another source, or computed masks that are missing or too few; from :meth:`rgba`, a frame without a
+        ValueError: computed masks that are missing or too few; from :meth:`rgba`, a frame without a
             mask, or a mask of another size.
     """
 
@@ -40,8 +77,6 @@ class Pictures:
     computed: tuple[Float[Tensor, "_ _"], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.masks not in get_args(Masks):
-            raise ValueError(f"objects.masks must be one of {get_args(Masks)}, got {self.masks!r}")
         wanted = len(self.capture.frames) if self.masks == "scene" else 0
         if len(self.computed) != wanted:
             raise ValueError(

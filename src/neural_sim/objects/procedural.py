@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import MinLen
 
 from neural_sim.objects import household
 from neural_sim.objects.mesh import ObjectMesh, normalise
+from neural_sim.ranges import Distinct, NonNegativeInt, validated
 
 DESIGNS = {
     "can": household.can,
@@ -19,6 +21,7 @@ DESIGNS = {
 }
 
 
+@validated
 class Procedural:
     """Six textured household objects, two blue and four red, without a unit of length.
 
@@ -27,18 +30,18 @@ class Procedural:
         seed: of their small print. Shapes and marks are fixed; an object does not depend on which others are chosen.
 
     Raises:
-        ValueError: unknown or repeated names, or a bad seed.
+        ValueError: unknown names.
     """
 
     metric: ClassVar[bool] = False
 
-    def __init__(self, names: list[str] | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, names: Annotated[list[str], MinLen(1), Distinct()] | None = None, seed: NonNegativeInt = 0
+    ) -> None:
         chosen = list(DESIGNS) if names is None else list(names)
         unknown = [name for name in chosen if name not in DESIGNS]
-        if unknown or not chosen or len(set(chosen)) < len(chosen):
-            raise ValueError(f"objects.names: want different ones of {', '.join(DESIGNS)}, got {chosen}")
-        if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
-            raise ValueError(f"objects.seed: want an integer of at least 0, got {seed!r}")
+        if unknown:
+            raise ValueError(f"objects.names: want some of {', '.join(DESIGNS)}, got {unknown}")
         self._names = chosen
         self.seed = seed
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neural_sim.objects.files import MeshFiles
+from neural_sim.objects.files import MeshFiles, Names
+from neural_sim.ranges import validated
 
 LAYOUT = "<id>_<name>/google_16k/textured.obj"
 ORIGIN = (
@@ -13,6 +14,7 @@ ORIGIN = (
 )
 
 
+@validated
 class YCB(MeshFiles):
     """Objects of a folder in the YCB layout, with the names of their folders.
 
@@ -24,7 +26,7 @@ class YCB(MeshFiles):
         ValueError: a folder without such objects, or an unknown name.
     """
 
-    def __init__(self, root: str | Path, names: list[str] | None = None) -> None:
+    def __init__(self, root: str | Path, names: Names = None) -> None:
         folder = Path(root)
         files = {path.parts[-3]: path for path in folder.glob("*/google_16k/textured.obj")}
         if not files:

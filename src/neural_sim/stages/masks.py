@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.objects.photos import Photos
-from neural_sim.objects.scene_masks import SceneMaskMaker
+from neural_sim.objects.pictures import SceneMaskMaker
 from neural_sim.stages.pixels import from_bytes, to_bytes
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 

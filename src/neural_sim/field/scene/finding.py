@@ -16,7 +16,7 @@ from neural_sim.field.scene.region import GROUND, Region, cell_centres, connecte
 from neural_sim.field.scene.space import Frame, expand
 from neural_sim.field.scene.surface import seen_surface
 from neural_sim.objects.capture import Capture
-from neural_sim.objects.scene_masks import Corners
+from neural_sim.objects.pictures import Corners
 
 RAYS = 49_152
 """Pixels whose rays find the scene's surface."""

@@ -18,8 +18,8 @@ from neural_sim.field.scene.photographs import photo_rays, scene_pixels
 from neural_sim.field.scene.rendering import object_mask
 from neural_sim.field.scene.space import Frame, looked_at
 from neural_sim.objects.capture import Capture
+from neural_sim.objects.pictures import Corners, Direction
 from neural_sim.objects.placing import mean_up
-from neural_sim.objects.scene_masks import Corners, Direction
 
 _log = logging.getLogger(__name__)
 
