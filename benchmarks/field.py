@@ -21,7 +21,7 @@ from neural_sim import cameras
 from neural_sim.field.base import RadianceField
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.training import fit_field
+from neural_sim.field.recipe import fit_field
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.objects.procedural import Procedural
 from neural_sim.objects.ycb import YCB

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neural_sim.field.appearance import AppearanceField
+from neural_sim.field.recipe import field_from_state, field_state
 from neural_sim.field.rendering import render_packed
-from neural_sim.field.training import field_from_state, field_state
 from neural_sim.types import Rays
 
 DOUBLE = torch.float64
@@ -104,10 +104,3 @@ def test_it_survives_saving(generator: torch.Generator, tmp_path: Path) -> None:
     assert isinstance(loaded, AppearanceField) and torch.equal(loaded.anchors, field.anchors)
     where = torch.rand(50, 3, generator=generator)
     assert torch.equal(loaded.query(where, where)[1], field.query(where, where)[1])
-
-
-def test_bad_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="head_width"):
-        AppearanceField(head_width=0)
-    with pytest.raises(ValueError, match="features"):
-        AppearanceField(features=2)

@@ -9,10 +9,10 @@ import torch
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
-from neural_sim.field.appearance_scores import fit_codes, render_lit, right_half
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.training import fit_field
+from neural_sim.field.recipe import fit_field
+from neural_sim.field.scores import fit_codes, render_lit, right_half
 from neural_sim.types import PosedViews
 
 LitBall = Callable[..., PosedViews]
@@ -104,11 +104,7 @@ def test_the_same_seed_gives_the_same_bits(lit_ball: LitBall) -> None:
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_bad_settings_are_refused(lit_ball: LitBall) -> None:
-    with pytest.raises(ValueError, match="anchors"):
-        AppearanceFitting(AppearanceField(), GRID, anchors=0)
-    with pytest.raises(ValueError, match="transient_penalty"):
-        AppearanceFitting(AppearanceField(), GRID, transient_penalty=-1.0)
+def test_more_anchors_than_views_are_refused(lit_ball: LitBall) -> None:
     views = lit_ball(4, 5)
     with pytest.raises(ValueError, match="6 anchors of 4"):
         fitted(PosedViews(views.images, views.camera_to_world, views.camera))

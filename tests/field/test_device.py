@@ -13,9 +13,8 @@ from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
 from neural_sim.field.fitting import BATCHES_PER_BLOCK, GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.mlp import MLPField
-from neural_sim.field.mlp_fitting import MLPFitting
-from neural_sim.field.training import fit_field
+from neural_sim.field.mlp import MLPField, MLPFitting
+from neural_sim.field.recipe import fit_field
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.types import PinholeCamera

@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from neural_sim.field.grid import GridField
 from neural_sim.field.interpolation import interpolate, interpolate_for_training
-from neural_sim.field.training import field_from_state, field_state
+from neural_sim.field.recipe import field_from_state, field_state
 
 
 def random_field(generator: torch.Generator, occupied: torch.Tensor, head_width: int = 0) -> GridField:
@@ -103,12 +103,6 @@ def test_saved_and_loaded_fields_are_the_same(generator: torch.Generator, tmp_pa
 def test_a_field_of_an_unknown_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown kind"):
         field_from_state({"kind": "Voxels"})
-
-
-@pytest.mark.parametrize("wrong", [{"features": 2}, {"step_cells": 0.0}, {"head_width": -1}])
-def test_bad_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="GridField"):
-        GridField(**wrong)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])

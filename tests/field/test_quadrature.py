@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from neural_sim.field.quadrature import alpha_from_sigma, composite, sum_rays, transmittance
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.quadrature import PackedSamples, alpha_from_sigma, composite, sum_rays, transmittance
 
 
 def pack(counts: list[int], width: float = 0.1) -> PackedSamples:

@@ -7,9 +7,13 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.grid import GridField
 from neural_sim.field.interpolation import gather_weighted, interpolate, trilinear_tangents, trilinear_weights
 from neural_sim.field.mlp import MLPField
-from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
+from neural_sim.field.quadrature import (
+    PackedSamples,
+    composite,
+    composite_with_gradient,
+    composite_with_tangents,
+)
 from neural_sim.field.rendering import render_samples, render_with_tangents
-from neural_sim.field.samples import PackedSamples
 from neural_sim.types import Rays
 
 DOUBLE = torch.float64

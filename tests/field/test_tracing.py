@@ -13,8 +13,8 @@ from neural_sim.field.extinction import Surface
 from neural_sim.field.grid import GridField
 from neural_sim.field.mlp import MLPField
 from neural_sim.field.pixels import seen_pixels
+from neural_sim.field.quadrature import sample_points
 from neural_sim.field.rendering import render_packed, render_views
-from neural_sim.field.samples import sample_points
 from neural_sim.field.screen import coarse_centres, screen_span
 from neural_sim.types import PinholeCamera, Rays
 

@@ -10,10 +10,8 @@ from neural_sim import cameras
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import visual_hull
-from neural_sim.field.mlp import MLPField, inverse_cumulative
-from neural_sim.field.mlp_fitting import MLPFitting
-from neural_sim.field.recipe import FieldRecipe
-from neural_sim.field.training import field_from_state, field_state, fit_field
+from neural_sim.field.mlp import MLPField, MLPFitting, inverse_cumulative
+from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state, fit_field
 from neural_sim.types import PinholeCamera, PosedViews, Rays
 
 RADIUS = 0.6
@@ -120,5 +118,3 @@ def test_bad_budgets_are_refused() -> None:
         fit_field(ball_views(3), fitting(), generator, steps=1, held_out=3)
     with pytest.raises(ValueError, match="steps"):
         fit_field(ball_views(3), fitting(), generator, steps=0)
-    with pytest.raises(ValueError, match="batch_rays"):
-        fitting(batch_rays=0)

@@ -9,10 +9,10 @@ import torch
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.appearance_fitting import AppearanceFitting
-from neural_sim.field.appearance_scores import render_lit
 from neural_sim.field.fitting import GridFitting
-from neural_sim.field.samples import PackedSamples
-from neural_sim.field.training import fit_field
+from neural_sim.field.quadrature import PackedSamples
+from neural_sim.field.recipe import fit_field
+from neural_sim.field.scores import render_lit
 from neural_sim.field.transient import SMALLEST_BETA, composite_both, uncertain_error
 from neural_sim.types import PosedViews
 

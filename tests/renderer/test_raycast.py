@@ -9,10 +9,9 @@ import trimesh
 from PIL import Image
 
 from neural_sim.cameras import opencv_camera, orbit
+from neural_sim.renderer.base import straight_alpha
 from neural_sim.renderer.lighting import Light, Lighting, lambert
-from neural_sim.renderer.raycast import RaycastRenderer
-from neural_sim.renderer.supersampling import straight_alpha
-from neural_sim.renderer.texture_sampling import Pyramid
+from neural_sim.renderer.raycast import Pyramid, RaycastRenderer
 from neural_sim.types import PinholeCamera
 
 LIGHT = Lighting((Light((1.0, 2.0, 2.0), 0.5),), ambient=0.4)
@@ -132,9 +131,7 @@ def test_alpha_is_straight():
     assert not empty.any()
 
 
-def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="supersample"):
-        RaycastRenderer(0)
+def test_a_mesh_without_faces_is_refused():
     with pytest.raises(ValueError, match="no faces"):
         RaycastRenderer().render(trimesh.Trimesh(), CAMERA, camera_at(0.0))
 

@@ -33,11 +33,6 @@ def test_pyrender_demanded_without_opengl_is_an_error(no_opengl):
         views.choose_mesh_renderer("pyrender")
 
 
-def test_unknown_backend_is_refused():
-    with pytest.raises(ValueError, match="'blender'"):
-        views.choose_mesh_renderer("blender")  # pyright: ignore[reportArgumentType]
-
-
 def test_a_platform_that_fails_is_passed_over(monkeypatch, caplog):
     monkeypatch.setattr(
         views, "PROBE", "import sys, os; sys.exit(os.environ['PYOPENGL_PLATFORM'] + ' is broken')"

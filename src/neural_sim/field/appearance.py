@@ -9,8 +9,10 @@ light that no view showed it in about 2 dB worse.)
 from __future__ import annotations
 
 import copy
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -18,13 +20,15 @@ from torch.nn import functional
 from neural_sim.field.base import RadianceField
 from neural_sim.field.extinction import Surface
 from neural_sim.field.grid import GridField
-from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.field.quadrature import PackedSamples, Span
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import PinholeCamera, Rays
 
 INITIAL_CODE = 0.3
 """Standard deviation of new codes."""
 
 
+@validated
 class AppearanceField(RadianceField):
     """``GridField`` for density and features, and a colour head of one hidden layer that sees features and a code.
 
@@ -37,22 +41,17 @@ class AppearanceField(RadianceField):
 
     def __init__(
         self,
-        features: int = 6,
-        head_width: int = 32,
-        code_size: int = 48,
+        features: Annotated[int, Ge(3)] = 6,
+        head_width: PositiveInt = 32,
+        code_size: PositiveInt = 48,
         view_dependent: bool = False,
-        step_cells: float = 1.0,
+        step_cells: Annotated[float, Gt(0), Le(2)] = 1.0,
         initial_density: float = -3.0,
-        density_gain: float = 2.0,
-        learned: int = 1,
-        anchors: int = 1,
+        density_gain: Positive = 2.0,
+        learned: PositiveInt = 1,
+        anchors: PositiveInt = 1,
     ) -> None:
         super().__init__()
-        if min(head_width, code_size, learned, anchors) < 1:
-            raise ValueError(
-                "AppearanceField: head_width, code_size, learned and anchors must be at least 1, got "
-                f"{head_width}, {code_size}, {learned}, {anchors}"
-            )
         self.grid = GridField(features, 0, step_cells, initial_density, density_gain)
         self.directed = view_dependent
         self.into = nn.Linear(features + 3 * view_dependent, head_width)

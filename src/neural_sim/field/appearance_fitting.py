@@ -9,17 +9,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.field.appearance import AppearanceField
-from neural_sim.field.appearance_scores import fit_codes, render_lit, right_half
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.objective import Fitting, Rendering, expected_error
-from neural_sim.field.quadrature import composite
-from neural_sim.field.samples import sample_points
-from neural_sim.field.scores import compare, where_known
+from neural_sim.field.objective import Fitting
+from neural_sim.field.quadrature import composite, sample_points
+from neural_sim.field.scores import (
+    Rendering,
+    compare,
+    expected_error,
+    fit_codes,
+    render_lit,
+    right_half,
+    where_known,
+)
 from neural_sim.field.transient import TransientHead, composite_both, uncertain_error
+from neural_sim.ranges import NonNegative, Positive, PositiveInt, validated
 from neural_sim.types import PosedViews
 
 
+@validated
 class AppearanceFitting(Fitting):
     """``GridFitting`` for density and features; head and codes learn beside it, at rates of their own.
 
@@ -41,21 +49,15 @@ class AppearanceFitting(Fitting):
         self,
         field: AppearanceField,
         grid: Callable[[GridField], GridFitting],
-        code_learning_rate: float = 0.02,
-        head_learning_rate: float = 0.03,
+        code_learning_rate: Positive = 0.02,
+        head_learning_rate: Positive = 0.03,
         shared_lights: bool = True,
-        anchors: int = 6,
+        anchors: PositiveInt = 6,
         transients: bool = False,
-        transient_penalty: float = 0.01,
+        transient_penalty: NonNegative = 0.01,
     ) -> None:
         self.grid = grid(field.grid)
         super().__init__(field, self.grid.batch_rays)
-        if anchors < 1:
-            raise ValueError(f"AppearanceFitting: anchors must be at least 1, got {anchors}")
-        if not transient_penalty >= 0.0:
-            raise ValueError(
-                f"AppearanceFitting: transient_penalty must be at least 0, got {transient_penalty}"
-            )
         self.code_learning_rate, self.head_learning_rate = code_learning_rate, head_learning_rate
         self.shared_lights, self.anchors = shared_lights, anchors
         self.transients, self.transient_penalty = transients, transient_penalty

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neural_sim.field.extinction import Surface
-from neural_sim.field.quadrature import composite, transmittance
-from neural_sim.field.samples import PackedSamples, Span, sample_points
+from neural_sim.field.quadrature import PackedSamples, Span, composite, sample_points, transmittance
 from neural_sim.types import PinholeCamera, Rays
 
 

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.field.grid import GridField
-from neural_sim.field.hull import pixels_across, visual_hull
-from neural_sim.field.objective import Fitting, RayBlocks, Rendering
+from neural_sim.field.hull import COARSEST, Resolution, pixels_across, visual_hull
+from neural_sim.field.objective import Fitting, RayBlocks
 from neural_sim.field.occupancy import crop
 from neural_sim.field.pool import RayPool, build_pool
-from neural_sim.field.quadrature import composite, render_weights
-from neural_sim.field.samples import PackedSamples, sample_points
+from neural_sim.field.quadrature import PackedSamples, composite, render_weights, sample_points
+from neural_sim.field.scores import Rendering
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import PosedViews
 
+BelowOne = Annotated[float, Ge(0), Lt(1)]
 BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 
 
+@validated
 class GridFitting(Fitting):
     """Coarse to fine: the visual hull's cells first; after each of ``refine_steps`` empty cells go, the rest halve.
 
@@ -36,20 +41,20 @@ class GridFitting(Fitting):
     def __init__(
         self,
         field: GridField,
-        resolution: int = 256,
-        refine_steps: tuple[int, ...] = (100, 300),
-        prune_steps: tuple[int, ...] = (),
-        prune_weight: float = 0.2,
-        prune_rays: int = 131_072,
-        batch_rays: int = 4096,
-        learning_rate: float = 0.2,
-        head_learning_rate: float = 0.01,
-        termination: float = 1e-3,
+        resolution: Resolution = 256,
+        refine_steps: tuple[PositiveInt, ...] = (100, 300),
+        prune_steps: tuple[PositiveInt, ...] = (),
+        prune_weight: BelowOne = 0.2,
+        prune_rays: PositiveInt = 131_072,
+        batch_rays: PositiveInt = 4096,
+        learning_rate: Positive = 0.2,
+        head_learning_rate: Positive = 0.01,
+        termination: BelowOne = 1e-3,
     ) -> None:
         super().__init__(field, batch_rays)
-        if prune_rays < 1 or not 0.0 <= prune_weight < 1.0:
+        if resolution >> len(refine_steps) < COARSEST:
             raise ValueError(
-                f"GridFitting: want prune_rays >= 1 and prune_weight in [0, 1), got {prune_rays} and {prune_weight}"
+                f"resolution: want at least {COARSEST} after halving it {len(refine_steps)} times, got {resolution}"
             )
         self.resolution = resolution
         self.refine_steps, self.prune_steps = tuple(refine_steps), tuple(prune_steps)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
@@ -23,15 +25,16 @@ from neural_sim.field.interpolation import (
 )
 from neural_sim.field.marching import SampleCollector, Wave, lookup, march
 from neural_sim.field.occupancy import Occupancy, build_occupancy, crop, dilate, subdivide, vertices
-from neural_sim.field.refinement import interpolate_from
-from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.field.quadrature import PackedSamples, Span
 from neural_sim.field.screen import coarse_centres, screen_span
+from neural_sim.ranges import NonNegativeInt, Positive, validated
 from neural_sim.types import PinholeCamera, Rays
 
 EMPTY_DENSITY = -1e4
 """Raw density of the row that stands for all empty space: softplus gives exactly 0."""
 
 
+@validated
 class GridField(RadianceField):
     """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, whatever the grid's scale.
 
@@ -44,19 +47,13 @@ class GridField(RadianceField):
 
     def __init__(
         self,
-        features: int = 3,
-        head_width: int = 0,
-        step_cells: float = 1.0,
+        features: Annotated[int, Ge(3)] = 3,
+        head_width: NonNegativeInt = 0,
+        step_cells: Annotated[float, Gt(0), Le(2)] = 1.0,
         initial_density: float = -3.0,
-        density_gain: float = 2.0,
+        density_gain: Positive = 2.0,
     ) -> None:
         super().__init__()
-        if features < 3:
-            raise ValueError(f"GridField: features must be at least 3, got {features}")
-        if head_width < 0 or not 0.0 < step_cells <= 2.0:
-            raise ValueError(
-                f"GridField: want head_width >= 0 and step_cells in (0, 2], got {head_width} and {step_cells}"
-            )
         self.features, self.head_width = features, head_width
         self.step_cells, self.initial_density, self.density_gain = step_cells, initial_density, density_gain
         self.directed = head_width > 0
@@ -130,7 +127,7 @@ class GridField(RadianceField):
         coordinates = self._set_cells(occupied, origin, cell)
         # New vertices lie on old cells' faces; nudged towards the inside of an occupied cell they find a row each.
         local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
-        rows = interpolate_from(local, before, corners, table)
+        rows = _interpolate_from(local, before, corners, table)
         self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
 
     def _set_cells(self, occupied: Tensor, origin: Tensor, cell: float) -> Int[Tensor, "vertices 3"]:
@@ -294,3 +291,22 @@ def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_
     """Give the field the cells of a saved state before its tensors are copied."""
     if isinstance(field, GridField):
         field.reset(state[prefix + "occupied"], state[prefix + "origin"], float(state[prefix + "cell"]))
+
+
+def _interpolate_from(
+    local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
+) -> Float[Tensor, "vertices channels"]:
+    """Values of an old table at grid vertices, each from whichever of its eight neighbouring cells is occupied."""
+    result = table.new_zeros(len(local), table.shape[1])
+    missing = torch.arange(len(local), device=local.device)
+    for corner in CORNERS:
+        nudge = (corner.to(local) - 0.5) * 1e-2
+        here = local.index_select(0, missing)
+        cell = lookup(here + nudge, occupancy)
+        hit = (cell >= 0).nonzero()[:, 0]
+        base = (here + nudge).floor().index_select(0, hit)
+        weights = corner_weights(*(here.index_select(0, hit) - base).t().contiguous())
+        rows = corners.index_select(0, cell.index_select(0, hit))
+        result.index_copy_(0, missing.index_select(0, hit), gather_weighted(table, rows, weights))
+        missing = missing[cell < 0]
+    return result

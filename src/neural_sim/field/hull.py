@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,9 +12,15 @@ from torch.nn import functional
 
 from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.field.occupancy import subdivide
+from neural_sim.ranges import Matching, check
 from neural_sim.types import PosedViews
 
 COARSEST = 32
+Resolution = Annotated[
+    int,
+    Matching(lambda cells: cells >= COARSEST and cells & (cells - 1) == 0, f"a power of two from {COARSEST}"),
+]
+"""Cells along the unit sphere's diameter that can be carved, coarse to fine."""
 DISSENT = 0.1
 """Share of the photographs that see a cell and may show no object there: their poses and masks are not exact."""
 
@@ -23,14 +30,13 @@ def visual_hull(
 ) -> tuple[Bool[Tensor, "nx ny nz"], Float[Tensor, "3"], float]:
     """Cells of the unit sphere that the object may occupy; the cube [-1, 1]^3 has ``resolution`` along each edge.
 
-    ``resolution`` is 32 times a power of two. A cell goes when some view that sees its centre has no pixel above
+    A cell goes when some view that sees its centre has no pixel above
     ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small; of photographs
     (``views.known``), more than ``DISSENT`` of those that see it. Returns cells, origin and edge length in object
     radii.
     Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
     """
-    if resolution < COARSEST or resolution & (resolution - 1):
-        raise ValueError(f"visual_hull: resolution must be a power of two from {COARSEST}, got {resolution}")
+    check(resolution, Resolution, "visual_hull.resolution")
     pose = views.camera_to_world
     origin = torch.full((3,), -1.0, dtype=pose.dtype, device=pose.device)
     size = COARSEST

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neural_sim.devices import at_once
 from neural_sim.field.occupancy import COARSENING, Occupancy
-from neural_sim.field.samples import PackedSamples, Span
+from neural_sim.field.quadrature import PackedSamples, Span
 from neural_sim.types import Rays
 
 SHORTEST, LONGEST = 8, 64

@@ -1,19 +1,26 @@
-"""The radiance field of the paper: NeRF's network (Mildenhall et al. 2020), coarse and fine."""
+"""The radiance field of the paper: NeRF's networks (Mildenhall et al. 2020), coarse and fine, and their fitting."""
 
 from __future__ import annotations
 
 import copy
+from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from neural_sim.cameras import unit_sphere_span
 from neural_sim.field.base import RadianceField
-from neural_sim.field.quadrature import render_weights
-from neural_sim.field.samples import PackedSamples, sample_points
-from neural_sim.types import Rays
+from neural_sim.field.objective import Fitting, RayBlocks
+from neural_sim.field.pool import build_pool
+from neural_sim.field.quadrature import PackedSamples, composite, render_weights, sample_points
+from neural_sim.field.rendering import render_samples
+from neural_sim.field.scores import Rendering
+from neural_sim.ranges import NonNegativeInt, Positive, PositiveInt, validated
+from neural_sim.types import PosedViews, Rays
 
+TwoOrMore = Annotated[int, Ge(2)]
 SKIP_LAYER = 4
 """The layer that sees the encoded position again (NeRF, Fig. 7)."""
 
@@ -58,6 +65,7 @@ class NerfNetwork(nn.Module):
         return sigma, torch.sigmoid(colour)
 
 
+@validated
 class MLPField(RadianceField):
     """Two networks: the coarse one says where along a ray the fine one is asked.
 
@@ -68,22 +76,16 @@ class MLPField(RadianceField):
 
     def __init__(
         self,
-        width: int = 256,
-        depth: int = 8,
-        position_frequencies: int = 10,
-        direction_frequencies: int = 4,
-        coarse_samples: int = 64,
-        fine_samples: int = 128,
-        density_scale: float = 10.0,
-        seed: int = 0,
+        width: TwoOrMore = 256,
+        depth: TwoOrMore = 8,
+        position_frequencies: NonNegativeInt = 10,
+        direction_frequencies: NonNegativeInt = 4,
+        coarse_samples: TwoOrMore = 64,
+        fine_samples: TwoOrMore = 128,
+        density_scale: Positive = 10.0,
+        seed: NonNegativeInt = 0,
     ) -> None:
         super().__init__()
-        sizes = (width, depth, coarse_samples, fine_samples)
-        if min(sizes) < 2 or min(position_frequencies, direction_frequencies) < 0 or density_scale <= 0.0:
-            raise ValueError(
-                "MLPField: want width, depth, coarse_samples, fine_samples >= 2, frequencies >= 0, density_scale > 0; "
-                f"got {sizes}, {(position_frequencies, direction_frequencies)} and {density_scale}"
-            )
         self._settings: dict[str, object] = {
             "width": width,
             "depth": depth,
@@ -206,3 +208,36 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
             with torch.no_grad():
                 layer.weight.copy_((torch.rand(layer.weight.shape, generator=generator) * 2.0 - 1.0) * bound)
                 layer.bias.zero_()
+
+
+@validated
+class MLPFitting(Fitting):
+    """Both networks at once (NeRF, Eq. 6), stratified noise in the sample distances.
+
+    Rays of all pixels take part: empty space far from the object is learned only from rays that miss it.
+    """
+
+    field: MLPField
+
+    def __init__(
+        self, field: MLPField, batch_rays: PositiveInt = 1024, learning_rate: Positive = 5e-4
+    ) -> None:
+        super().__init__(field, batch_rays)
+        self.learning_rate = learning_rate
+
+    def start(self, views: PosedViews, generator: torch.Generator) -> None:
+        self._blocks = RayBlocks(build_pool(views, None, generator))
+        self._generator = generator
+
+    def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
+        batch = self._blocks.draw(self.batch_rays)
+        coarse = self.field.sample_coarse(batch.rays, self._generator)
+        fine = self.field.sample_fine(batch.rays, coarse, self._generator)
+        sigma, rgb = self.field.query_coarse(*sample_points(batch.rays, coarse))
+        return [composite(sigma, rgb, coarse), render_samples(self.field, batch.rays, fine)], batch.pixels
+
+    def advance(self, step: int) -> bool:
+        return False
+
+    def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
+        return [(list(self.field.parameters()), self.learning_rate)]

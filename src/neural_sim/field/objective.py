@@ -10,34 +10,14 @@ from torch import Tensor
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pool import RayPool
-from neural_sim.field.scores import score_views
+from neural_sim.field.scores import Rendering, expected_error, score_views
 from neural_sim.types import PosedViews
-
-Rendering = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]
-
-
-def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, ""]:
-    """Mean square colour error over a background drawn uniformly in [0, 1], in closed form.
-
-    With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
-    E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
-    """
-    return expected_errors(rendering, pixels).mean()
-
-
-def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
-    """The square error of each ray and channel, of which ``expected_error`` is the mean."""
-    colour = rendering[0] - pixels[:, :3]
-    opacity = (rendering[1] - pixels[:, 3])[:, None]
-    return colour.square() - colour * opacity + opacity.square() / 3.0
 
 
 class Fitting(ABC):
     """One field with its training rays. Calls: ``start`` once, then ``loss`` and ``advance`` in each step."""
 
     def __init__(self, field: RadianceField, batch_rays: int) -> None:
-        if batch_rays < 1:
-            raise ValueError(f"fitting: batch_rays must be at least 1, got {batch_rays}")
         self.field = field
         self.batch_rays = batch_rays
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
-from neural_sim.field.samples import Span
+from neural_sim.field.quadrature import Span
 from neural_sim.types import PinholeCamera
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384

@@ -1,20 +1,73 @@
-"""The volume rendering quadrature on packed samples (Max 1995; NeRF, Mildenhall et al. 2020, Eq. 3), pure functions.
+"""Samples along rays without padding, and the volume rendering quadrature on them, pure functions.
 
-Sums over a ray are differences of one running sum over all samples; unlike scatters it is fast on a CPU and has both
-derivative modes. It runs in float64, and no sample counts for more than ``OPAQUE_DEPTH``, so that a ray late in the
-pack loses no digits to those before it: N samples are known to N eps of float64 times the sum of their counted depths.
+The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray are differences of one running sum
+over all samples; unlike scatters it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
+counts for more than ``OPAQUE_DEPTH``, so that a ray late in the pack loses no digits to those before it: N samples are
+known to N eps of float64 times the sum of their counted depths.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.field.samples import PackedSamples
+from neural_sim.types import Rays
 
 OPAQUE_DEPTH = 50.0
 """Optical depth of one sample behind which nothing is seen: exp(-50) = 2e-22 is lost beside 1 even in float64."""
+
+
+@dataclass(frozen=True)
+class PackedSamples:
+    """Samples of many rays without padding, sorted by ray and then by distance (the layout of nerfacc).
+
+    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii and
+    ``width`` the length of ray the sample stands for. Ray r owns the samples ``starts[r]:starts[r + 1]``.
+    """
+
+    ray: Int[Tensor, "samples"]
+    distance: Float[Tensor, "samples"]
+    width: Float[Tensor, "samples"]
+    starts: Int[Tensor, "rays_plus_one"]
+
+    def __len__(self) -> int:
+        return self.ray.shape[0]
+
+    def of_rays(self, first: int, last: int, begin: int, end: int) -> PackedSamples:
+        """The samples of rays ``first`` to ``last`` - 1, numbered from 0; they are those from ``begin`` to ``end`` - 1.
+
+        Both are ``starts`` of the rays. They are asked for, because reading them here would make the host wait for
+        the device once a batch.
+        """
+        return PackedSamples(
+            self.ray[begin:end] - first,
+            self.distance[begin:end],
+            self.width[begin:end],
+            self.starts[first : last + 1] - begin,
+        )
+
+
+@dataclass(frozen=True)
+class Span:
+    """Distances between which each ray may meet something, in object radii; none where near > far."""
+
+    near: Float[Tensor, "rays"]
+    far: Float[Tensor, "rays"]
+
+    def select(self, index: Int[Tensor, "some"]) -> Span:
+        return Span(self.near.index_select(0, index), self.far.index_select(0, index))
+
+
+def sample_points(
+    rays: Rays, samples: PackedSamples
+) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples 3"]]:
+    """Positions and directions of the samples, differentiable in the rays; the distances are constants."""
+    directions = rays.directions.index_select(0, samples.ray)
+    origins = rays.origins.index_select(0, samples.ray)
+    return origins + directions * samples.distance[:, None], directions
 
 
 def alpha_from_sigma(

@@ -1,19 +1,35 @@
-"""A field's kind, its fitting and its budget in one configured object, from which each object's field is fitted."""
+"""How a field is fitted to posed views: the configured recipe, its training loop, and what is stored of a field."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
+import lightning
 import torch
+from torch.utils.data import DataLoader
 
+from neural_sim.devices import synchronise, trainer_on
+from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
+from neural_sim.field.grid import GridField
+from neural_sim.field.mlp import MLPField
 from neural_sim.field.objective import Fitting
-from neural_sim.field.training import fit_field
+from neural_sim.ranges import NonNegativeInt, PositiveFraction, PositiveInt, validated
 from neural_sim.types import PosedViews
 
+KINDS: dict[str, type[RadianceField]] = {
+    "AppearanceField": AppearanceField,
+    "GridField": GridField,
+    "MLPField": MLPField,
+}
+TERMINATION = 1e-3
+RAYS_PER_CHUNK = 1 << 15
 
+
+@validated
 @dataclass(frozen=True)
 class FieldRecipe:
     """How to fit a field to views.
@@ -22,19 +38,17 @@ class FieldRecipe:
         field: makes a new field.
         fitting: makes the fitting of a field.
         steps: optimiser steps, the budget.
+        final_rate: of the learning rates' start, to which they fall exponentially.
+        score_every: steps after which the held-out views are rendered and scored; 0: only at the end.
         seed: of new weights and the order of rays; not the run's seed, so that runs share fields.
     """
 
     field: Callable[[], RadianceField]
     fitting: Callable[[RadianceField], Fitting]
-    steps: int = 1000
-    final_rate: float = 0.1
-    score_every: int = 0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"field.steps must be at least 1, got {self.steps}")
+    steps: PositiveInt = 1000
+    final_rate: PositiveFraction = 0.1
+    score_every: NonNegativeInt = 0
+    seed: NonNegativeInt = 0
 
     def fit(
         self, views: PosedViews, held_out: int, device: torch.device
@@ -49,3 +63,137 @@ class FieldRecipe:
             placed, fitting, generator, steps=self.steps, held_out=held_out,
             final_rate=self.final_rate, score_every=self.score_every,
         )  # fmt: skip
+
+
+def fit_field(
+    views: PosedViews,
+    fitting: Fitting,
+    generator: torch.Generator,
+    *,
+    steps: int,
+    held_out: int = 0,
+    final_rate: float = 0.1,
+    score_every: int = 0,
+) -> tuple[RadianceField, list[dict[str, float]]]:
+    """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
+
+    Returns the field, in evaluation mode and without gradients, and its history. Raises ValueError when no view is
+    left to fit.
+    """
+    if not 0 <= held_out < len(views):
+        raise ValueError(
+            f"fit_field: held_out must lie in [0, {len(views)}) for {len(views)} views, got {held_out}"
+        )
+    count = len(views) - held_out
+    index = torch.arange(len(views))
+    module = RadianceFieldModule(
+        fitting,
+        views.select(index[:count]),
+        views.select(index[count:]) if held_out else None,
+        generator,
+        steps,
+        final_rate,
+        score_every,
+    )
+    trainer_on(views.images.device).fit(module)
+    return module.field.eval().requires_grad_(False), module.history
+
+
+def field_state(field: RadianceField) -> dict[str, Any]:
+    """Kind, constructor arguments and tensors of a field, on the CPU. Raises ``ValueError`` for an unknown kind."""
+    kind = type(field).__name__
+    if kind not in KINDS:
+        raise ValueError(f"field: unknown kind {kind!r}, want one of {sorted(KINDS)}")
+    state = {name: tensor.detach().cpu() for name, tensor in field.state_dict().items()}
+    return {"kind": kind, "settings": field.settings(), "state": state}
+
+
+def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
+    """Inverse of :func:`field_state`, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
+    if saved.get("kind") not in KINDS:
+        raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
+    field = KINDS[saved["kind"]](**saved["settings"])
+    field.load_state_dict(saved["state"])
+    return field.eval().requires_grad_(False)
+
+
+@validated
+class RadianceFieldModule(lightning.LightningModule):
+    """Fits a field to ``views`` by Adam and scores it on ``held_out``.
+
+    One step is one batch of rays; the learning rate falls exponentially to ``final_rate`` of its start over ``steps``.
+    ``score_every`` steps (0: only at the end) the held-out views are rendered; each score is a row of
+    ``history`` {seconds, step, psnr, psnr_foreground, ssim} and is logged as ``field/...``. Seconds are those of
+    fitting, from the start of preparation, without the scoring itself.
+    """
+
+    def __init__(
+        self,
+        fitting: Fitting,
+        views: PosedViews,
+        held_out: PosedViews | None,
+        generator: torch.Generator,
+        steps: PositiveInt,
+        final_rate: PositiveFraction = 0.1,
+        score_every: NonNegativeInt = 0,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.fitting, self.field = fitting, fitting.field
+        self.views, self.held_out, self.generator = views, held_out, generator
+        self.steps, self.final_rate, self.score_every = steps, final_rate, score_every
+        self.history: list[dict[str, float]] = []
+        self._steps_done = 0
+        self._begun = time.perf_counter()
+        self._paused = 0.0
+
+    def setup(self, stage: str) -> None:
+        self._begun = time.perf_counter()
+        self.fitting.start(self.views, self.generator)
+
+    def train_dataloader(self) -> DataLoader[int]:
+        return DataLoader(range(self.steps), batch_size=None)  # pyright: ignore[reportArgumentType]
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        groups = [
+            {"params": parameters, "lr": rate, "initial_lr": rate}
+            for parameters, rate in self.fitting.learning_rates()
+        ]
+        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
+
+    def training_step(self, batch: Any, batch_index: int) -> None:
+        optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
+        loss = self.fitting.loss()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * self.final_rate ** (self._steps_done / self.steps)
+        optimizer.step()
+        self._steps_done += 1
+        if self.fitting.advance(self._steps_done):
+            _replace_parameters(optimizer, [parameters for parameters, _ in self.fitting.learning_rates()])
+        last = self._steps_done == self.steps
+        if last or (self.score_every and self._steps_done % self.score_every == 0):
+            self._score()
+
+    def _score(self) -> None:
+        if self.held_out is None:
+            return
+        synchronise(self.held_out.images.device)
+        now = time.perf_counter()
+        self.field.eval()
+        scores = self.fitting.score(self.held_out, TERMINATION, RAYS_PER_CHUNK)
+        self.field.train()
+        seconds = now - self._begun - self._paused
+        self._paused += time.perf_counter() - now
+        self.history.append({"seconds": seconds, "step": float(self._steps_done), **scores})
+        self.log_dict({f"field/{name}": value for name, value in scores.items()} | {"field/seconds": seconds})
+
+
+def _replace_parameters(optimizer: torch.optim.Optimizer, groups: list[list[torch.nn.Parameter]]) -> None:
+    """Point the optimiser at new tensors; moments of those that stay are kept."""
+    for group, parameters in zip(optimizer.param_groups, groups, strict=True):
+        group["params"] = parameters
+    current = {parameter for parameters in groups for parameter in parameters}
+    for stale in [parameter for parameter in optimizer.state if parameter not in current]:
+        del optimizer.state[stale]

@@ -12,8 +12,13 @@ from neural_sim.cameras import pixel_rays
 from neural_sim.field.base import RadianceField
 from neural_sim.field.extinction import Surface
 from neural_sim.field.pixels import seen_pixels
-from neural_sim.field.quadrature import composite, composite_with_gradient, composite_with_tangents
-from neural_sim.field.samples import PackedSamples, sample_points
+from neural_sim.field.quadrature import (
+    PackedSamples,
+    composite,
+    composite_with_gradient,
+    composite_with_tangents,
+    sample_points,
+)
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2

@@ -7,9 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neural_sim.field.objective import Rendering, expected_errors
-from neural_sim.field.quadrature import composite, render_weights, sum_rays
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.quadrature import PackedSamples, composite, render_weights, sum_rays
+from neural_sim.field.scores import Rendering, expected_errors
 
 FREQUENCIES = 5
 SMALLEST_BETA = 0.03  # as in NeRF in the Wild

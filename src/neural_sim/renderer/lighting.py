@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le
 from jaxtyping import Float
 
+from neural_sim.ranges import Fraction, Matching, NonNegative, check, validated
+
 Vector = tuple[float, float, float]
+Kelvin = Annotated[float, Ge(1500.0), Le(40000.0)]
+"""Temperatures whose colour is known; colder bodies are outside sRGB's gamut."""
 
 SECOND_RADIATION_CONSTANT = 1.438777e7  # h c / k in nm K
 SRGB_FROM_XYZ = np.array(
@@ -22,6 +27,7 @@ LOBES = (
 """The CIE 1931 observer's x, y, z as sums of (height, centre, width below, width above) in nm (Wyman et al. 2013)."""
 
 
+@validated
 @dataclass(frozen=True)
 class Light:
     """A directional light. ``direction`` points towards it, in the world frame; it need not be of unit length.
@@ -30,24 +36,13 @@ class Light:
     ``fill`` is the part that arrives from all sides, as a room's walls scatter it.
     """
 
-    direction: Vector
+    direction: Annotated[Vector, Matching(any, "three numbers, not all of them zero")]
     intensity: float
-    colour: Vector = (1.0, 1.0, 1.0)
-    fill: float = 0.0
-
-    def __post_init__(self) -> None:
-        if len(self.direction) != 3 or not all(map(math.isfinite, self.direction)) or not any(self.direction):
-            raise ValueError(
-                f"light.direction: want three finite numbers, not all zero, got {self.direction}"
-            )
-        if not math.isfinite(self.intensity):
-            raise ValueError(f"light.intensity: want a finite number, got {self.intensity}")
-        if len(self.colour) != 3 or not all(0.0 <= value <= 1.0 for value in self.colour):
-            raise ValueError(f"light.colour: want three numbers in [0, 1], got {self.colour}")
-        if not 0.0 <= self.fill <= 1.0:
-            raise ValueError(f"light.fill: want a number in [0, 1], got {self.fill}")
+    colour: tuple[Fraction, Fraction, Fraction] = (1.0, 1.0, 1.0)
+    fill: Fraction = 0.0
 
 
+@validated
 @dataclass(frozen=True)
 class Lighting:
     """A white surface has the colour ``ambient`` plus what each of ``lights`` sheds on it.
@@ -56,11 +51,7 @@ class Lighting:
     """
 
     lights: tuple[Light, ...] = (Light((0.3, 0.4, 1.0), 0.3),)
-    ambient: float = 0.7
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.ambient) and self.ambient >= 0.0):
-            raise ValueError(f"lighting.ambient: want a finite number of at least 0, got {self.ambient}")
+    ambient: NonNegative = 0.7
 
 
 def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
@@ -77,10 +68,9 @@ def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.n
 def temperature_colour(kelvin: float) -> Vector:
     """SRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
 
-    Raises ``ValueError`` outside [1500, 40000] kelvin; colder bodies are outside sRGB's gamut.
+    Raises ``ValueError`` outside :data:`Kelvin`'s range.
     """
-    if not 1500.0 <= kelvin <= 40000.0:
-        raise ValueError(f"light: want a colour temperature in [1500, 40000] kelvin, got {kelvin}")
+    check(kelvin, Kelvin, "temperature_colour.kelvin")
     wavelength = np.arange(360.0, 831.0, 5.0)
     radiance = wavelength**-5 / np.expm1(SECOND_RADIATION_CONSTANT / (wavelength * kelvin))
     observer = np.stack([sum(_lobe(wavelength, *lobe) for lobe in lobes) for lobes in LOBES])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Annotated, Literal, Self
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from neural_sim.devices import at_once
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.field.rendering import SAMPLES_AT_ONCE, render_packed, render_views, render_with_tangents
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import Maps, PinholeCamera, Rays
 
 Quality = Literal["draft", "normal", "final"]
@@ -36,6 +38,7 @@ QUALITIES: dict[Quality, Omissions] = {
 }
 
 
+@validated
 class NerfRenderer:
     """Renders whole views at once, or any bundle of rays with derivatives.
 
@@ -49,32 +52,21 @@ class NerfRenderer:
         step: factor of the field's step, instead of the quality's.
         cull: cast rays only for pixels that may see the field's occupied cells; changes no pixel.
         skip_empty: step over space that the field knows to be empty; changes no pixel.
-
-    Raises:
-        ValueError: any of these out of its range.
     """
 
     def __init__(
         self,
         quality: Quality = "final",
-        rays_per_chunk: int = 65536,
-        termination: float | None = None,
-        step: float | None = None,
+        rays_per_chunk: PositiveInt = 65536,
+        termination: Annotated[float, Ge(0), Lt(1)] | None = None,
+        step: Positive | None = None,
         cull: bool = True,
         skip_empty: bool = True,
     ) -> None:
-        if quality not in get_args(Quality):
-            raise ValueError(f"NerfRenderer: quality must be one of {get_args(Quality)}, got {quality!r}")
         self.quality: Quality = quality
         omitted = QUALITIES[quality]
         self.termination = omitted.termination if termination is None else termination
         self.step = omitted.step if step is None else step
-        if not 0.0 <= self.termination < 1.0:
-            raise ValueError(f"NerfRenderer: termination must lie in [0, 1), got {self.termination}")
-        if not self.step > 0.0:
-            raise ValueError(f"NerfRenderer: step must be above 0, got {self.step}")
-        if rays_per_chunk < 1:
-            raise ValueError(f"NerfRenderer: rays_per_chunk must be at least 1, got {rays_per_chunk}")
         self.rays_per_chunk = rays_per_chunk
         self.cull, self.skip_empty = cull, skip_empty
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
-from neural_sim.field.quadrature import composite
-from neural_sim.field.samples import sample_points
+from neural_sim.field.quadrature import composite, sample_points
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import Maps, PinholeCamera, Rays
 

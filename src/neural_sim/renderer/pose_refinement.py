@@ -10,9 +10,11 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
@@ -20,12 +22,12 @@ from trimesh.registration import procrustes
 
 from neural_sim.alpha import premultiplied
 from neural_sim.cameras import resized
-from neural_sim.checks import at_least
 from neural_sim.field.base import RadianceField
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
-from neural_sim.field.hull import COARSEST
-from neural_sim.field.training import fit_field
+from neural_sim.field.hull import Resolution
+from neural_sim.field.recipe import fit_field
+from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.types import Maps, PosedViews
 
@@ -39,6 +41,7 @@ DAMPING = 1e-3
 VIEWS_AT_ONCE = 16
 
 
+@validated
 @dataclass(frozen=True)
 class PoseRefinement:
     """Corrects poses in rounds of a small field and steps of each camera.
@@ -50,31 +53,19 @@ class PoseRefinement:
         rounds: how often a field is fitted; 0: poses stay as they are given.
         updates: Gauss-Newton steps of each camera in a round.
         image_size: longer side in pixels to which larger views are reduced.
-        resolution: cells of the first rounds' fields along the unit sphere's diameter, a power of two from 32.
+        resolution: cells of the first rounds' fields along the unit sphere's diameter.
         steps: optimiser steps of each of these fields.
         batch_rays: rays of a step.
         seed: of the order of rays; not the run's seed, so that runs share views.
-
-    Raises:
-        ValueError: a number out of range.
     """
 
-    rounds: int = 0
-    updates: int = 4
-    image_size: int = 96
-    resolution: int = 64
-    steps: int = 60
-    batch_rays: int = 4096
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        at_least("objects.poses", 0, rounds=self.rounds, seed=self.seed)
-        at_least("objects.poses", 1, updates=self.updates, steps=self.steps, batch_rays=self.batch_rays)
-        at_least("objects.poses", 8, image_size=self.image_size)
-        if self.resolution < COARSEST or self.resolution & (self.resolution - 1):
-            raise ValueError(
-                f"objects.poses.resolution must be a power of two from {COARSEST}, got {self.resolution}"
-            )
+    rounds: NonNegativeInt = 0
+    updates: PositiveInt = 4
+    image_size: Annotated[int, Ge(8)] = 96
+    resolution: Resolution = 64
+    steps: PositiveInt = 60
+    batch_rays: PositiveInt = 4096
+    seed: NonNegativeInt = 0
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
         """The views at corrected poses. The last ``held_out`` views train no field, but their poses are corrected too.

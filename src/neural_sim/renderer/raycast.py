@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from PIL import Image
 from torch import Tensor
 
 from neural_sim.cameras import focal_lengths, rays
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
-from neural_sim.renderer.texture_sampling import Pyramid
 from neural_sim.types import PinholeCamera
 
 # Offsets from a pixel's centre, right and down: the usual rotated grid of OpenGL's 4x multisampling, which
@@ -128,3 +128,44 @@ def _barycentric(
     weights = np.clip(np.stack([1.0 - w1 - w2, w1, w2], -1), 0.0, 1.0)
     weights = weights / weights.sum(-1, keepdims=True)
     return weights, distance, facing / length, 0.5 * length
+
+
+class Pyramid:
+    """A texture and its halvings; ``sample`` blends the two levels next to the wanted footprint."""
+
+    def __init__(self, texture: UInt8[np.ndarray, "h w 3"]) -> None:
+        height, width = texture.shape[:2]
+        self.texels = height * width
+        self._levels = [np.asarray(texture, dtype=np.uint8)]
+        image = Image.fromarray(self._levels[0])
+        while max(width, height) > 1:
+            width, height = max(width // 2, 1), max(height // 2, 1)
+            image = image.resize((width, height), Image.Resampling.BOX)
+            self._levels.append(np.asarray(image))
+
+    def sample(self, uv: Float[np.ndarray, "n 2"], level: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """Colours in [0, 1]; ``uv`` wraps, v upwards; ``level`` is log2 of texels a sample, 0 or less: full size."""
+        level = np.clip(level, 0.0, len(self._levels) - 1.0)
+        low = np.floor(level).astype(np.int64)
+        part = (level - low)[:, None]
+        colour = np.zeros((len(uv), 3))
+        for number in np.unique(np.concatenate([low, low + 1])):
+            weight = np.where(
+                low[:, None] == number, 1.0 - part, np.where(low[:, None] + 1 == number, part, 0.0)
+            )
+            rows = np.flatnonzero(weight[:, 0] > 0.0)
+            if len(rows):
+                colour[rows] += weight[rows] * _bilinear(self._levels[number], uv[rows])
+        return colour / 255.0
+
+
+def _bilinear(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    height, width = texture.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    left, right = x0 % width, (x0 + 1) % width
+    top, bottom = y0 % height, (y0 + 1) % height
+    upper = texture[top, left] * (1.0 - fx) + texture[top, right] * fx
+    lower = texture[bottom, left] * (1.0 - fx) + texture[bottom, right] * fx
+    return upper * (1.0 - fy) + lower * fy

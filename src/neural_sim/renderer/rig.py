@@ -6,16 +6,28 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.renderer.lighting import Light, Lighting, temperature_colour
+from neural_sim.ranges import (
+    Ascending,
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveFraction,
+    PositiveInt,
+    validated,
+)
+from neural_sim.renderer.lighting import Kelvin, Light, Lighting, temperature_colour
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
+@validated
 @dataclass(frozen=True)
 class LightRig:
     """k anchor lights around an object, and mixtures of them: shade = ambient + sum_i w_i light_i.
@@ -26,25 +38,18 @@ class LightRig:
     ``ambient`` and the largest intensity add up to at most 1 and weights are those of a simplex.
     """
 
-    anchors: int = 6
-    temperature_range: tuple[float, float] = (2700.0, 9000.0)
-    intensity_range: tuple[float, float] = (0.5, 0.9)
-    fill: float = 0.35
-    ambient: float = 0.1
+    anchors: Annotated[int, Ge(2)] = 6
+    temperature_range: Annotated[tuple[Kelvin, Kelvin], Ascending()] = (2700.0, 9000.0)
+    intensity_range: Annotated[tuple[Positive, Positive], Ascending()] = (0.5, 0.9)
+    fill: Fraction = 0.35
+    ambient: NonNegative = 0.1
 
     def __post_init__(self) -> None:
-        if self.anchors < 2:
-            raise ValueError(f"lights.anchors: want at least 2, got {self.anchors}")
-        for name in ("temperature_range", "intensity_range"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise ValueError(f"lights.{name}: want two positive numbers in order, got {(low, high)}")
-        if self.ambient < 0.0 or self.ambient + self.intensity_range[1] > 1.0 + 1e-9:
+        if self.ambient + self.intensity_range[1] > 1.0 + 1e-9:
             raise ValueError(
                 "lights: ambient and the largest intensity must add up to at most 1, or white surfaces saturate; got "
                 f"{self.ambient} and {self.intensity_range[1]}"
             )
-        self.lights()  # a range out of bounds is found here
 
     def lights(self) -> tuple[Light, ...]:
         """The k anchors."""
@@ -76,6 +81,7 @@ class LightRig:
         return Lighting(tuple(lights), self.ambient)
 
 
+@validated
 @dataclass(frozen=True)
 class VariedLight:
     """The lights under which a field's training views are rendered.
@@ -85,14 +91,8 @@ class VariedLight:
     """
 
     rig: LightRig = field(default_factory=LightRig)
-    anchored: float = 0.5
-    mixtures: int = 12
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.anchored <= 1.0:
-            raise ValueError(f"lights.anchored: want a share in (0, 1], got {self.anchored}")
-        if self.mixtures < 1:
-            raise ValueError(f"lights.mixtures: want at least 1, got {self.mixtures}")
+    anchored: PositiveFraction = 0.5
+    mixtures: PositiveInt = 12
 
     def weights(self, count: int, generator: torch.Generator) -> Float[Tensor, "count k"]:
         """Each view's weights over the anchors, float32.

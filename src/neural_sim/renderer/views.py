@@ -9,15 +9,16 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.cameras import orbit
-from neural_sim.checks import at_least
 from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.ranges import Ascending, NonNegativeInt, PositiveInt, check, validated
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
@@ -25,6 +26,9 @@ from neural_sim.renderer.rig import LightRig, VariedLight
 from neural_sim.types import PinholeCamera, PosedViews
 
 log = logging.getLogger(__name__)
+
+Backend = Literal["auto", "pyrender", "raycast"]
+"""What draws meshes; auto: pyrender over EGL, else over OSMesa, else ray casting, which the log then says."""
 
 PROBE_SECONDS = 60
 # Draws one triangle: a context can be made and still fail at the first shader.
@@ -42,16 +46,17 @@ raise SystemExit(0 if depth.max() > 1.0 else 3)
 
 
 def choose_mesh_renderer(
-    backend: Literal["auto", "pyrender", "raycast"] = "auto",
+    backend: Backend = "auto",
     supersample: int = 2,
     lighting: Lighting | None = None,
 ) -> MeshRenderer:
-    """``auto``: pyrender over EGL, else over OSMesa, else ray casting, which the log then says.
+    """Return the renderer of a backend.
 
-    Raises ``ValueError`` for an unknown backend, ``RuntimeError`` where ``pyrender`` is demanded and no OpenGL answers.
+    Raises:
+        ValueError: an unknown backend.
+        RuntimeError: ``pyrender`` is demanded, and no OpenGL answers.
     """
-    if backend not in ("auto", "pyrender", "raycast"):
-        raise ValueError(f"renderer.backend: want auto, pyrender or raycast, got {backend!r}")
+    check(backend, Backend, "renderer.backend")
     if backend == "raycast":
         return RaycastRenderer(supersample, lighting)
     platform = opengl_platform()
@@ -117,6 +122,11 @@ def render_views(
     return PosedViews(images, camera_to_world, camera, weights)
 
 
+OutsideSphere = Annotated[float, Gt(1)]
+"""Distance of a camera outside of the object's bounding sphere, in object radii."""
+
+
+@validated
 @dataclass(frozen=True)
 class Views:
     """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Secs. 4 and B.2).
@@ -125,25 +135,17 @@ class Views:
     ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
     """
 
-    count: int = 100
-    held_out: int = 16
-    image_size: int = 128
-    field_of_view_deg: float = 40.0
-    distance_range: tuple[float, float] = (2.4, 4.0)
-    supersample: int = 2
-    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    count: PositiveInt = 100
+    held_out: NonNegativeInt = 16
+    image_size: PositiveInt = 128
+    field_of_view_deg: Annotated[float, Gt(0), Lt(180)] = 40.0
+    distance_range: Annotated[tuple[OutsideSphere, OutsideSphere], Ascending()] = (2.4, 4.0)
+    supersample: PositiveInt = 2
+    backend: Backend = "auto"
     lights: VariedLight | None = None
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
-        at_least("views", 1, count=self.count, image_size=self.image_size, supersample=self.supersample)
-        at_least("views", 0, held_out=self.held_out, seed=self.seed)
-        if self.backend not in ("auto", "pyrender", "raycast"):
-            raise ValueError(f"views.backend must be auto, pyrender or raycast, got {self.backend!r}")
-        if not 1.0 < self.distance_range[0] <= self.distance_range[1]:
-            raise ValueError(
-                f"views.distance_range must be ordered and above 1 radius, got {self.distance_range}"
-            )
         if self.lights is not None:
             self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
 

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import torch
 
 from neural_sim.field.base import RadianceField
-from neural_sim.field.recipe import FieldRecipe
-from neural_sim.field.training import field_from_state, field_state
+from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
 

@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neural_sim.field.quadrature import render_weights, sum_rays, transmittance
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.quadrature import PackedSamples, render_weights, sum_rays, transmittance
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.space import Frame, along_rays
 from neural_sim.types import Rays

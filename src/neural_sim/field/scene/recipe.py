@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, MultipleOf
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.checks import at_least
 from neural_sim.field.scene.finding import Found, find
 from neural_sim.field.scene.fitting import Budget, ScenePixels, fit
 from neural_sim.field.scene.grid import SceneGrid
@@ -20,6 +21,7 @@ from neural_sim.field.scene.space import Frame, looked_at
 from neural_sim.objects.capture import Capture
 from neural_sim.objects.pictures import Corners, Direction
 from neural_sim.objects.placing import mean_up
+from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 
 _log = logging.getLogger(__name__)
 
@@ -33,6 +35,7 @@ LEAST_PIXELS = 80
 """But photographs keep so many pixels along the longer side."""
 
 
+@validated
 @dataclass(frozen=True)
 class SceneMasks:
     """Masks from a field of the whole scene.
@@ -42,27 +45,17 @@ class SceneMasks:
 
     Args:
         image_size: longer side in pixels of the photographs that train the field, and of the masks.
-        resolution: cells of the field along each side of contracted space, a multiple of 4.
+        resolution: cells of the field along each side of contracted space.
         steps: optimiser steps, the budget.
         batch_rays: rays of a step.
         seed: of the order of rays; not the run's seed, so that runs share masks.
-
-    Raises:
-        ValueError: a number out of range.
     """
 
-    image_size: int = 160
-    resolution: int = 96
-    steps: int = 240
-    batch_rays: int = 2048
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        at_least("objects.scene", 1, steps=self.steps, batch_rays=self.batch_rays)
-        at_least("objects.scene", 16, image_size=self.image_size, resolution=self.resolution)
-        at_least("objects.scene", 0, seed=self.seed)
-        if self.resolution % 4:
-            raise ValueError(f"objects.scene.resolution must be a multiple of 4, got {self.resolution}")
+    image_size: Annotated[int, Ge(16)] = 160
+    resolution: Annotated[int, Ge(16), MultipleOf(4)] = 96
+    steps: PositiveInt = 240
+    batch_rays: PositiveInt = 2048
+    seed: NonNegativeInt = 0
 
     def masks(
         self, capture: Capture, up: Direction | None, box: Corners | None

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.field.quadrature import composite
-from neural_sim.field.samples import PackedSamples
+from neural_sim.field.quadrature import PackedSamples, composite
 from neural_sim.studies.work_precision.series import Order, Point, Series, Timing, slope
 
 SPAN = 2.0
