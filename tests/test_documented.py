@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from neural_sim import main as program
 from neural_sim.report.tracking import tracking_uri
-from neural_sim.tasks.walk import STEPS
+from neural_sim.tasks.walk import PHASES
 
 CONF = program.conf_directory()
 FILES = ("json", "md", "png", "py", "yaml", "db", "pt", "safetensors")
@@ -32,7 +32,7 @@ def compose_and_build(overrides):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", list(overrides))
     context, _ = program.context_of(config, Path("unused"))
-    if set(context.stages) & set(STEPS) and config.trainer.accelerator == "cpu":
+    if set(context.stages) & set(PHASES) and config.trainer.accelerator == "cpu":
         assert context.graph.names
 
 

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from neural_sim.configuration import conf_directory
 from neural_sim.main import UserError, context_of
-from neural_sim.tasks.walk import STEPS
+from neural_sim.tasks.walk import PHASES
 
 ROOT = Path(__file__).parents[1]
 CONF = conf_directory()
@@ -60,7 +60,7 @@ def test_every_experiment_composes_at_every_scale_and_builds(name, shared):
     ]
     assert len({repr(budget) for budget in budgets}) == 3
     context = made(f"+experiment={name}", f"paths.data={shared}", *labels(name, shared))
-    if set(context.stages) & set(STEPS):
+    if set(context.stages) & set(PHASES):
         assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
 
 

@@ -103,40 +103,42 @@ Recompose = Callable[[Sequence[str]], DictConfig]
 def context_of(
     config: DictConfig, folder: Path, recompose: Recompose | None = None
 ) -> tuple[Context, dict[str, Task]]:
-    """A run in ``folder``, and those of its stages that are none from objects to a report, by name.
+    """Return a run in ``folder`` and its tasks by name: phases of a run first, in their order.
 
-    The experiment is built at once if a stage needs it, so that bad settings are refused before any stage runs. With
-    ``recompose`` stages can build the experiment of another method.
+    The experiment is built at once where phases of a run are asked for, so that bad settings are refused before
+    anything else. With ``recompose`` tasks can build the experiment of another method.
 
     Raises:
-        UserError: as :func:`build`, and for an unknown stage.
+        UserError: as :func:`build`, and for an unknown entry of ``stages``.
     """
     plain = _plain(config)
     from neural_sim.tasks.context import Context
-    from neural_sim.tasks.walk import STEPS
+    from neural_sim.tasks.walk import PHASES
 
+    phases = {name: phase for name, phase in PHASES.items() if name in plain["stages"]}
     others: dict[str, Task] = {}
     for name in plain["stages"]:
-        if name in STEPS:
+        if name in PHASES:
             continue
-        node = plain.get(name)
-        if not isinstance(node, Mapping) or "_target_" not in node:
-            known = [*STEPS, *(key for key, value in plain.items() if _is_step(value))]
+        if not _is_task(plain.get(name)):
+            known = [*PHASES, *(key for key, value in plain.items() if _is_task(value))]
             raise UserError(f"stages: unknown stage {name!r}, want some of {', '.join(known)}")
-        others[name] = _instantiate(node, name)
-    wanted = {*plain["stages"], *(name for step in others.values() for name in getattr(step, "needs", ()))}
-    context = Context(plain, folder, lambda: _build(plain), (*(n for n in STEPS if n in wanted), *others))
+        others[name] = _instantiate(plain[name], name)
+    context = Context(plain, folder, lambda: _build(plain), (*phases, *others))
     if recompose is not None:
         context.of_method = lambda method: _build(_plain(recompose([f"baseline={method}"])))
-    if wanted & set(STEPS):
+    if phases:
         _ = context.experiment
-    return context, others
+    return context, {**phases, **others}
 
 
-def _is_step(node: Any) -> bool:
-    return isinstance(node, Mapping) and "_target_" in node and callable(
-        getattr(hydra.utils.get_object(node["_target_"]), "run", None)
-    )  # fmt: skip
+def _is_task(node: Any) -> bool:
+    if not isinstance(node, Mapping) or "_target_" not in node:
+        return False
+    from neural_sim.tasks.context import Task
+
+    kind = hydra.utils.get_object(node["_target_"])
+    return isinstance(kind, type) and issubclass(kind, Task)
 
 
 def _camera(parts: Mapping[str, Any]) -> Any:
@@ -212,10 +214,10 @@ def _task(config: DictConfig) -> float | None:
     try:
         given = list(runtime.overrides.task)
         folder, name = Path(runtime.runtime.output_dir), runtime.job.config_name
-        context, others = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
+        context, tasks = context_of(config, folder, lambda more: hydra.compose(name, _with(given, more)))
         from neural_sim.tasks.walk import walk
 
-        return walk(context, others)
+        return walk(context, tasks)
     except (ValueError, FileNotFoundError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise

@@ -162,7 +162,8 @@ def test_figures_are_written(results, tmp_path):
 
 
 def live(uri, results):
-    return live_run(uri, "pose_gap", "neural_sim", 3, results.names, results.biased, results.config)
+    config = {"name": "pose_gap", "seed": 3, **results.config}
+    return live_run(uri, config, "neural_sim", results.names, results.biased)
 
 
 def steps(uri, run_id, key):

@@ -1,4 +1,4 @@
-"""A stage from outside the package: one class, one configuration node."""
+"""A task from outside the package: one class, one configuration node."""
 
 import os
 import subprocess
@@ -15,9 +15,11 @@ ROOT = Path(__file__).parents[2]
 PLUGIN = '''
 from dataclasses import dataclass
 
+from neural_sim.tasks.context import Task, TaskFailure
+
 
 @dataclass(frozen=True)
-class Count:
+class Count(Task):
     """Counts the objects and writes the number."""
 
     times: int = 1
@@ -26,20 +28,18 @@ class Count:
         (context.folder / "count.txt").write_text(str(self.times * len(context.graph.names)))
 
 
-class Fail:
+class Fail(Task):
     def run(self, context):
-        from neural_sim.tasks.context import TaskFailure
-
         raise TaskFailure("two checks failed")
 '''
 
 
 @pytest.fixture
 def plugin(tmp_path, monkeypatch):
-    (tmp_path / "my_stage.py").write_text(PLUGIN)
+    (tmp_path / "my_task.py").write_text(PLUGIN)
     monkeypatch.syspath_prepend(tmp_path)
     yield
-    sys.modules.pop("my_stage", None)
+    sys.modules.pop("my_task", None)
 
 
 def context(folder, *overrides):
@@ -48,27 +48,27 @@ def context(folder, *overrides):
     return context_of(config, folder)
 
 
-def test_a_stage_from_outside_is_one_class_and_one_node(tmp_path, plugin):
-    overrides = ["+count={_target_: my_stage.Count, times: 2}", "stages=[count]"]
+def test_a_task_from_outside_is_one_class_and_one_node(tmp_path, plugin):
+    overrides = ["+count={_target_: my_task.Count, times: 2}", "stages=[count]"]
     assert walk(*context(tmp_path, *overrides)) is None
     assert (tmp_path / "count.txt").read_text() == "12"
 
 
 def test_its_settings_are_checked_like_all_others(tmp_path, plugin):
     with pytest.raises(UserError, match=r"count.times: want int, got 'two'"):
-        context(tmp_path, "+count={_target_: my_stage.Count, times: two}", "stages=[count]")
+        context(tmp_path, "+count={_target_: my_task.Count, times: two}", "stages=[count]")
 
 
 def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin):
     with pytest.raises(UserError) as caught:
-        context(tmp_path, "+count={_target_: my_stage.Count}", "stages=[views,fields]")
+        context(tmp_path, "+count={_target_: my_task.Count}", "stages=[views,fields]")
     known = "views, field, target_sets, warm_start, psi, evaluate, report"
     more = "preflight, repeat, predict, export, viewer, count"
     assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}, {more}"
 
 
-def test_a_stage_that_finds_a_failure_makes_the_exit_status_one(tmp_path, plugin):
-    arguments = ["+fail={_target_: my_stage.Fail}", "stages=[fail]", f"hydra.run.dir={tmp_path}/run"]
+def test_a_task_that_finds_a_failure_makes_the_exit_status_one(tmp_path, plugin):
+    arguments = ["+fail={_target_: my_task.Fail}", "stages=[fail]", f"hydra.run.dir={tmp_path}/run"]
     command = [sys.executable, "-m", "src.main", *arguments]
     places = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
     environment = {**os.environ, "PYTHONPATH": places}

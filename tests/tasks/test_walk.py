@@ -91,30 +91,43 @@ def test_without_evaluation_there_is_no_score(folder, returned):
     assert walk(*_context(folder, "stages=[views,field]")) is None
 
 
-def test_what_no_asked_stage_makes_must_be_in_the_store(folder, returned, tmp_path):
-    with pytest.raises(ValueError, match=r"views of pitcher is not in .*; add stage views to \['field'\]"):
-        walk(*_context(tmp_path, "stages=[field]"))
-    context, steps = _context(folder, "stages=[psi]")
-    assert walk(context, steps) is None
-    assert {omission.why for omission in context.account.left_out if omission.stage == "psi"} >= {
-        "baseline=ns keeps its distribution"
+def test_what_is_wanted_is_made_with_all_that_it_needs(folder, returned, tmp_path, caplog):
+    """The same psi as in the phases' order, each result charged to its own phase."""
+    loop = ["baseline=lts", "outer.iterations=1", "outer.images_per_object=4", "budget.outer.pool_per_bin=4"]
+    context, tasks = _context(tmp_path, *loop, "stages=[psi]")
+    with caplog.at_level(logging.INFO):
+        assert walk(context, tasks) is None
+    assert "to make: views 2, field 2, warm_start 1, target_sets 1, psi 1\n" in caplog.text
+    made = {path.parent.name for path in (tmp_path / "store").rglob("*.pt")}
+    assert made == {"views", "field", "target", "detector", "psi"}
+    seconds = context.account.seconds
+    assert {*seconds} == {"views", "field", "target_sets", "warm_start", "psi"}
+    assert min(seconds.values()) > 0.0
+    assert all(omission.why != "found in the store" for omission in context.account.left_out)
+    ordered, tasks = _context(folder, *loop, "stages=[views,field,target_sets,warm_start,psi]")
+    walk(ordered, tasks)
+    assert torch.equal(
+        context.results(context.graph.learned).last, ordered.results(ordered.graph.learned).last
+    )
+
+
+def test_what_the_store_has_is_read_and_said(folder, returned):
+    context, tasks = _context(folder, "stages=[evaluate]")
+    assert walk(context, tasks) == returned
+    found = {(each.stage, each.what) for each in context.account.left_out if each.why == "found in the store"}
+    assert ("psi", "psi loop") in found and not {"views", "field", "warm_start"} & {
+        stage for stage, _ in found
     }
+    left_out = {each.why for each in context.account.left_out if each.stage == "psi"}
+    assert "baseline=ns keeps its distribution" in left_out
 
 
-@pytest.mark.parametrize(
-    ("stages", "missing", "named"),
-    [
-        ("target_sets,warm_start", "field of pitcher", "field"),
-        ("views,target_sets,psi", "detector trained on the uniform distribution", "warm_start"),
-        ("views,field,target_sets,evaluate", "psi loop", "psi"),
-    ],
-)
-def test_a_missing_stage_is_refused_before_any_work(stages, missing, named, tmp_path):
-    """Such as a field that is missed only after minutes of rendering a target."""
-    context, steps = _context(tmp_path, f"stages=[{stages}]", "baseline=neural_sim")
-    with pytest.raises(ValueError, match=rf"stages: {missing} is not in .*; add stage {named} to \["):
-        walk(context, steps)
-    assert not (tmp_path / "store").exists() and not context.account.seconds
+def test_a_task_is_refused_before_what_it_reads_is_made_or_tracked(tmp_path):
+    context, tasks = _context(tmp_path, "stages=[views,report,preflight]")
+    with pytest.raises(ValueError, match="preflight wants a method that follows the hypergradient"):
+        walk(context, tasks)
+    assert not (tmp_path / "store").exists() and not (tmp_path / "mlflow.db").exists()
+    assert not context.account.seconds
 
 
 def test_a_method_that_keeps_its_distribution_needs_no_detector(tmp_path):

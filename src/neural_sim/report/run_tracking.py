@@ -75,15 +75,14 @@ class LiveRun:
 @contextmanager
 def live_run(
     uri: str,
-    experiment: str,
+    config: Mapping[str, Any],
     method: str,
-    seed: int,
     names: Sequence[str],
     biased: Sequence[str],
-    config: Mapping[str, Any],
+    begun: float | None = None,
 ) -> Iterator[LiveRun]:
     """A run with the configuration as its parameters, RUNNING inside, see :func:`tracking.opened`."""
-    gap = config.get("gap", "disjoint")
+    seed, gap = config["seed"], config.get("gap", "disjoint")
     name = f"{method} seed {seed}" + ("" if gap == "disjoint" else f" gap {gap}")
     tags = {
         "method": method,
@@ -92,7 +91,7 @@ def live_run(
         "biased": ",".join(biased),
         "gap": gap,
     }
-    with tracking.opened(uri, experiment, name, tags, tracking.flatten(config)) as run:
+    with tracking.opened(uri, config["name"], name, tags, tracking.flatten(config), begun) as run:
         yield LiveRun(run, names)
 
 

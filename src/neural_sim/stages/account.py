@@ -1,18 +1,23 @@
-"""What a run cost, and the work that it did not have to do."""
+"""What a run cost by its phases, and the work that it did not have to do."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
-
-from neural_sim.stages.stage import Stage
-from neural_sim.stages.store import Entry
 
 
 @dataclass(frozen=True)
 class Omission:
-    """Work that a run leaves out, and why. ``fraction`` is relative to all work of that kind, ``seconds`` what it would
-    take, where they are known.
+    """Work that a run leaves out.
+
+    Args:
+        stage: the phase of the run that would do it.
+        what: the work.
+        why: the reason.
+        fraction: of all work of that kind, None if unknown.
+        seconds: what it would take, None if unknown.
     """
 
     stage: str
@@ -24,11 +29,35 @@ class Omission:
 
 @dataclass
 class Account:
-    """Seconds by stage, and what was left out."""
+    """Seconds by phase of a run, and what was left out.
+
+    A phase is charged for the time between beginning and end without that of the phases inside it: a field counts as
+    a field whoever asks for it.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
     left_out: list[Omission] = field(default_factory=list)
+    _running: list[str] = field(default_factory=list)
+    _since: float = 0.0
 
-    def reused(self, stage: Stage[Any], entry: Entry) -> None:
-        """Count a result that the store had."""
-        self.left_out.append(Omission(stage.name, stage.title, "found in the store", 1.0, entry.seconds))
+    @contextmanager
+    def charged(self, phase: str) -> Iterator[None]:
+        """Charge the time inside to a phase."""
+        self._settle()
+        self._running.append(phase)
+        try:
+            yield
+        finally:
+            self._settle()
+            self._running.pop()
+
+    def _settle(self) -> None:
+        now = time.perf_counter()
+        if self._running:
+            phase = self._running[-1]
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self._since
+        self._since = now
+
+    def reused(self, phase: str, what: str, seconds: float) -> None:
+        """Note a result that the store had, and the seconds that it took when it was computed."""
+        self.left_out.append(Omission(phase, what, "found in the store", 1.0, seconds))

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.real import Sampling
@@ -62,6 +63,10 @@ class TrainedStage(Stage[TrainedDetector]):
         camera = self.camera
         return self.detector(num_classes=len(self.names), image_size=(camera.height, camera.width))
 
+    @override
+    def check(self) -> None:
+        self.build()  # refuses initial weights that are missing or do not fit
+
     def pack(self, value: TrainedDetector) -> dict[str, Any]:
         return {"params": placed(value.params, CPU), "cost": dataclasses.asdict(value.cost)}
 
@@ -73,7 +78,7 @@ class TrainedStage(Stage[TrainedDetector]):
 class DetectorStage(TrainedStage):
     """A detector trained from scratch on images drawn from psi, with the same budget for every method.
 
-    ``probabilities`` is the digest of p, see :meth:`SceneDistribution.digest_of`; ``name`` is that of the stage that
+    ``probabilities`` is the digest of p, see :meth:`SceneDistribution.digest_of`; ``phase`` is that of the run which
     needs the detector, ``called`` describes psi in messages. ``targets`` are the sets whose photographs train too,
     where ``training.real`` combines both (None: it does not).
     """
@@ -85,7 +90,7 @@ class DetectorStage(TrainedStage):
     probabilities: str
     seed: int
     psi: Float[Tensor, "objects K"] = field(metadata=UNKEYED)
-    name: str = field(metadata=UNKEYED)
+    phase: str = field(metadata=UNKEYED)
     called: str = field(metadata=UNKEYED)
     device: torch.device = field(default=CPU, metadata=UNKEYED)
     targets: TargetSetsStage | None = None
@@ -156,7 +161,7 @@ class PhotographsStage(TrainedStage):
     over them.
     """
 
-    name: ClassVar[str] = "evaluate"
+    phase: ClassVar[str] = "evaluate"
 
     start: DetectorStage | None
     targets: TargetSetsStage

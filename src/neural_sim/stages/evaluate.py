@@ -27,7 +27,7 @@ class Scores:
 class ScoresStage(Stage[Scores]):
     """A detector's scores on ``part`` of the target sets."""
 
-    name: ClassVar[str] = "evaluate"
+    phase: ClassVar[str] = "evaluate"
     kind: ClassVar[str] = "evaluate"
 
     trained: TrainedStage

@@ -26,7 +26,7 @@ class FittedField:
 class FieldStage(Stage[FittedField]):
     """The field that ``recipe`` fits to all views but the held-out ones."""
 
-    name: ClassVar[str] = "field"
+    phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "field"
 
     views: ViewsStage

@@ -209,7 +209,7 @@ class Graph:
         return replace(x.training, warm_start="initial", real=real)
 
     def _detector(
-        self, psi: Psi, epochs: int, name: str, called: str, photographs: bool = True
+        self, psi: Psi, epochs: int, phase: str, called: str, photographs: bool = True
     ) -> DetectorStage:
         """A detector trained on a distribution, and on photographs where the training combines both."""
         x, training = self.experiment, self._training
@@ -218,7 +218,7 @@ class Graph:
             training = replace(training, real=Real())
         probabilities = x.imaging.distribution.digest_of(psi)
         return DetectorStage(
-            self.scene, x.detector, training, epochs, probabilities, x.run.seed, psi, name, called, self.device,
+            self.scene, x.detector, training, epochs, probabilities, x.run.seed, psi, phase, called, self.device,
             self.targets if combined else None,
         )  # fmt: skip
 
@@ -291,3 +291,14 @@ class Graph:
         last = len(learned.trajectory) - 1
         asked = {0, last, *(math.floor(part * last + 0.5) for part in self.experiment.run.score_at)}
         return {iteration: learned.trajectory[iteration] for iteration in sorted(asked)}
+
+    def validation(self, learned: LearnedPsi) -> ScoresStage:
+        """Return the validation scores of the detector that is scored as ``learned``."""
+        return self.scores(learned.last, "learned", "val")
+
+    def evaluated(self, learned: LearnedPsi) -> list[ScoresStage]:
+        """Return all scores that a run makes."""
+        on_the_way = [
+            self.scores(psi, f"psi after {i} iterations") for i, psi in self.on_the_way(learned).items()
+        ]
+        return [*self.compared(learned).values(), *on_the_way, self.validation(learned)]

@@ -22,7 +22,7 @@ class MasksStage(Stage[Computed]):
     is the source's, with its budget. Not the run's seed, so that runs share masks.
     """
 
-    name: ClassVar[str] = "views"
+    phase: ClassVar[str] = "views"
     kind: ClassVar[str] = "masks"
     keep: ClassVar[bool] = False  # read once, by the views
 

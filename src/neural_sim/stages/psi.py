@@ -50,7 +50,7 @@ class PsiStage(Stage[LearnedPsi]):
         ValueError: ``outer.loop_layers`` of a backbone that has no such stages; here, before fields are trained.
     """
 
-    name: ClassVar[str] = "psi"
+    phase: ClassVar[str] = "psi"
     kind: ClassVar[str] = "psi"
 
     warm_start: DetectorStage

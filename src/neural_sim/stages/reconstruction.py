@@ -23,7 +23,7 @@ from neural_sim.synthesis.subjects import SubjectScene
 class ReconstructionStage(Stage[trimesh.Trimesh]):
     """The mesh of all views but the held-out ones, see :func:`reconstruct`."""
 
-    name: ClassVar[str] = "field"
+    phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "reconstruction"
 
     views: ViewsStage

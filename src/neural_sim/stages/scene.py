@@ -21,7 +21,7 @@ class SceneStage(Stage[Scene]):
     in radii.
     """
 
-    name: ClassVar[str] = "field"
+    phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"
     stored: ClassVar[bool] = False
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
 
 from neural_sim.digests import digest
+from neural_sim.stages.account import Account
 from neural_sim.stages.describe import describe, modules_of
-from neural_sim.stages.store import Entry, Store
+from neural_sim.stages.store import Store
 from neural_sim.stages.version import code_version
 
 T = TypeVar("T")
-_log = logging.getLogger(__name__)
 
 
 UNKEYED = {"key": False}
@@ -30,8 +29,8 @@ class Stage(ABC, Generic[T]):
     result is computed, or follow from other fields.
     """
 
-    name: str
-    """The stage that ``stages=[...]`` must list in order to compute a result that is not stored."""
+    phase: str
+    """The phase of a run that is charged for the result."""
     kind: str
     """The folder of the store."""
     keep: ClassVar[bool] = True
@@ -40,20 +39,32 @@ class Stage(ABC, Generic[T]):
     """Whether the result goes to the store; what is quickly put together from inputs stays in memory."""
 
     @property
+    def early(self) -> bool:
+        """Whether the result is made before all others, because what the user gave for it may be unusable."""
+        return False
+
+    def check(self) -> None:
+        """Refuse now what :meth:`make` would refuse, as far as that shows without results of other stages.
+
+        Raises:
+            ValueError: as :meth:`make`.
+        """
+
+    @property
     @abstractmethod
     def title(self) -> str:
-        """The result in words, for messages."""
+        """Return the result in words, for messages."""
 
     @abstractmethod
     def make(self, results: Results) -> T:
-        """The result, from those of the inputs."""
+        """Return the result, made from those of the inputs."""
 
     def pack(self, value: T) -> Any:
-        """The result as tensors, numbers, strings, and lists and dictionaries of these."""
+        """Return the result as tensors, numbers, strings, and lists and dictionaries of these."""
         return value
 
     def unpack(self, stored: Any) -> T:
-        """Inverse of :meth:`pack`."""
+        """Return the result that was packed."""
         return stored
 
     @property
@@ -99,61 +110,67 @@ class Results:
 
     Args:
         store: where results are kept.
-        asked: names of the stages that may be computed; results of others must be in the store.
-        reused: called with every result that the store had.
+        account: is charged for every result, and told of those that the store had.
     """
 
-    def __init__(
-        self, store: Store, asked: Collection[str], reused: Callable[[Stage[Any], Entry], None] | None = None
-    ) -> None:
-        self._store, self._asked, self._reused = store, tuple(asked), reused
+    def __init__(self, store: Store, account: Account | None = None) -> None:
+        self._store, self._account = store, Account() if account is None else account
         self._kept: dict[str, Any] = {}
-        self._checked: set[str] = set()
+        self._seen: set[str] = set()
 
     def __call__(self, stage: Stage[T]) -> T:
-        """The stage's result.
-
-        Raises:
-            ValueError: a result that the store lacks, of a stage that was not asked for.
-        """
+        """Return the stage's result."""
         name = f"{stage.kind} {stage.key}"
         if name in self._kept:
             return self._kept[name]
-
-        def make() -> Any:
-            self._refuse_unasked(stage)
-            return stage.pack(stage.make(self))
-
-        if not stage.stored:
-            self._kept[name] = stage.make(self)
-            return self._kept[name]
-        entry = self._store.fetch(stage.kind, stage.key, stage.description, make)
-        if entry.reused and self._reused is not None:
-            self._reused(stage, entry)
-        value = stage.unpack(entry.value)
+        with self._account.charged(stage.phase):
+            value = self._stored(stage, name) if stage.stored else stage.make(self)
         if stage.keep:
             self._kept[name] = value
         return value
 
-    def check(self, stage: Stage[Any]) -> None:
-        """Refuse now what evaluating the stage would refuse, perhaps after minutes of work on other results.
+    def _stored(self, stage: Stage[T], name: str) -> T:
+        entry = self._store.fetch(
+            stage.kind, stage.key, stage.description, lambda: stage.pack(stage.make(self))
+        )
+        if entry.reused and name not in self._seen:
+            self._account.reused(stage.phase, stage.title, entry.seconds)
+        self._seen.add(name)
+        return stage.unpack(entry.value)
+
+    def missing(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
+        """Return the stages whose results would be computed in order to evaluate these, inputs first."""
+        found: list[Stage[Any]] = []
+        seen = set(self._kept)
+
+        def visit(stage: Stage[Any]) -> None:
+            name = f"{stage.kind} {stage.key}"
+            if name in seen:
+                return
+            seen.add(name)
+            if stage.stored and self._store.has(stage.kind, stage.key):
+                return
+            for needed in stage.needed:
+                visit(needed)
+            found.append(stage)
+
+        for stage in stages:
+            visit(stage)
+        return found
+
+    def check(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
+        """Refuse now what evaluating the stages would refuse, perhaps after minutes of work on other results.
+
+        Returns:
+            The stages that would be computed, see :meth:`missing`; those that are to be made early are made already.
 
         Raises:
-            ValueError: as evaluating it.
+            ValueError: as evaluating them.
         """
-        name = f"{stage.kind} {stage.key}"
-        if name in self._kept or name in self._checked:
-            return
-        if stage.stored:
-            if self._store.has(stage.kind, stage.key):
-                return
-            self._refuse_unasked(stage)
-        for needed in stage.needed:
-            self.check(needed)
-        self._checked.add(name)
-
-    def _refuse_unasked(self, stage: Stage[Any]) -> None:
-        if stage.name not in self._asked:
-            raise ValueError(
-                f"stages: {stage.title} is not in {self._store.root}; add stage {stage.name} to {list(self._asked)}"
-            )
+        missing = self.missing(stages)
+        for stage in missing:
+            stage.check()
+        for stage in missing:
+            if stage.early:
+                self(stage)
+        return missing

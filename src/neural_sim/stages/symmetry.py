@@ -19,7 +19,7 @@ class SymmetryStage(Stage[list[list[int]]]):
     field of an object that there is no mesh of.
     """
 
-    name: ClassVar[str] = "report"
+    phase: ClassVar[str] = "report"
     kind: ClassVar[str] = "symmetry"
 
     object: str

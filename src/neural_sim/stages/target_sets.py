@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
@@ -38,7 +39,7 @@ class TargetSetsStage(Stage[TargetSets]):
     that have none.
     """
 
-    name: ClassVar[str] = "target_sets"
+    phase: ClassVar[str] = "target_sets"
     kind: ClassVar[str] = "target"
 
     target: Target
@@ -54,6 +55,13 @@ class TargetSetsStage(Stage[TargetSets]):
     @property
     def title(self) -> str:
         return "target sets"
+
+    @property
+    @override
+    def early(self) -> bool:
+        return not getattr(
+            self.target, "renders", True
+        )  # photographs that cannot be used are refused at once
 
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}

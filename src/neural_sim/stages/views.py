@@ -20,7 +20,7 @@ from neural_sim.types import PinholeCamera, PosedViews
 class ViewsStage(Stage[PosedViews]):
     """Views of one object; ``content`` is the digest of its mesh. Not the run's seed, so that runs share them."""
 
-    name: ClassVar[str] = "views"
+    phase: ClassVar[str] = "views"
     kind: ClassVar[str] = "views"
     keep: ClassVar[bool] = False  # large, read once
 

@@ -19,13 +19,13 @@ from neural_sim.report.intervals import bounds, points
 from neural_sim.report.page import render
 from neural_sim.report.page.verdict import POINTS, listed
 from neural_sim.report.runs import FinishedRun, Group, LeftOut, Runs, by_reason, select
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of processor time"}
 
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(Task):
     """Compare finished runs of MLflow experiments, each experiment by itself and at each gap.
 
     Args:

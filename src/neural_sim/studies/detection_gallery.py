@@ -18,8 +18,8 @@ from neural_sim.detector.metrics import AveragePrecision
 from neural_sim.documents import markdown_table
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
-from neural_sim.studies.graphs import check_methods, graphs_of_methods, results_of_study
-from neural_sim.tasks.context import Context
+from neural_sim.studies.graphs import check_methods, graphs_of_methods
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
 RIGHT, WRONG, MISSED = "#2ca25f", "#d7301f", "#ffd23f"
@@ -57,7 +57,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class DetectionGallery:
+class DetectionGallery(Task):
     """``+experiment=detection_gallery``.
 
     Args:
@@ -86,7 +86,7 @@ class DetectionGallery:
         """Train a detector on what every method learned, and publish the figure, counts and AP."""
         context.experiment.check_boxes("detection_gallery")
         graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
-        results = results_of_study(context)
+        results = context.results
         test = results(context.graph.targets).test
         found = {}
         for method, graph in graphs.items():

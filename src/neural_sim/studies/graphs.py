@@ -6,11 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.stage import Results
-from neural_sim.stages.store import Store
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.tasks.context import Context
-from neural_sim.tasks.walk import STEPS
 
 
 def check_methods(methods: Sequence[str], key: str) -> None:
@@ -43,11 +40,6 @@ def graphs_of_seeds(context: Context, seeds: int) -> list[Graph]:
     x = context.experiment
     x.check_boxes("a comparison of sources of images")
     return [Graph(replace(x, run=replace(x.run, seed=x.run.seed + i))) for i in range(seeds)]
-
-
-def results_of_study(context: Context) -> Results:
-    """Return the context's results, which also computes what a study compares and ``stages`` does not list."""
-    return Results(Store(context.experiment.run.store), {*context.stages, *STEPS}, context.account.reused)
 
 
 def sets_of_kinds(graph: Graph, kinds: Mapping[str, Sequence[int]]) -> dict[str, TargetSetsStage]:

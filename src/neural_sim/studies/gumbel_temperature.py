@@ -24,7 +24,7 @@ from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run
 from neural_sim.studies.frozen import FrozenLoop, centred
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 BIAS, SPREAD = METHOD_COLOURS["learned"], "#e08a1e"
 LEAST = 1e-2
@@ -67,7 +67,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Temperatures:
+class Temperatures(Task):
     """``+experiment=gumbel_temperature``.
 
     Args:

@@ -18,7 +18,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.report.figures import INK, MUTED
 from neural_sim.report.tracking import Run
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PinholeCamera
 
 UNCHANGED = 1e-6
@@ -34,7 +34,7 @@ class InterpolatedViews:
 
 
 @dataclass(frozen=True)
-class Interpolation:
+class Interpolation(Task):
     """``+experiment=illumination_interpolation``: every object from one camera, from one anchor light to another.
 
     Args:

@@ -13,17 +13,17 @@ from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.meshes import Meshes
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
-from neural_sim.studies.graphs import graphs_of_seeds, results_of_study, sets_of_kinds
+from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
 from neural_sim.studies.sources import compare_sources, publish, training_images
 from neural_sim.target.coco import CocoTarget
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 """Where BlenderProc's ``write_coco_annotations`` writes, in its output folder."""
 
 
 @dataclass(frozen=True)
-class NerfVsMesh:
+class NerfVsMesh(Task):
     """``+experiment=nerf_vs_mesh``: one detector trained on images of the fields and of the meshes.
 
     Both have the same poses and distances, and are scored on images of one and of several objects.
@@ -86,7 +86,7 @@ class NerfVsMesh:
             raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
         if not x.imaging.target.renders:
             raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")
-        graphs, results = graphs_of_seeds(context, self.seeds), results_of_study(context)
+        graphs, results = graphs_of_seeds(context, self.seeds), context.results
         kinds = {"single": self.single, "multiple": self.multiple}
         found = compare_sources(
             graphs, results, self.sources, lambda graph: sets_of_kinds(graph, kinds), self.draws

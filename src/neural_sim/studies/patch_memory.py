@@ -22,7 +22,7 @@ from neural_sim.report.tracking import Run
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.synthesis.draws import HARD
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import Maps
 
 FORWARD, WHOLE = "forward", "reverse, whole image"
@@ -56,7 +56,7 @@ class PatchCost:
 
 
 @dataclass(frozen=True)
-class PatchMemory:
+class PatchMemory(Task):
     """``+experiment=patch_memory``.
 
     Args:

@@ -16,8 +16,8 @@ from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.stage import Results
-from neural_sim.studies.graphs import check_methods, graphs_of_methods, results_of_study
-from neural_sim.tasks.context import Context
+from neural_sim.studies.graphs import check_methods, graphs_of_methods
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
 
@@ -36,7 +36,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class SamplesGallery:
+class SamplesGallery(Task):
     """``+experiment=samples_gallery``.
 
     Args:
@@ -69,7 +69,7 @@ class SamplesGallery:
         if not names or set(names) - set(graph.names):
             raise ValueError(f"samples_gallery.objects: want some of {list(graph.names)}, got {list(names)}")
         graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
-        results = results_of_study(context)
+        results = context.results
         learned = {method: results(other.learned).last for method, other in graphs.items()}
         drawn = {method: self._drawn(graphs[method], results, psi) for method, psi in learned.items()}
         test = results(graph.targets).test

@@ -26,9 +26,9 @@ from neural_sim.stages.graph import Graph
 from neural_sim.stages.other_images import trained_on
 from neural_sim.stages.reconstruction import ReconstructionDetectorStage, ReconstructionStage
 from neural_sim.stages.stage import Results
-from neural_sim.studies.graphs import graphs_of_seeds, results_of_study
+from neural_sim.studies.graphs import graphs_of_seeds
 from neural_sim.studies.sources import More, compare_sources, publish, training_images
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PosedViews
 
 UNLIT = Lighting(lights=(), ambient=1.0)
@@ -49,7 +49,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class SfmVsNerf:
+class SfmVsNerf(Task):
     """``+experiment=sfm_vs_nerf``: what a reconstructed mesh lacks that a field has.
 
     Args:
@@ -81,7 +81,7 @@ class SfmVsNerf:
         Raises:
             ValueError: no held-out view.
         """
-        x, results = context.experiment, results_of_study(context)
+        x, results = context.experiment, context.results
         graphs, names = graphs_of_seeds(context, self.seeds), list(context.graph.names)
         if not x.imaging.views.held_out:
             raise ValueError("sfm_vs_nerf: want views.held_out of at least 1, got 0")

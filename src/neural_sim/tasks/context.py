@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -23,7 +24,7 @@ from neural_sim.report.tracking import Run, flatten, log_run, tracking_uri
 from neural_sim.stages.account import Account
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.stage import Results
+from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.store import Store
 
 _log = logging.getLogger(__name__)
@@ -34,14 +35,22 @@ class TaskFailure(RuntimeError):
     """A task has written its results, which include a failure: the program's exit status is 1."""
 
 
-class Task(Protocol):
-    """An entry of ``stages`` that is no stage: it reads results of stages and writes to the run's folder.
+class Task(ABC):
+    """An entry of ``stages``: something that a user asks for, as a frozen dataclass of its settings."""
 
-    A task that needs stages from objects to a report names them in ``needs``; they run before it.
-    """
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        """Return the stages whose results the task will read, as far as that is known before it runs.
 
+        What these would refuse is refused before any task runs; so is what this method refuses.
+
+        Raises:
+            ValueError: settings of the run that the task cannot work with.
+        """
+        return ()
+
+    @abstractmethod
     def run(self, context: Context) -> None:
-        """Do the work."""
+        """Do the work: read results, which are made where the store lacks them, and write to the run's folder."""
 
 
 @dataclass
@@ -52,13 +61,13 @@ class Context:
         config: the whole configuration as plain values.
         folder: where tasks write.
         build: makes the experiment when it is first asked for; studies of finished runs need none.
-        stages: what the command asks for.
+        stages: names of what the command asks for.
         account: seconds and what was left out, for the report.
         live: the command's run in MLflow while it is open.
-        returned: what the run returns to a sweep.
         of_method: makes the experiment of the same command with another method (``baseline=...``), where the program
             can compose it.
         begun: when the task that runs began, in seconds since 1970.
+        logged: seconds by phase that the log has.
     """
 
     config: dict[str, Any]
@@ -67,9 +76,9 @@ class Context:
     stages: Sequence[str]
     account: Account = field(default_factory=Account)
     live: LiveRun | None = None
-    returned: float | None = None
     of_method: Callable[[str], Experiment] | None = None
     begun: float = field(default_factory=time.time)
+    logged: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
     def of(experiment: Experiment, folder: Path | None = None) -> Context:
@@ -90,7 +99,7 @@ class Context:
     @cached_property
     def results(self) -> Results:
         """Results of stages, read from the store or computed."""
-        return Results(Store(self.experiment.run.store), self.stages, self.account.reused)
+        return Results(Store(self.experiment.run.store), self.account)
 
     @property
     def uri(self) -> str:
@@ -106,14 +115,17 @@ class Context:
         return tqdm(list(items), desc=name, disable=not self.config["progress"], leave=False)
 
     @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        """Count the seconds of a stage or a task."""
-        self.begun, begun = time.time(), time.perf_counter()
-        yield
-        spent = self.account.seconds[name] = time.perf_counter() - begun
-        _log.info("%-11s %8.1f s", name, spent)
-        if self.live:
-            self.live.stage(name, spent)
+    def running(self, name: str) -> Iterator[None]:
+        """Charge the seconds of a task, without those of the phases that it reads, and log those of new phases."""
+        self.begun = time.time()
+        with self.account.charged(name):
+            yield
+        for phase, spent in self.account.seconds.items():
+            if phase not in self.logged:
+                _log.info("%-11s %8.1f s", phase, spent)
+            if self.live and spent != self.logged.get(phase):
+                self.live.stage(phase, spent)
+        self.logged = dict(self.account.seconds)
 
     @contextmanager
     def tracked(self) -> Iterator[None]:
@@ -122,9 +134,8 @@ class Context:
             with nullcontext():
                 yield
             return
-        x, names = self.experiment, self.graph.names
-        biased, method = x.imaging.distribution.biased, x.loop.method.name
-        with live_run(self.uri, x.run.name, method, x.run.seed, names, biased, x.config) as self.live:
+        method, biased = self.experiment.loop.method.name, self.experiment.imaging.distribution.biased
+        with live_run(self.uri, self.config, method, self.graph.names, biased, self.begun) as self.live:
             _log.info("to watch this run:\n%s", self.live.where)
             yield
 

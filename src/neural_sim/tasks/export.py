@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -12,6 +12,7 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.cameras import reframed
 from neural_sim.checks import at_least
@@ -20,8 +21,8 @@ from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
 from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.psi_file import psi_of_file
-from neural_sim.stages.stage import Results
-from neural_sim.stages.store import Store, locked
+from neural_sim.stages.stage import Stage
+from neural_sim.stages.store import locked
 from neural_sim.stages.version import code_version
 from neural_sim.synthesis.export.bop import Model
 from neural_sim.synthesis.export.dataset import FORMATS, DataSet, Format, ImageFormat
@@ -31,7 +32,7 @@ from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.synthesis.export.records import opencv_entry
 from neural_sim.synthesis.scene import Scene
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ UNKNOWN_RADIUS = 100.0
 
 
 @dataclass(frozen=True)
-class ExportTask:
+class ExportTask(Task):
     """A data set of ``count`` images. See ``docs/usage.md``, Exporting a data set.
 
     Args:
@@ -92,13 +93,14 @@ class ExportTask:
             if getattr(self, key) not in known:
                 raise ValueError(f"export.{key} must be one of {known}, got {getattr(self, key)!r}")
 
-    def run(self, context: Context) -> None:
-        """Write the data set and the table of psi.
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        graph = context.graph
+        fields = graph.fields if self.detail == "run" else ()
+        return [*fields, graph.learned] if self.psi == "learned" else fields
 
-        Raises:
-            ValueError: a psi that is not in the store or the file, a folder of other images or that cannot be written,
-                BOP for objects of one image under different focal lengths.
-        """
+    @override
+    def run(self, context: Context) -> None:
         root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
         data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
         root.parent.mkdir(parents=True, exist_ok=True)
@@ -123,8 +125,6 @@ class ExportTask:
         size = (graph.camera.width, graph.camera.height) if self.width is None else (self.width, self.height)
         camera = reframed(graph.camera, *cast(tuple[int, int], size))
         workers = self._processes(context)
-        # What an export needs beside psi it makes itself.
-        results = Results(Store(x.run.store), (*context.stages, "views", "field"), context.account.reused)
         psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
         renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
@@ -132,7 +132,7 @@ class ExportTask:
         source = ImageSource(scene, psi, camera, tuple(model.millimetres for model in models), x.run.seed)
         identity = self._identity(source, [stage.key for stage in stages])
         ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
-        fields = tuple(results(stage).field for stage in context.shown(stages, "field"))
+        fields = tuple(context.results(stage).field for stage in context.shown(stages, "field"))
         source = replace(source, scene=replace(scene, fields=fields))
         return DataSet(
             source, root, models, identity, self.count, cast(Sequence[Format], tuple(self.formats)),

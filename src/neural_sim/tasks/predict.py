@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.photographs import detect
 from neural_sim.detector.saved import DOCUMENT, SavedDetector
 from neural_sim.devices import device_of
+from neural_sim.documents import write_json
 from neural_sim.report.predictions import draw, result_rows, save_picture, scores_document, scores_table
 from neural_sim.target.photo_files import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 
 @dataclass(frozen=True)
-class PredictTask:
-    """Detections on photographs of any size.
+class PredictTask(Task):
+    """Detections on photographs of any size, drawn and in COCO's format, and their scores where there are annotations.
 
     Args:
         model: a run's folder, or its ``model.safetensors``; None: the folder of this run, whose report writes it.
@@ -53,14 +54,8 @@ class PredictTask:
             raise ValueError(f"predict.batch_size must be at least 1, got {self.batch_size}")
         _ = PhotoFiles(self.images, "predict.images")
 
+    @override
     def run(self, context: Context) -> None:
-        """Write pictures with boxes and COCO results, and with annotations the scores.
-
-        The files are ``pictures/``, ``coco_results.json``, ``coco_images.json`` and ``scores.json``.
-
-        Raises:
-            ValueError: a model, a picture or annotations that cannot be used, with the key and the file.
-        """
         folder, photos = context.folder, PhotoFiles(str(self.images), "predict.images")
         saved = self._saved(folder).to(device_of(context.config["trainer"]["accelerator"]))
         truth = self._truth(saved, photos)
@@ -85,14 +80,14 @@ class PredictTask:
                 if known is not None:
                     scored.append((found, known))
         categories = [{"id": id, "name": saved.class_names[label]} for label, id in category_ids.items()]
-        _write(folder / "coco_images.json", {"images": entries, "categories": categories})
-        _write(folder / "coco_results.json", rows)
+        write_json(folder / "coco_images.json", {"images": entries, "categories": categories}, indent=None)
+        write_json(folder / "coco_results.json", rows, indent=None)
         if scored:
             ap = evaluate(
                 [found for found, _ in scored], without_pixels([t for _, t in scored]), saved.class_names,
                 saved.detector.score,
             )  # fmt: skip
-            _write(folder / "scores.json", scores_document(ap, len(scored)))
+            write_json(folder / "scores.json", scores_document(ap, len(scored)), indent=None)
             print(scores_table(ap, len(scored)))
         print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
 
@@ -115,8 +110,3 @@ def _entry(path: Path, photos: PhotoFiles, truth: Truth | None, number: int) -> 
     if truth is None:
         return {"id": number, "file_name": photos.name(path)}
     return {key: truth.entries[path][key] for key in ("id", "file_name")}
-
-
-def _write(path: Path, document: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, allow_nan=False), encoding="utf-8")

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from typing_extensions import override
+
+from neural_sim.baseline.base import HypergradientLoop, Response
+from neural_sim.documents import write_json
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.foreseen import foresee
 from neural_sim.outer.labelled import labelled_gains
 from neural_sim.report.page.preflight_page import write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
 from neural_sim.report.preflight import Preflight
+from neural_sim.stages.stage import Stage
 from neural_sim.target.mismatch import distance_factor, matching_settings, mismatches
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 
 @dataclass(frozen=True)
-class PreflightTask:
+class PreflightTask(Task):
     """What to expect of an optimisation, before any.
 
     It shows the detector of the initial distribution by bin of the validation images, the expected gain of every
@@ -40,8 +43,6 @@ class PreflightTask:
     moved: float = 0.15
     labelled: Sequence[int] = (10, 25)
 
-    needs = ("views", "field", "target_sets", "warm_start")
-
     def __post_init__(self) -> None:
         if self.trials < 1:
             raise ValueError(f"preflight.trials must be at least 1, got {self.trials}")
@@ -50,19 +51,22 @@ class PreflightTask:
         if any(count < 1 for count in self.labelled):
             raise ValueError(f"preflight.labelled: want numbers of at least 1, got {list(self.labelled)}")
 
-    def run(self, context: Context) -> None:
-        """Write preflight.json and preflight.html, and print a summary.
-
-        Raises:
-            ValueError: a method without a derivative.
-        """
-        graph, results, x = context.graph, context.results, context.experiment
-        names, validation = list(graph.names), results(graph.targets).val
-        loop = graph.learned.loop(results)
-        if not isinstance(loop, GradientLoop):
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        method, graph = context.experiment.loop.method, context.graph
+        if not isinstance(method, (HypergradientLoop, Response)):
             raise ValueError(
-                f"preflight wants a method that follows the hypergradient, got baseline={x.loop.method.name}"
+                f"preflight wants a method that follows the hypergradient, got baseline={method.name}"
             )
+        return [graph.targets, graph.warm_start, graph.of_initial]
+
+    @override
+    def run(self, context: Context) -> None:
+        graph, results, x = context.graph, context.results, context.experiment
+        for stage in context.shown(self.reads(context), "preflight"):
+            results(stage)
+        names, validation = list(graph.names), results(graph.targets).val
+        loop = cast(GradientLoop, graph.learned.loop(results))
         outer = x.loop.outer
         foreseen = foresee(loop, self.trials, self.moved)
         photographs, labelled = results(graph.targets).train, []
@@ -84,12 +88,8 @@ class PreflightTask:
             labelled=tuple(labelled),
             score=x.score,
         )
-        _write(context.folder / "preflight.json", report)
+        document = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}
+        write_json(context.folder / "preflight.json", document)
         page = write_preflight_page(report, validation, images, context.folder)
         print(report.summary())
         print(f"is it worth it? open {page}")
-
-
-def _write(path: Path, report: Preflight) -> None:
-    document: dict[str, Any] = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}
-    path.write_text(json.dumps(document, indent=1), encoding="utf-8")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+from typing_extensions import override
 
 from neural_sim.checks import at_least
 from neural_sim.detector.protocol import Score
@@ -16,7 +18,8 @@ from neural_sim.report.page.verdict import Gain, verdict
 from neural_sim.report.score_table import ScoreTable
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
-from neural_sim.tasks.context import Context
+from neural_sim.stages.stage import Stage
+from neural_sim.tasks.context import Context, Task
 
 APART = 1_000
 """Between the seeds of trainings, so that a sweep over seeds 0, 1, 2 shares none of them."""
@@ -26,7 +29,7 @@ DIFFERENCES = (*SHOWN, ("matched", "ns"))
 
 
 @dataclass(frozen=True)
-class RepeatTask:
+class RepeatTask(Task):
     """Detectors of the initial, the learned and the target's distribution, each trained several times.
 
     The first training is the run's own. The target's is left out where it is unknown or where the run starts at it.
@@ -44,13 +47,16 @@ class RepeatTask:
     trainings: int = 5
     draws: int = 100
 
-    needs = ("views", "field", "target_sets", "warm_start", "psi", "evaluate")
-
     def __post_init__(self) -> None:
         at_least("repeat", 2, trainings=self.trainings, draws=self.draws)
 
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        graph = context.graph
+        return [graph.learned, graph.scores(graph.psi("initial"), "ns")]
+
+    @override
     def run(self, context: Context) -> None:
-        """Write repeat.md, which is also printed, and repeat.json."""
         graph, results, score = context.graph, context.results, context.experiment.score
         names, test = list(graph.names), results(graph.targets).test
         first = graph.compared(results(graph.learned))

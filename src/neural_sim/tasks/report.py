@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.devices import peak_memory_mb, placed
@@ -18,41 +20,47 @@ from neural_sim.report.page.run_page import PER_OBJECT, Shown, write_run_page
 from neural_sim.report.run import RunResults, write_results
 from neural_sim.stages.evaluate import Scores
 from neural_sim.stages.graph import Psi
-from neural_sim.tasks.context import Context
+from neural_sim.stages.stage import Stage
+from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
 
 
-def write_report(context: Context) -> None:
-    """Write all that a run leaves in its folder and in MLflow."""
-    graph, results, folder = context.graph, context.results, context.folder
-    if context.live is None:
-        raise RuntimeError("report: want an open MLflow run, see Context.tracked")
-    learned = results(graph.learned)
-    test = results(graph.targets).test
-    scores: dict[str, Scores] = {}
-    if "evaluate" in context.stages:
-        compared = graph.compared(learned).items()
-        scores = {called: results(stage) for called, stage in compared}
-    report = run_results(context, scores)
-    rendered = graph.synthetic(learned.last, "learned").images(results)
-    drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
-    detections = scores["learned"].detections if scores else []
-    write_figures(report, drawn.images, test, detections, folder / "figures")
-    write_training_set(drawn, list(graph.names), folder / "training_set")
-    if scores:
+@dataclass(frozen=True)
+class ReportTask(Task):
+    """All that a run leaves in its folder and in MLflow."""
+
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        graph = context.graph
+        return [*graph.fields, graph.targets, graph.learned, graph.scores(graph.psi("initial"), "ns")]
+
+    @override
+    def run(self, context: Context) -> None:
+        if context.live is None:
+            raise RuntimeError("report: want an open MLflow run, see Context.tracked")
+        graph, results, folder = context.graph, context.results, context.folder
+        learned, test = results(graph.learned), results(graph.targets).test
+        for stage in context.shown(graph.evaluated(learned), "evaluate"):
+            results(stage)
+        scores = {called: results(stage) for called, stage in graph.compared(learned).items()}
+        report = run_results(context, scores)
+        rendered = graph.synthetic(learned.last, "learned").images(results)
+        drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
+        write_figures(report, drawn.images, test, scores["learned"].detections, folder / "figures")
+        write_training_set(drawn, list(graph.names), folder / "training_set")
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
         _write_model(context, test)
-    write_results(report, folder)
-    commands = _commands(context, detector=bool(scores))
-    page = write_run_page(report, _shown(context, learned.last, test, scores), commands, folder)
-    context.live.finish(report, folder)
-    print(report.summary())
-    print(f"results: {folder}\n{context.live.where}")
-    for what, command in commands.items():
-        print(f"{what.lower()}: {command}")
-    print(f"did it work? open {page}")
+        write_results(report, folder)
+        commands = _commands(context)
+        page = write_run_page(report, _shown(context, learned.last, test, scores), commands, folder)
+        context.live.finish(report, folder)
+        print(report.summary())
+        print(f"results: {folder}\n{context.live.where}")
+        for what, command in commands.items():
+            print(f"{what.lower()}: {command}")
+        print(f"did it work? open {page}")
 
 
 def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str, Scores]) -> Shown:
@@ -65,13 +73,14 @@ def _shown(context: Context, psi: Psi, test: LabelledImages, scores: Mapping[str
     return Shown(before, after, test, {called: part.detections for called, part in scores.items()})
 
 
-def _commands(context: Context, detector: bool) -> dict[str, str]:
-    """Return what to run next, by what it does; ``detector``: whether the run leaves one."""
-    name, folder = context.experiment.run.name, context.folder
-    compare = f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'"
-    predict = f"python -m src.main 'stages=[predict]' predict.model={folder} predict.images=/data/photos"
-    commands = {"To compare methods and seeds": compare}
-    return commands | ({"To detect objects in photographs": predict} if detector else {})
+def _commands(context: Context) -> dict[str, str]:
+    """Return what to run next, by what it does."""
+    name, folder = context.config["name"], context.folder
+    return {
+        "To compare methods and seeds": f"python -m src.main +experiment=compare 'compare.experiments=[{name}]'",
+        "To detect objects in photographs": f"python -m src.main 'stages=[predict]' predict.model={folder} "
+        "predict.images=/data/photos",
+    }
 
 
 def _write_model(context: Context, test: LabelledImages) -> None:
@@ -113,13 +122,13 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
         },
         records=[dataclasses.asdict(record) for record in learned.records],
         ap={called: dataclasses.asdict(part.ap) for called, part in scores.items()},
-        validation_ap=context.returned,
+        validation_ap=results(graph.validation(learned)).ap.mean,
         fields=fields,
-        seconds=dict(context.account.seconds),
+        seconds={phase: spent for phase, spent in context.account.seconds.items() if phase != "report"},
         memory=peak_memory_mb(graph.device),
         left_out=[dataclasses.asdict(omission) for omission in context.account.left_out],
         config=x.config,
-        curve=_curve(context) if scores else (),
+        curve=_curve(context),
         symmetric_bins={
             name: {angle: results(graph.symmetry(name, angle)) for angle in angles}
             for name in graph.names

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from typing_extensions import override
 
 from neural_sim.report.viewer import Shots, Viewer
+from neural_sim.stages.graph import Psi
 from neural_sim.stages.psi_file import psi_of_file
-from neural_sim.stages.stage import Results
-from neural_sim.stages.store import Store
-from neural_sim.tasks.context import Context
+from neural_sim.stages.stage import Stage
+from neural_sim.tasks.context import Context, Task
 
 
 @dataclass(frozen=True)
-class ViewerTask:
+class ViewerTask(Task):
     """A page on this machine's own address, until Ctrl-C. Fields and the detector are read from the store, or computed.
 
     Args:
@@ -37,12 +41,15 @@ class ViewerTask:
         if self.seconds is not None and not self.seconds >= 0.0:
             raise ValueError(f"viewer.seconds must not be negative, got {self.seconds}")
 
-    def run(self, context: Context) -> None:
-        """Open the page and wait.
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        graph = context.graph
+        if self.psi == "learned":
+            return [graph.learned, graph.scene]
+        return [graph.trained_on(self._known(context)[self.psi], self.psi)]
 
-        Raises:
-            ValueError: viser is missing, or a psi that is not in the store or the file.
-        """
+    @override
+    def run(self, context: Context) -> None:
         viewer = Viewer(self.shots(context), self.port, self.psi)
         print(f"open {viewer.address} (Ctrl-C ends it)", flush=True)
         try:
@@ -59,23 +66,25 @@ class ViewerTask:
             pass
 
     def shots(self, context: Context) -> Shots:
-        """Return the scene, the known distributions, and the detector trained on ``psi``."""
+        """Return the scene, the known distributions, and the detector trained on ``psi``.
+
+        Raises:
+            ValueError: a psi that is not in the file.
+        """
+        graph, known, results = context.graph, self._known(context), context.results
+        if self.psi == "learned":
+            known["learned"] = results(graph.learned).last
+        trained = graph.trained_on(known[self.psi], self.psi)
+        return Shots(results(graph.scene), known, trained.build(), results(trained).params)
+
+    def _known(self, context: Context) -> dict[str, Psi]:
+        """Return the distributions that are known before psi is learned, by name."""
         graph, distribution = context.graph, context.experiment.imaging.distribution
         known = {"initial": graph.psi("initial")}
         if self.psi == "target" or graph.target_psi is not None:
             known["target"] = graph.stated_psi("target", "viewer.psi")
-        if self.psi not in known:
-            file = Path(self.psi).expanduser()
-            learned = self.psi == "learned"
-            known[self.psi] = (
-                context.results(graph.learned).last
-                if learned
-                else psi_of_file(file, distribution, graph.names, "viewer.psi")
+        if self.psi not in ("learned", *known):
+            known[self.psi] = psi_of_file(
+                Path(self.psi).expanduser(), distribution, graph.names, "viewer.psi"
             )
-        # What the page needs beside psi it makes itself.
-        made = ("views", "field", "target_sets", "warm_start", "evaluate")
-        results = Results(
-            Store(context.experiment.run.store), (*context.stages, *made), context.account.reused
-        )
-        trained = graph.trained_on(known[self.psi], self.psi)
-        return Shots(results(graph.scene), known, trained.build(), results(trained).params)
+        return known

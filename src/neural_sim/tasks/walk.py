@@ -1,113 +1,138 @@
-"""A run: the stages of ``stages=[...]``, one after another."""
+"""A run: what ``stages=[...]`` names, one after another, with everything that it needs."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from typing_extensions import override
+
+from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.outer.inner import pooled
+from neural_sim.report.run_tracking import LiveRun
+from neural_sim.stages.account import Omission
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.plan import plan
 from neural_sim.stages.stage import Stage
+from neural_sim.synthesis.draws import HardDraws
 from neural_sim.tasks.context import Context, Task
-from neural_sim.tasks.report import write_report
+from neural_sim.tasks.report import ReportTask
 
 _log = logging.getLogger(__name__)
 
 
-def views(context: Context) -> None:
-    """Make the views of all objects."""
-    for stage in context.shown(context.graph.views, "views"):
-        context.results(stage)
+@dataclass(frozen=True)
+class Phase(Task):
+    """A phase of a run: results that are known before it begins.
 
-
-def fields(context: Context) -> None:
-    """Make the fields of all objects."""
-    for stage in context.shown(context.graph.fields, "field"):
-        fitted = context.results(stage)
-        if context.live:
-            context.live.fields({stage.views.object: fitted.history})
-
-
-def target_sets(context: Context) -> None:
-    """Make the target sets."""
-    context.results(context.graph.targets)
-
-
-def warm_start(context: Context) -> None:
-    """Train the warm start."""
-    context.results(context.graph.warm_start)
-
-
-def psi(context: Context) -> None:
-    """Learn psi."""
-    learned = context.results(context.graph.learned)
-    if context.live:
-        context.live.iterations([dataclasses.asdict(record) for record in learned.records])
-
-
-def evaluate(context: Context) -> None:
-    """Score the detectors that the report compares."""
-    graph, results = context.graph, context.results
-    learned = results(graph.learned)
-    on_the_way = [
-        graph.scores(at, f"psi after {i} iterations") for i, at in graph.on_the_way(learned).items()
-    ]
-    for scores in context.shown([*graph.compared(learned).values(), *on_the_way], "evaluate"):
-        results(scores)
-    # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
-    context.returned = results(graph.scores(learned.last, "learned", "val")).ap.mean
-
-
-_MADE: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
-    "views": lambda graph: graph.views,
-    "field": lambda graph: graph.fields,
-    "target_sets": lambda graph: [graph.targets],
-    "warm_start": lambda graph: [graph.warm_start],
-    "psi": lambda graph: [graph.learned],
-    "evaluate": lambda graph: [graph.learned, graph.scores(graph.psi("initial"), "ns")],
-    "report": lambda graph: (),  # reads what depends on the learned psi
-}
-"""What steps make that is known before any runs."""
-
-STEPS: Mapping[str, Callable[[Context], None]] = {
-    "views": views,
-    "field": fields,
-    "target_sets": target_sets,
-    "warm_start": warm_start,
-    "psi": psi,
-    "evaluate": evaluate,
-    "report": write_report,
-}
-"""The stages of a run from objects to a report, in their order; a target of photographs comes first."""
-
-
-def walk(context: Context, others: Mapping[str, Task]) -> float | None:
-    """Run the context's stages: those of ``STEPS`` in its order, then ``others`` in theirs.
-
-    Returns what a sweep may maximise: the AP on validation images of the detector trained on the learned distribution.
-    None where nothing was evaluated.
+    Args:
+        name: of the phase.
+        stages: those whose results it consists of.
+        log: writes a result to MLflow.
     """
-    asked = [name for name in STEPS if name in context.stages]
-    if asked:
-        context.account.left_out += plan(context.graph)
-        if {"warm_start", "psi", "evaluate"} & {*asked}:
-            context.graph.warm_start.build()  # so that weights which do not fit it are refused now
-        if not context.graph.renders_target:
-            # Photographs that cannot be used are refused before fields are fitted.
-            asked.sort(key=lambda name: name != "target_sets")
-        for name in asked:
-            for stage in _MADE[name](context.graph):
-                context.results.check(stage)
-    for omission in context.account.left_out:
-        fraction = "" if omission.fraction in (None, 1.0) else f" ({omission.fraction:.0%})"
-        _log.info("left out: %s%s: %s", omission.what, fraction, omission.why)
+
+    name: str
+    stages: Callable[[Graph], Iterable[Stage[Any]]]
+    log: Callable[[LiveRun, Any, Any], None] | None = None
+
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        return self.stages(context.graph)
+
+    @override
+    def run(self, context: Context) -> None:
+        for stage in context.shown(self.stages(context.graph), self.name):
+            result = context.results(stage)
+            if context.live and self.log:
+                self.log(context.live, stage, result)
+
+
+@dataclass(frozen=True)
+class EvaluateTask(Task):
+    """The scores of the detectors that a run compares."""
+
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        graph = context.graph
+        return [graph.learned, graph.scores(graph.psi("initial"), "ns")]
+
+    @override
+    def run(self, context: Context) -> None:
+        learned = context.results(context.graph.learned)
+        for stage in context.shown(context.graph.evaluated(learned), "evaluate"):
+            context.results(stage)
+
+
+PHASES: Mapping[str, Task] = {
+    "views": Phase("views", lambda graph: graph.views),
+    "field": Phase(
+        "field",
+        lambda graph: graph.fields,
+        lambda live, stage, fitted: live.fields({stage.views.object: fitted.history}),
+    ),
+    "target_sets": Phase("target_sets", lambda graph: [graph.targets]),
+    "warm_start": Phase("warm_start", lambda graph: [graph.warm_start]),
+    "psi": Phase(
+        "psi",
+        lambda graph: [graph.learned],
+        lambda live, _, learned: live.iterations([dataclasses.asdict(each) for each in learned.records]),
+    ),
+    "evaluate": EvaluateTask(),
+    "report": ReportTask(),
+}
+"""The phases of a run from objects to a report, in their order."""
+
+
+def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
+    """Run tasks in their order; results that the store lacks are made when a task first asks for them.
+
+    What the tasks will read, as far as they know it, is checked before anything is made.
+
+    Returns:
+        What a sweep may maximise: the AP on validation images of the detector trained on the learned distribution.
+        None where nothing was evaluated.
+    """
+    phases = PHASES.keys() & tasks.keys()
+    wanted = [stage for task in tasks.values() for stage in task.reads(context)]
+    if wanted:
+        missing = Counter(stage.phase for stage in context.results.check(wanted) if stage.stored)
+        _log.info(
+            "to make: %s", ", ".join(f"{phase} {count}" for phase, count in missing.items()) or "nothing"
+        )
+    if phases:
+        context.account.left_out += omitted(context.graph)
     with context.tracked():
-        for name in asked:
-            with context.timed(name):
-                STEPS[name](context)
-        for name, step in others.items():
-            with context.timed(name):
-                step.run(context)
-    return context.returned
+        for name, task in tasks.items():
+            with context.running(name):
+                task.run(context)
+    if not {"evaluate", "report"} & phases:
+        return None
+    # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
+    return context.results(context.graph.validation(context.results(context.graph.learned))).ap.mean
+
+
+def omitted(graph: Graph) -> list[Omission]:
+    """Return the work that a run leaves out because its scene does not need it; the log says so too."""
+    x, draws = graph.experiment, graph.learned.draws
+    method, outer, distribution = x.loop.method, x.loop.outer, x.imaging.distribution
+    loops, follows = not isinstance(method, Fixed), isinstance(method, HypergradientLoop)
+    fixed = 0.0 if outer.learned is None else 1.0 - len(outer.learned) / len(graph.names)
+    rows = [
+        (not distribution.lights, "field", "appearance codes", "no parameter moves the light", None),
+        (not loops, "psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0),
+        (loops and not follows, "psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0),
+        (follows and isinstance(draws, HardDraws), "psi", "the renderer's derivative",
+         "the estimator scores images and differentiates none", 1.0),
+        (follows and fixed > 0.0, "psi", "probes", "outer.learned fixes the other objects' psi", fixed),
+        (loops and pooled(outer, draws, distribution), "psi", "most renders of the loop",
+         "fields do not change: every bin is rendered once", None),
+        (loops and outer.epochs > 1, "psi", "passes of the backbone's frozen stages in the loop's training",
+         "their features are kept", 1.0 - 1.0 / outer.epochs),
+    ]  # fmt: skip
+    found = [Omission(phase, what, why, fraction) for applies, phase, what, why, fraction in rows if applies]
+    for each in found:
+        _log.info("left out: %s: %s", each.what, each.why)
+    return found

@@ -28,11 +28,15 @@ def composed(*overrides):
 def test_the_experiment_has_every_family_and_the_stages_that_they_need():
     config = composed()
     assert tuple(config.work_precision.families) == FAMILIES
-    assert WorkPrecisionStep(families=["quadrature", "solver"]).needs == ()
-    assert WorkPrecisionStep(families=["renderer", "derivative"]).needs == ("views", "field")
-    assert WorkPrecisionStep(families=FAMILIES).needs == (
-        "views", "field", "target_sets", "warm_start", "psi", "evaluate"
-    )  # fmt: skip
+    context, _ = context_of(config, Path("unused"))
+    graph = context.graph
+
+    def read(*families):
+        return {*WorkPrecisionStep(families=families).reads(context)}
+
+    assert not read("quadrature", "solver")
+    assert read("renderer", "derivative") == {*graph.fields} and read("field") == {*graph.views}
+    assert read(*FAMILIES) == {*graph.fields, *graph.views, graph.warm_start, graph.targets, graph.learned}
 
 
 def test_the_parts_are_those_of_the_configuration(tmp_path):

@@ -22,7 +22,7 @@ from neural_sim.studies.experiments.measured import (
     write_measured,
 )
 from neural_sim.studies.experiments.settings import Settings
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
@@ -86,7 +86,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Experiments:
+class Experiments(Task):
     """Write the page of experiments; ``+experiment=experiments_table``.
 
     Args:

@@ -14,14 +14,14 @@ from tqdm import tqdm
 
 from neural_sim.documents import markdown_table
 from neural_sim.studies.stress.cases import CASES, Check, Checks, Scope
-from neural_sim.tasks.context import Context, TaskFailure
+from neural_sim.tasks.context import Context, Task, TaskFailure
 
 FAMILIES = ("linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer")
 """One file each, in the order of the loop: its cases are the functions marked ``@case``."""
 
 
 @dataclass(frozen=True)
-class Stress:
+class Stress(Task):
     """Runs every case of ``families``; ``full`` False takes smaller versions of the heavy ones.
 
     Raises:
@@ -50,7 +50,6 @@ class Stress:
         failed = failures(checks)
         if failed:
             raise TaskFailure(f"stress: {len(failed)} checks failed")
-        context.returned = 0.0
 
     def run_all(self, seed: int, progress: bool = False) -> list[Check]:
         """Run all checks; a case that fails or raises does not keep the others from running."""

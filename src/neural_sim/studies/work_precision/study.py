@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from typing_extensions import override
 
 from neural_sim.field.base import RadianceField
 from neural_sim.outer.module import SimulatorModule
@@ -16,6 +18,8 @@ from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.provenance import machine
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Stage
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.studies.work_precision.derivative import Derivative
 from neural_sim.studies.work_precision.estimator import Estimators
@@ -28,7 +32,7 @@ from neural_sim.studies.work_precision.report import document, track, write, wri
 from neural_sim.studies.work_precision.series import Clock, Series, Timing
 from neural_sim.studies.work_precision.solver import Solver
 from neural_sim.studies.work_precision.suite import Family, WorkPrecision
-from neural_sim.tasks.context import Context
+from neural_sim.tasks.context import Context, Task
 from neural_sim.tasks.report import run_results
 from neural_sim.types import PosedViews
 
@@ -37,13 +41,15 @@ FAMILIES = ("quadrature", "renderer", "field", "solver", "hypergradient", "estim
 """In the order of the loop; each is a key of the stage's settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
 """What a documentation page says that makes its sections; they are to be made at its scale, quick."""
-FITTED = ("views", "field")
-STARTED = (*FITTED, "target_sets", "warm_start")
-NEEDS: Mapping[str, tuple[str, ...]] = {
-    "renderer": FITTED, "field": ("views",), "hypergradient": STARTED, "estimator": STARTED, "derivative": FITTED,
-    "loop": (*STARTED, "psi", "evaluate"),
-}  # fmt: skip
-"""Stages that run before a family."""
+READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
+    "renderer": lambda graph: graph.fields,
+    "field": lambda graph: graph.views,
+    "hypergradient": lambda graph: [graph.warm_start, graph.targets],
+    "estimator": lambda graph: [graph.warm_start, graph.targets],
+    "derivative": lambda graph: graph.fields,
+    "loop": lambda graph: [graph.learned, graph.targets],
+}
+"""The stages that a family reads."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class RunWorld:
 
 
 @dataclass(frozen=True)
-class WorkPrecisionStep:
+class WorkPrecisionStep(Task):
     """``+experiment=work_precision``.
 
     Args:
@@ -134,10 +140,9 @@ class WorkPrecisionStep:
     def __post_init__(self) -> None:
         _ = self.suite  # raises for families and the clock
 
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Stages that run before."""
-        return tuple(dict.fromkeys(stage for name in self.families for stage in NEEDS.get(name, ())))
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        return [stage for name in self.families if name in READS for stage in READS[name](context.graph)]
 
     @property
     def suite(self) -> WorkPrecision:
@@ -166,4 +171,3 @@ class WorkPrecisionStep:
             write_docs(held, Path(self.docs), COMMAND)
         run = track(found, config, context.uri, context.folder, begun)
         print(f"{time.time() - begun:.0f} s\nresults: {context.folder}\n{run.where}")
-        context.returned = 0.0
