@@ -13,9 +13,9 @@ from hydra import compose, initialize_config_dir
 from PIL import Image
 
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.stages import export as stage
 from neural_sim.stages.detail import finer_recipe, view_size_for
 from neural_sim.target.coco import CocoTarget
+from neural_sim.tasks import export as task
 from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[2]
@@ -50,7 +50,7 @@ def made(base):
 
 
 def test_a_data_set_needs_objects_and_a_psi_alone(made):
-    """Views and fields are made by the stage itself; no target set and no detector is."""
+    """Views and fields are made, and no target set and no detector is."""
     manifest = json.loads((made / "manifest.json").read_text())
     assert manifest["identity"]["classes"] == ["pitcher", "drill"]
     assert [image["number"] for image in manifest["images"]] == [0, 1, 2]
@@ -114,7 +114,6 @@ REFUSED = [
     (["export.formats=[]"], r"export\.formats: want some of .*, got \[\]"),
     (["export.image_format=gif"], r"export\.image_format: want .*'gif'|export\.image_format must be one of"),
     (["export.workers=-1"], r"export\.workers must be at least 0, got -1"),
-    (["export.psi=learned"], r"stages: psi loop is not in .*store; add stage psi to \['export'\]"),
     (["export.psi=/none"], r"export\.psi: want learned, initial, target, a run's folder.*, got /none, which does not"),
     (lambda path: [results(path, "{")], r"export\.psi: .*results\.json is no results\.json or psi\.json"),
     (lambda path: [results(path, {"psi": {"pitcher": {"pose": [0.125] * 8}}})],
@@ -139,7 +138,7 @@ def test_bad_settings_are_one_line_and_leave_nothing(overrides, message, base, t
 def test_another_configuration_of_a_folder_is_refused_before_fields_are_fitted(
     base, made, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(stage, "farthest", None)  # comes after the fields
+    monkeypatch.setattr(task, "farthest", None)  # comes after the fields
     for change, message in (("seed=9", r"made with seed=0, now it is 9"),
                             ("export.width=64", r"made with camera\.width=48, now it is 64"),
                             ("export.image_format=png", r"made with image_format=\"jpg\", now it is \"png\""),

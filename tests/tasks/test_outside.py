@@ -55,7 +55,7 @@ def test_a_task_from_outside_is_one_class_and_one_node(tmp_path, plugin):
 
 
 def test_its_settings_are_checked_like_all_others(tmp_path, plugin):
-    with pytest.raises(UserError, match=r"count.times: want int, got 'two'"):
+    with pytest.raises(UserError, match=r"count.times: want a whole number, got 'two'"):
         context(tmp_path, "+count={_target_: my_task.Count, times: two}", "stages=[count]")
 
 
