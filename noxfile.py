@@ -75,9 +75,9 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Measure error against run time, and run the other benchmarks; JSON goes to outputs."""
+    """Error against run time; ``nox -s bench -- outer export`` runs benchmarks/<name>.py instead."""
     _install(session)
+    for name in session.posargs:
+        session.run("python", f"benchmarks/{name}.py")
     if not session.posargs:
         session.run("python", "-m", "src.main", "+experiment=work_precision")
-    for name in session.posargs or ["field", "render", "outer"]:
-        session.run("python", f"benchmarks/{name}.py")

@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from field import fit, load_objects, training_views  # the benchmark beside this one
 from machine import memory_mb
+from training_views import fit, load_objects, training_views
 
 from neural_sim.cameras import reframed
 from neural_sim.parameter.pose import Pose
@@ -46,6 +46,7 @@ def source_of(fields: dict[str, torch.nn.Module], quality: str) -> ImageSource:
 
 
 def sized(source: ImageSource, width: int, height: int, objects: int) -> ImageSource:
+    """Return the source with images of another size and number of objects."""
     synthesizer = replace(source.scene.synthesizer, objects_per_image=(objects, objects))
     camera = reframed(source.scene.camera, width, height)
     return replace(source, camera=camera, scene=replace(source.scene, synthesizer=synthesizer))
@@ -86,6 +87,7 @@ def in_process(*arguments) -> dict[str, float]:
 
 
 def main() -> None:
+    """Measure as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
     parser.add_argument("--names", nargs="*")
@@ -102,7 +104,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     fields = {
-        item.name: fit(training_views(item, arguments.views, 84), arguments.steps, 0, torch.device("cpu"))[0]
+        item.name: fit(training_views(item, arguments.views, 84), arguments.steps)
         for item in load_objects(arguments.root, arguments.names)
     }
     rows = []

@@ -13,7 +13,7 @@ from neural_sim.devices import compute_in_float32, forget_gpu_peak
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
-    """The option ``--device``: cpu, cuda or cuda:1, which compute as runs do."""
+    """Add the option ``--device``: cpu, cuda or cuda:1, which compute as runs do."""
     compute_in_float32()
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="cpu or cuda")
 

@@ -41,14 +41,14 @@ PHASES = (
 
 
 def repeated(scene: Scene, count: int) -> Scene:
-    """The first ``count`` objects, and the same ones again under new names once they are used up."""
+    """Repeat a scene's objects under new names until there are ``count``."""
     index = [i % len(scene.names) for i in range(count)]
     names = tuple(f"{scene.names[i]}_{label}" for label, i in enumerate(index))
     return dataclasses.replace(scene, names=names, fields=tuple(scene.fields[i] for i in index))
 
 
 def loop(context: Context, count: int, images: int) -> SimulatorModule:
-    """The psi loop on ``count`` objects with ``images`` training images of each, from uniform poses."""
+    """Make the psi loop on ``count`` objects with ``images`` training images of each, from uniform poses."""
     generator = torch.Generator().manual_seed(0)
     scene = repeated(context.results(context.graph.scene), count)
     detector = context.experiment.detector(
@@ -91,11 +91,12 @@ def exponent(rows: list[dict[str, Any]], size: str, key: str = "seconds") -> flo
 
 
 def last_exponent(rows: list[dict[str, Any]], size: str) -> float:
-    """The slope between the two largest sizes, where what does not grow with them matters least."""
+    """Return the slope between the two largest sizes, where what does not grow with them matters least."""
     return exponent(sorted(rows, key=lambda row: row[size])[-2:], size)
 
 
 def main() -> None:
+    """Measure as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("overrides", nargs="*", help="configuration keys, as on the command line of a run")
     parser.add_argument(

@@ -35,6 +35,7 @@ TARGET = {"019_pitcher_base": 3, "035_power_drill": 7}
 
 
 def make_captures(options: argparse.Namespace) -> None:
+    """Photograph every object, exactly and as a telephone would."""
     renderer = choose_mesh_renderer("auto", 1)
     for kind, (noise, exposure) in KINDS.items():
         for item in YCB(options.root, options.names).load():
@@ -61,17 +62,19 @@ def make_target(options: argparse.Namespace, names: list[str]) -> Path:
 
 
 def stored(folder: Path) -> list[str]:
+    """Return the overrides that keep stores in the folder."""
     return [f"paths.store={folder / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}", "progress=false"]
 
 
 def run(options: argparse.Namespace, folder: Path, *overrides: str) -> Path:
-    """The folder of a run by the command line."""
+    """Run the command line in a folder, and return it."""
     command = [sys.executable, "-m", "src.main", *overrides, f"hydra.run.dir={folder}", *stored(options.out)]
     subprocess.run(command, check=True, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL)
     return folder
 
 
 def of_photographs(options: argparse.Namespace, kind: str, rounds: int) -> list[str]:
+    """Return the overrides that take the photographs as objects."""
     return [
         f"scale={options.scale}", "objects=photos", "objects.up=-y", f"objects.root={options.out / kind}",
         f"objects.poses.rounds={rounds}",
@@ -79,11 +82,13 @@ def of_photographs(options: argparse.Namespace, kind: str, rounds: int) -> list[
 
 
 def printed(what: str, ap: dict[str, float]) -> None:
+    """Print AP by class and its mean."""
     each = ", ".join(f"{name} {100 * value:.1f}" for name, value in ap.items())
     print(f"{what}: {each}, mean {100 * sum(ap.values()) / len(ap):.1f}", flush=True)
 
 
 def main() -> None:
+    """Run from photographs to predictions."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", type=Path, required=True, help="a folder in the YCB layout")
     parser.add_argument("--names", nargs="*", default=["019_pitcher_base", "025_mug", "035_power_drill"])

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from field import HELD_OUT, load_objects, quick_psnr, training_views
+from training_views import HELD_OUT, load_objects, quick_psnr, training_views
 
 from neural_sim.renderer.pose_refinement import PoseRefinement, moved, rotation_angle
 from neural_sim.report.provenance import machine
@@ -24,7 +24,7 @@ from neural_sim.types import PosedViews
 
 
 def disturbed(views: PosedViews, noise: float) -> PosedViews:
-    """The views at wrong poses, as photographs, whose silhouettes need not agree."""
+    """Move the views to wrong poses, as photographs, whose silhouettes need not agree."""
     generator = torch.Generator().manual_seed(5)
     step = noise * torch.randn(len(views), 6, generator=generator)
     step[:, 3:] *= views.camera_to_world[:, :3, 3].norm(dim=-1, keepdim=True)
@@ -40,6 +40,7 @@ def errors(views: PosedViews, truth: PosedViews) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Measure as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout; without it the embedded objects")
     parser.add_argument("--names", nargs="*")

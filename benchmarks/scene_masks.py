@@ -21,7 +21,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from captures import Made, on_a_table
-from field import quick_psnr
+from training_views import quick_psnr
 
 from neural_sim.field.scene.recipe import SceneMasks
 from neural_sim.objects.mesh import ObjectMesh
@@ -71,6 +71,7 @@ def measure(item: ObjectMesh, folder: Path, options: argparse.Namespace) -> dict
 
 
 def main() -> None:
+    """Measure as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", help="a folder in the YCB layout, for the drill")
     parser.add_argument("--photos", type=int, default=40)

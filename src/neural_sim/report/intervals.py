@@ -5,7 +5,7 @@ A few seeds tell little of their own scatter, so that an interval has Student's 
 instead covers the truth in 81, 86 and 92 of 100 cases with 2, 3 and 5 of them. Where all seeds share the test images,
 as trainings repeated on one target do, the images' part of a mean does not shrink with the number of seeds. It is
 therefore added, as squares. Where each seed has test images of its own, the scatter between seeds has that part
-already, and intervals are a little wide: they cover 98 of 100. ``python benchmarks/intervals.py`` measures both.
+already, and intervals are a little wide: they cover 98 of 100.
 """
 
 from __future__ import annotations
