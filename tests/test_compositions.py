@@ -133,7 +133,7 @@ def test_the_papers_method_is_what_the_paper_says_at_every_scale(scale):
 
 @pytest.mark.parametrize("key", ["update", "light_update"])
 def test_a_bad_step_is_refused_with_its_place(key):
-    with pytest.raises(UserError, match=f"outer.{key}: learning_rate must be positive, got 0"):
+    with pytest.raises(UserError, match=f"outer.{key}.learning_rate: want more than 0, got 0"):
         experiment(f"outer.{key}.learning_rate=0")
 
 

@@ -31,9 +31,6 @@ def test_specifications():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"anchors": 1}, "parameter.illumination.anchors"),
-        ({"constraint": "box"}, "parameter.illumination.constraint"),
-        ({"deviation": 0.0}, "parameter.illumination.deviation"),
         ({"anchors": 3, "initial": [1.5, -0.25, -0.25]}, "parameter.illumination.initial"),
         ({"anchors": 3, "constraint": "affine", "target": [1.0, 1.0, 0.0]}, "parameter.illumination.target"),
         ({"anchors": 3, "constraint": "affine", "target": [1.0, 0.0]}, "want 3 numbers"),

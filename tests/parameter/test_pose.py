@@ -85,9 +85,13 @@ def test_azimuth_bins_the_other_angle(generator):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"bins": 0}, {"axis": "roll"}, {"bin_mean": "mode"}, {"temperature": 0.0}, {"floor": 0.2},
-            {"other_range_deg": (10.0, -10.0)}]
-)  # fmt: skip
-def test_bad_settings_name_their_key(bad):
-    with pytest.raises(ValueError, match=f"parameter.pose.{next(iter(bad))}"):
+    ("bad", "message"),
+    [
+        ({"floor": 0.2}, r"parameter\.pose\.floor: want less than 1/8 for 8 bins, got 0\.2"),
+        ({"other_range_deg": (0.0, 400.0)}, r"Pose\.other_range_deg: want .*at most a circle"),
+        ({"initial": {"dominant": 9}, "biased": {"mug": {}}}, r"parameter\.pose\.initial of mug"),
+    ],
+)
+def test_bad_settings_name_their_key(bad, message):
+    with pytest.raises(ValueError, match=message):
         Pose(**bad)

@@ -135,11 +135,3 @@ def test_mirror_goes_on_after_a_cliff():
         if step == 45:  # momentum has forgotten the cliff: 1e12 * 0.5^40 = 1
             before = psi.clone()
     assert (psi - before)[0, 0] > 13 * 0.3 / 10
-
-
-@pytest.mark.parametrize("make", [lambda: SGD(learning_rate=0.0),
-                                  lambda: Mirror(momentum=1.0), lambda: Mirror(max_step=-1.0),
-                                  lambda: SGD(1.0, max_step=0.0)])  # fmt: skip
-def test_bad_settings_are_refused(make):
-    with pytest.raises(ValueError, match=r"^(learning_rate|momentum|max_step) must "):
-        make()

@@ -6,19 +6,36 @@ Everything is a pure function of logits psi and of noise drawn beforehand, so th
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.parameter.simplex import project_simplex
+from neural_sim.parameter.distributions import project_simplex
 
 # The softmax of a logit at its lowest (:func:`bounded`), in floors: there p is within this fraction of the floor.
 LOWEST = 0.25
 
 
+@dataclass(frozen=True)
+class BinNoise:
+    """Noise that selects the bins of n draws.
+
+    ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see
+    :func:`~neural_sim.parameter.bins.balanced`; None: independent draws.
+    """
+
+    gumbel: Float[Tensor, "n k"]
+    offset: float | None = None
+
+    def select(self, index: Int[Tensor, "m"]) -> BinNoise:
+        """Select the draws ``index``, which may repeat; not balanced, which is a property of all draws together."""
+        return BinNoise(self.gumbel[index])
+
+
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
+    """Compute log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
     The floor keeps every bin within reach of a draw and every log p finite, whatever psi is.
 
@@ -33,15 +50,19 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 
 
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Log w, for which the derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)): w = p - ``floor``, computed
-    without cancellation. Divided by p in its place, derivatives of bins at the floor would vanish.
+    """Compute log w for w = p - ``floor``, without cancellation.
+
+    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)). Divided by p in the place of w, derivatives of
+    bins at the floor would vanish.
     """
     return torch.log_softmax(psi, -1) + math.log1p(-psi.shape[-1] * floor)
 
 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Psi with no logit further below the largest than log(1 / (``LOWEST`` ``floor``)). There a bin's p is within a
-    quarter of the floor; further down p hardly changes, yet a step of some logits would not bring the bin back.
+    """Raise logits that lie further below the largest than log(1 / (``LOWEST`` ``floor``)).
+
+    There a bin's p is within a quarter of the floor; further down p hardly changes, yet a step of some logits would not
+    bring the bin back.
     """
     if floor == 0.0:
         return psi
@@ -51,8 +72,9 @@ def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n
 def nearest(
     values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | float = 0.0
 ) -> Float[Tensor, "*n k"]:
-    """The nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1, nor below the p of a
-    logit that :func:`bounded` has raised, if the largest p is 1.
+    """Find the nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1.
+
+    Nor is any below the p of a logit that :func:`bounded` has raised, if the largest p is 1.
     """
     bins = values.shape[-1]
     lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
@@ -61,7 +83,7 @@ def nearest(
 
 
 def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Centred logits whose :func:`log_probabilities` are log ``probabilities``, clamped to just above the floor."""
+    """Compute centred logits of ``probabilities``, clamped to just above the floor; see :func:`log_probabilities`."""
     bins = probabilities.shape[-1]
     above_floor = ((probabilities - floor) / (1.0 - bins * floor)).clamp_min(1e-6)
     log_p = above_floor.log()
@@ -75,7 +97,7 @@ def gumbel(shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtyp
 
 
 def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: float) -> Int[Tensor, "n"]:
-    """Bins of n draws of which each follows p, and bin b has n p_b, rounded down or up.
+    """Draw n bins of which each follows p, and bin b comes n p_b times, rounded down or up.
 
     The counts are those of systematic sampling: the numbers ``offset``, ``offset`` + 1, ... below n (``offset`` uniform
     in [0, 1)) that fall between the cumulated n p. The draws begin at the Gumbel-max ones; those of bins with too many
@@ -106,7 +128,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
 def gumbel_softmax(
     log_p: Float[Tensor, "*n k"], noise: Float[Tensor, "*n k"], temperature: float
 ) -> Float[Tensor, "*n k"]:
-    """Y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
+    """Compute y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
 
     Raises:
         ValueError: unless the temperature is positive.
@@ -117,20 +139,20 @@ def gumbel_softmax(
 
 
 def centres(bins: int, low: float, high: float, like: Tensor) -> Float[Tensor, "k"]:
-    """Centres of ``bins`` equal bins of [low, high], in the unit of ``low``."""
+    """Compute the centres of ``bins`` equal bins of [low, high], in the unit of ``low``."""
     steps = torch.arange(bins, dtype=like.dtype, device=like.device) + 0.5
     return low + (high - low) / bins * steps
 
 
 def linear_mean(weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"]) -> Float[Tensor, "*n"]:
-    """The paper's approximate bin centre, sum_i y_i B_i. On a circle it is wrong across the wrap."""
+    """Compute the paper's approximate bin centre, sum_i y_i B_i. On a circle it is wrong across the wrap."""
     return weights @ bin_centres
 
 
 def circular_mean(
     weights: Float[Tensor, "*n k"], bin_centres: Float[Tensor, "k"], smallest_resultant: float = 0.1
 ) -> Float[Tensor, "*n"]:
-    """The direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
+    """Compute the direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
 
     Its derivative grows as one over the resultant's length, without bound where opposite bins mix in equal
     parts; a length below ``smallest_resultant`` is replaced by it in the derivative. The value is exact.
@@ -143,6 +165,6 @@ def circular_mean(
 
 
 def nearest_bin(angle: Float[Tensor, "*n"], bins: int, low: float, high: float) -> Int[Tensor, "*n"]:
-    """Index of the bin of [low, high) that contains ``angle`` modulo the range."""
+    """Find the index of the bin of [low, high) that contains ``angle`` modulo the range."""
     fraction = ((angle.detach() - low) / (high - low)) % 1.0
     return (fraction * bins).long().clamp_max(bins - 1)

@@ -1,4 +1,4 @@
-"""Distributions over bins by name, as configurations state them."""
+"""Distributions over bins: by name, as configurations state them; projections onto them; distances."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ authors' code and leaves 0.86 for one mode of eight bins, 0.44 for each of two a
 
 
 def distribution(specification: Specification, bins: int, where: str = "distribution") -> Float[Tensor, "k"]:
-    """Probabilities over ``bins`` bins, float64.
+    """Compute the probabilities of ``bins`` bins, float64, from how a configuration states them.
 
     ``uniform``; ``{dominant: b}``, 0.02 on all bins but b, which has the rest (0.86 for k = 8);
     ``{modes: [b, ...]}``, 0.02 on all others, the rest split equally among the modes; or ``bins`` numbers
@@ -66,10 +66,47 @@ def _numbers(values: Sequence[float], bins: int, where: str) -> Tensor:
 
 
 def merged(p: Float[Tensor, "*n k"], groups: Sequence[Sequence[int]]) -> Float[Tensor, "*n g"]:
-    """Probabilities of groups of bins, numbered from 1."""
+    """Add up the probabilities of groups of bins, which are numbered from 1."""
     return torch.stack([p[..., [b - 1 for b in group]].sum(-1) for group in groups], -1)
 
 
 def total_variation(p: Float[Tensor, "*n k"], q: Float[Tensor, "*n k"]) -> Float[Tensor, "*n"]:
-    """Half the L1 distance between two distributions: 0 when equal, 1 when disjoint."""
+    """Compute half the L1 distance between two distributions: 0 when equal, 1 when disjoint."""
     return 0.5 * (p - q).abs().sum(-1)
+
+
+def project_sum(values: Float[Tensor, "*n k"], total: float = 1.0) -> Float[Tensor, "*n k"]:
+    """Project onto the plane ``sum(w) = total``, whose points may have either sign.
+
+    Raises:
+        ValueError: no entries, or entries that are not finite.
+    """
+    _check_weights(values)
+    return values - (values.mean(-1, keepdim=True) - total / values.shape[-1])
+
+
+def project_simplex(values: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+    """Project onto the simplex ``w >= 0, sum(w) = 1`` (Held, Wolfe and Crowder 1974).
+
+    The nearest point is ``max(v - t, 0)`` for the one t at which that adds up to 1. Only differences to the largest
+    entry matter, and of those only the ones below 1 (t lies at most 1 below the largest entry), so that nothing large
+    is ever subtracted: entries of any size are projected to a few roundings of 1. Differentiable where the set of
+    positive weights does not change: there the derivative is ``I - 1 1^T / (positive weights)`` on that set.
+
+    Raises:
+        ValueError: no entries, or entries that are not finite.
+    """
+    _check_weights(values)
+    below = (values - values.amax(-1, keepdim=True).detach()).clamp_min(-1.0)
+    descending = below.sort(-1, descending=True).values
+    count = torch.arange(1, values.shape[-1] + 1, dtype=values.dtype, device=values.device)
+    thresholds = (descending.cumsum(-1) - 1.0) / count
+    positive = (descending > thresholds).sum(-1, keepdim=True)
+    return (below - thresholds.gather(-1, positive - 1)).clamp_min(0.0)
+
+
+def _check_weights(values: Tensor) -> None:
+    if values.ndim == 0 or values.shape[-1] == 0:
+        raise ValueError(f"simplex: want at least one weight, got shape {tuple(values.shape)}")
+    if not bool(torch.isfinite(values).all()):
+        raise ValueError(f"simplex: weights must be finite, got {values.tolist()}")

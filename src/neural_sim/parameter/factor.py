@@ -5,22 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol, get_args
+from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
 
+from annotated_types import Ge, Lt
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
+from neural_sim.parameter.bins import BinNoise
 from neural_sim.parameter.distributions import Specification, distribution
-from neural_sim.parameter.noise import BinNoise
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
 COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
 """The numbers of a :class:`SceneDraw` that images depend on smoothly."""
 Gap = Literal["disjoint", "uniform", "same"]
+Floor = Annotated[float, Ge(0), Lt(1)]
+"""Smallest probability of a bin, below 1 over their number."""
 
 
+@validated
 @dataclass(frozen=True)
 class ConfiguredDistributions:
     """Initial and target distribution of one factor for each object, as configured.
@@ -38,7 +43,7 @@ class ConfiguredDistributions:
     gap: Gap = "disjoint"
 
     def of(self, which: str, object_name: str) -> Specification:
-        """The ``initial`` or ``target`` specification of one object."""
+        """Look up the ``initial`` or ``target`` specification of one object."""
         own = (self.biased or {}).get(object_name)
         if own is None:
             return self.initial if which == "initial" else self.target
@@ -56,42 +61,75 @@ class ConfiguredDistributions:
 class Factor(Protocol):
     """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
 
-    ``update`` names the setting of the psi loop that steps it. ``lights`` is the number of anchor lights; above 0, the
-    images themselves change with psi, not only how often each is drawn. ``drawn`` lists what hard draws at given ``p``
-    depend on.
-
-    ``psi`` is the configured ``initial`` or ``target`` psi of an object, float64. ``psi_of`` maps probabilities of bins
-    or weights of lights to psi; ``p_of`` is its inverse. A derivative by psi, divided by the exponential of
-    ``log_slopes``, is that by p but for a constant; they are 0 for lights. ``project`` returns the nearest psi that
-    meets the factor's constraint, ``moved`` that whose p is nearest to p + ``change``. ``stratum_of`` returns the
-    stratum of each draw. ``reach`` converts a score to the units of psi and gives the largest step, for a method whose
-    steps are at most ``step`` logits.
+    ``update`` names the setting of the psi loop that steps it.
     """
 
     update: ClassVar[str]
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The name of the configuration node ``parameter.<name>``."""
+        ...
+
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Numbers of psi for each object."""
+        ...
+
     @property
-    def lights(self) -> int: ...
+    def lights(self) -> int:
+        """Number of anchor lights.
+
+        Above 0, the images themselves change with psi, not only how often each is drawn.
+        """
+        ...
+
     @property
-    def configured(self) -> ConfiguredDistributions: ...
+    def configured(self) -> ConfiguredDistributions:
+        """The configured distributions, by object."""
+        ...
+
     @property
-    def drawn(self) -> dict[str, Any]: ...
-    def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]: ...
-    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
-    def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
-    def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
-    def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]: ...
+    def drawn(self) -> dict[str, Any]:
+        """What hard draws at given ``p`` depend on."""
+        ...
+
+    def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
+        """Compute the configured ``initial`` or ``target`` psi of an object, float64."""
+        ...
+
+    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """Map probabilities of bins, or weights of lights, to psi."""
+        ...
+
+    def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """Map psi to probabilities of bins, or weights of lights."""
+        ...
+
+    def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """Compute log w: a derivative by psi over w is that by p but for a constant. 0 for lights."""
+        ...
+
+    def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+        """Find the nearest psi that meets the factor's constraint."""
+        ...
+
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
-    ) -> Float[Tensor, "*n k"]: ...
-    def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]: ...
-    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]: ...
+    ) -> Float[Tensor, "*n k"]:
+        """Find the psi whose p is nearest to p + ``change``, no bin left with less than ``keep`` of its p."""
+        ...
+
+    def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
+        """Find the stratum of each draw."""
+        ...
+
+    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
+        """Convert a score to the units of psi, with the largest step, where steps are at most ``step`` logits."""
+        ...
 
 
+@validated
 @dataclass(frozen=True)
 class BinnedFactor:
     """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
@@ -113,30 +151,24 @@ class BinnedFactor:
     update: ClassVar[str] = "update"
     name: str
     coordinate: Coordinate
-    bins: int
+    bins: PositiveInt
     low: float
     high: float
     geometric: bool = False
     periodic: bool = False
-    temperature: float = 0.1
+    temperature: Positive = 0.1
     bin_mean: Literal["linear", "circular"] = "linear"
-    floor: float = 0.005
+    floor: Floor = 0.005
     configured: ConfiguredDistributions = ConfiguredDistributions()
 
     def __post_init__(self) -> None:
         where = f"parameter.{self.name}"
-        if self.bins < 1:
-            raise ValueError(f"{where}.bins must be at least 1, got {self.bins}")
-        if self.bin_mean not in ("linear", "circular"):
-            raise ValueError(f"{where}.bin_mean must be linear or circular, got {self.bin_mean!r}")
         if self.bin_mean == "circular" and not self.periodic:
             raise ValueError(f"{where}.bin_mean: circular is for a full circle, want linear")
-        if not self.temperature > 0.0:
-            raise ValueError(f"{where}.temperature must be positive, got {self.temperature}")
-        if not 0.0 <= self.floor < 1.0 / self.bins:
-            raise ValueError(f"{where}.floor must lie in [0, 1/bins), got {self.floor}")
-        if self.configured.gap not in get_args(Gap):
-            raise ValueError(f"{where}.gap must be one of {get_args(Gap)}, got {self.configured.gap!r}")
+        if not self.floor < 1.0 / self.bins:
+            raise ValueError(
+                f"{where}.floor: want less than 1/{self.bins} for {self.bins} bins, got {self.floor}"
+            )
         if not self.low < self.high or (self.geometric and not self.low > 0.0):
             raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
         for name in self.configured.biased or {}:
@@ -160,62 +192,61 @@ class BinnedFactor:
         return 0
 
     def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """The configured ``initial`` or ``target`` distribution of one object."""
+        """Compute the configured ``initial`` or ``target`` distribution of one object."""
         where = f"parameter.{self.name}.{which} of {object_name}"
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """The logits that give :meth:`probabilities`."""
+        """Compute the logits that give :meth:`probabilities`."""
         return self.psi_of(self.probabilities(which, object_name))
 
     def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """The logits that give the probabilities ``p``."""
+        """Compute the logits that give the probabilities ``p``."""
         return binned.logits(p, self.floor)
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """The probabilities of the bins."""
+        """Compute the probabilities of the bins."""
         return self.log_probabilities(psi).exp()
 
     def log_probabilities(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Log p over the bins, floored."""
+        """Compute log p over the bins, floored."""
         return binned.log_probabilities(psi, self.floor)
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Log (p - floor)."""
+        """Compute log (p - floor)."""
         return binned.log_slopes(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Logits within reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
+        """Raise logits out of reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
         return binned.bounded(psi, self.floor)
 
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
-        """Logits of the probabilities nearest to p + ``change``, none lower than :meth:`project` lets it be, nor than
-        the fraction ``keep`` of what it was.
+        """Compute logits of the probabilities nearest to p + ``change``.
+
+        None is lower than :meth:`project` lets it be, nor than the fraction ``keep`` of what it was.
         """
         p = self.p_of(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p), self.floor)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """The bin of each draw's coordinate, which a relaxed draw may not share with the bin that it was drawn for."""
+        """Find the bin of each draw's coordinate: for a relaxed draw not always the bin that was drawn."""
         return self.bin_of(getattr(draw, self.coordinate))
 
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """The score itself, and ``step``."""
+        """Return the score itself, and ``step``."""
         return score, step
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
-        """Exact samples of the bins by the Gumbel-max trick, balanced where the noise has an offset; no derivative
-        reaches psi.
-        """
+        """Draw bins exactly by the Gumbel-max trick, balanced where the noise has an offset, without a derivative."""
         log_p = self.log_probabilities(psi.detach())
         if noise.offset is None:
             return (log_p + noise.gumbel).argmax(-1)
         return binned.balanced(log_p, noise.gumbel, noise.offset)
 
     def at(self, bins: Int[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """The coordinate in given bins, at the fraction ``within`` of each."""
+        """Compute the coordinate in given bins, at the fraction ``within`` of each."""
         return self._place(self._centres(within)[bins], within)
 
     def relaxed(
@@ -233,7 +264,7 @@ class BinnedFactor:
         return self._place(centre, within), (log_p.detach() + noise.gumbel).argmax(-1)
 
     def bin_of(self, values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-        """The bin of each value. Values outside a range that is not periodic belong to the bin at that end."""
+        """Find the bin of each value. Values outside a range that is not periodic belong to the bin at that end."""
         low, high = self._ends
         at = values.log() if self.geometric else values
         if self.periodic:

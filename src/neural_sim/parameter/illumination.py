@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.parameter.distributions import Specification, distribution, project_simplex, project_sum
 from neural_sim.parameter.factor import ConfiguredDistributions, Gap
-from neural_sim.parameter.simplex import project_simplex, project_sum
+from neural_sim.ranges import Positive, validated
 from neural_sim.types import SceneDraw
 
 Constraint = Literal["simplex", "affine"]
@@ -32,6 +33,7 @@ class GaussianDraw:
     weights: Float[Tensor, "n k"]
 
 
+@validated
 @dataclass(frozen=True)
 class Illumination:
     """Weights over ``anchors`` lights.
@@ -49,25 +51,15 @@ class Illumination:
     """
 
     update: ClassVar[str] = "light_update"
-    anchors: int = 6
+    anchors: Annotated[int, Ge(2)] = 6
     constraint: Constraint = "simplex"
-    deviation: float = 0.1
+    deviation: Positive = 0.1
     initial: Specification = "uniform"
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
     gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:
-        if self.anchors < 2:
-            raise ValueError(f"parameter.illumination.anchors must be at least 2, got {self.anchors}")
-        if self.constraint not in get_args(Constraint):
-            raise ValueError(
-                f"parameter.illumination.constraint must be simplex or affine, got {self.constraint!r}"
-            )
-        if not (math.isfinite(self.deviation) and self.deviation > 0.0):
-            raise ValueError(f"parameter.illumination.deviation must be positive, got {self.deviation}")
-        if self.gap not in get_args(Gap):
-            raise ValueError(f"parameter.illumination.gap must be one of {get_args(Gap)}, got {self.gap!r}")
         for name in ("", *(self.biased or {})):  # a bad specification is refused before any stage runs
             self.psi("initial", name)
             self.psi("target", name)
@@ -108,66 +100,75 @@ class Illumination:
         return ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """The configured ``initial`` or ``target`` weights of one object, float64: they are psi itself."""
+        """Compute the configured ``initial`` or ``target`` weights of one object, float64: they are psi itself."""
         specification = self.configured.of(which, object_name)
         where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
         numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
         if self.constraint == "affine" and numbers:
-            return _affine_numbers(specification, self.anchors, where)
+            return _affine_numbers(cast(Sequence[float], specification), self.anchors, where)
         return distribution(specification, self.anchors, where)
 
     def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """The weights themselves."""
+        """Return the weights themselves."""
         return p
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Psi itself."""
+        """Return psi itself."""
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """0: psi are the weights."""
+        """Return 0: psi are the weights."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """The nearest weights that meet the constraint. Raises ``ValueError`` for values that are not finite."""
+        """Find the nearest weights that meet the constraint.
+
+        Raises:
+            ValueError: values that are not finite.
+        """
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
 
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
-        """The nearest weights to psi + ``change`` that meet the constraint. ``keep``, of bins, does not bound them: a
-        weight is no number of images.
+        """Find the nearest weights to psi + ``change`` that meet the constraint.
+
+        ``keep``, of bins, does not bound them: a weight is no number of images.
         """
         return self.project(psi + change)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """The anchor light of the largest weight. Raises ``ValueError`` for draws under the fixed light."""
+        """Find the anchor light of the largest weight.
+
+        Raises:
+            ValueError: draws under the fixed light.
+        """
         if draw.weights is None:
             raise ValueError("parameter.illumination: want draws under weighed lights, got the fixed one")
         return draw.weights.argmax(-1)
 
     def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """The score times the variance, in units of psi, and one standard deviation as the largest step."""
+        """Multiply the score by the variance, to units of psi; the largest step is one standard deviation."""
         return self.deviation**2 * score, self.deviation
 
     def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
-        """Every image's weights: psi itself, differentiable in psi."""
+        """Repeat psi for every image, differentiably."""
         return psi.expand(count, -1)
 
     def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
-        """Draws of N(psi, deviation^2 I) from standard normal ``noise``, and their projections; detached from psi."""
+        """Draw from N(psi, deviation^2 I) by standard normal ``noise``, and project the draws; detached from psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 
     def log_prob(self, psi: Float[Tensor, "k"], unprojected: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
-        """Log density of Gaussian draws before their projection; its gradient is (u - psi) / deviation^2."""
+        """Compute the log density of draws before their projection; its gradient is (u - psi) / deviation^2."""
         scaled = (unprojected.detach() - psi) / self.deviation
         constant = self.anchors * (math.log(self.deviation) + 0.5 * math.log(2.0 * math.pi))
         return -0.5 * scaled.square().sum(-1) - constant
 
 
-def _affine_numbers(values: object, anchors: int, where: str) -> Float[Tensor, "k"]:
-    weights = torch.tensor([float(str(value)) for value in values], dtype=torch.float64)  # pyright: ignore
+def _affine_numbers(values: Sequence[float], anchors: int, where: str) -> Float[Tensor, "k"]:
+    weights = torch.tensor([float(value) for value in values], dtype=torch.float64)
     if len(weights) != anchors:
         raise ValueError(f"{where}: want {anchors} numbers, got {len(weights)}")
     if not bool(torch.isfinite(weights).all()) or abs(float(weights.sum()) - 1.0) > 1e-6:

@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Floor, Gap
+from neural_sim.ranges import Ascending, Matching, Positive, PositiveInt, validated
 
 Axis = Literal["polar", "azimuth", "both"]
 OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
 """Range of the other angle, where ``unlearned`` does not give it."""
+Range = Annotated[
+    tuple[float, float], Ascending(), Matching(lambda ends: ends[1] - ends[0] <= 360.0, "at most a circle")
+]
 
 
+@validated
 @dataclass(frozen=True)
 class Pose:
     """Which angles of the camera's pose are learned.
@@ -36,27 +41,20 @@ class Pose:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    bins: int = 8
+    bins: PositiveInt = 8
     axis: Axis = "polar"
-    other_bins: int = 4
-    other_range_deg: tuple[float, float] | None = None
-    temperature: float = 0.1
+    other_bins: PositiveInt = 4
+    other_range_deg: Range | None = None
+    temperature: Positive = 0.1
     bin_mean: Literal["linear", "circular"] = "circular"
-    floor: float = 0.005
+    floor: Floor = 0.005
     initial: Specification = "uniform"
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
     gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:
-        if self.axis not in get_args(Axis):
-            raise ValueError(f"parameter.pose.axis must be one of {get_args(Axis)}, got {self.axis!r}")
-        low, high = self._other_range_deg or (0.0, 0.0)
-        if not low <= high or high - low > 360.0:
-            raise ValueError(
-                f"parameter.pose.other_range_deg must be ordered and at most a circle, got {[low, high]}"
-            )
-        _ = self.factors
+        _ = self.factors  # raises for what their distributions do not take
 
     @property
     def _other_range_deg(self) -> tuple[float, float] | None:
@@ -90,7 +88,7 @@ class Pose:
 
 
 def _angle(configured: ConfiguredDistributions, angle: str) -> ConfiguredDistributions:
-    """One angle's distributions, from those configured for two."""
+    """Pick one angle's distributions from those configured for two."""
 
     def part(specification: Specification) -> Specification:
         if isinstance(specification, Mapping) and set(specification) <= {"phi", "rho"} and specification:

@@ -13,12 +13,11 @@ from torch.nn.functional import one_hot
 
 from neural_sim.digests import tensor_digest
 from neural_sim.parameter import bins as binned
-from neural_sim.parameter.distances import Unit, radii_in_metres
+from neural_sim.parameter.bins import BinNoise
 from neural_sim.parameter.distributions import distribution
 from neural_sim.parameter.factor import COORDINATES, BinnedFactor, Factor
 from neural_sim.parameter.illumination import Illumination
-from neural_sim.parameter.noise import BinNoise, SceneNoise
-from neural_sim.parameter.unlearned import Unlearned
+from neural_sim.parameter.unlearned import Unit, Unlearned, radii_in_metres
 from neural_sim.types import SceneDraw
 
 
@@ -26,10 +25,37 @@ class Parameter(Protocol):
     """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it does not learn."""
 
     @property
-    def factors(self) -> tuple[Factor, ...]: ...
+    def factors(self) -> tuple[Factor, ...]:
+        """The factors that are learned."""
+        ...
 
     @property
-    def ranges(self) -> Mapping[str, tuple[float, float]]: ...
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Uniform ranges of coordinates that are not, in radians."""
+        ...
+
+
+@dataclass(frozen=True)
+class SceneNoise:
+    """All randomness of n draws, drawn once and replayed in every pass (paper, Tool 2).
+
+    ``bins`` selects each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
+    where no factor draws it. ``light`` is standard normal, for lights drawn around psi's weights; None: the lights are
+    psi's weights.
+    """
+
+    bins: Mapping[str, BinNoise]
+    uniform: Mapping[str, Float[Tensor, "n"]]
+    light: Float[Tensor, "n k"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.uniform["phi"])
+
+    def select(self, index: Int[Tensor, "k"]) -> SceneNoise:
+        """Select the draws ``index``, which may repeat."""
+        bins = {name: part.select(index) for name, part in self.bins.items()}
+        uniform = {name: values[index] for name, values in self.uniform.items()}
+        return SceneNoise(bins, uniform, None if self.light is None else self.light[index])
 
 
 @dataclass(frozen=True)
@@ -56,7 +82,7 @@ class SceneDistribution:
 
     @staticmethod
     def of(parameters: Iterable[Parameter], unlearned: Unlearned | None = None) -> SceneDistribution:
-        """The product of configured parameters."""
+        """Build the product of configured parameters."""
         parameters = tuple(parameters)
         unlearned = Unlearned() if unlearned is None else unlearned
         ranges, unit = unlearned.ranges, unlearned.distance_unit
@@ -69,7 +95,7 @@ class SceneDistribution:
         )
 
     def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
-        """The objects' radii of ``sizes`` where distances are in metres, see :func:`radii_in_metres`; else None."""
+        """List the radii of ``sizes`` where distances are in metres, see :func:`radii_in_metres`; else None."""
         if self.distance_unit == "radii":
             return None
         nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
@@ -90,7 +116,7 @@ class SceneDistribution:
         return next((factor for factor in self.factors if isinstance(factor, Illumination)), None)
 
     def factor(self, name: str) -> Factor:
-        """A factor by its name."""
+        """Find a factor by its name."""
         return self.factors[self.names.index(name)]
 
     @property
@@ -112,16 +138,16 @@ class SceneDistribution:
         return sum(factor.size for factor in self.factors)
 
     def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
-        """Every factor's part of psi, or of any vector of psi's shape."""
+        """Split psi, or any vector of psi's shape, into every factor's part."""
         parts = psi.split([factor.size for factor in self.factors], -1)
         return dict(zip(self.names, parts, strict=True))
 
     def join(self, parts: Mapping[str, Float[Tensor, "*n k"]]) -> Float[Tensor, "*n K"]:
-        """Inverse of :meth:`split`."""
+        """Join what :meth:`split` has split."""
         return torch.cat([parts[name] for name in self.names], -1)
 
     def psi(self, which: str, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
-        """The configured ``initial`` or ``target`` psi of the objects, float64."""
+        """Compute the configured ``initial`` or ``target`` psi of the objects, float64."""
         return torch.stack(
             [torch.cat([factor.psi(which, name) for factor in self.factors]) for name in objects]
         )
@@ -132,17 +158,17 @@ class SceneDistribution:
         return torch.cat([f.psi_of(distribution("uniform", f.size)) for f in self.factors])
 
     def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
-        """Every factor's probabilities of its bins, and the weights of the lights."""
+        """Compute every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
         return {f.name: f.p_of(parts[f.name]) for f in self.factors}
 
     def digest_of(self, psi: Float[Tensor, "objects K"]) -> str:
-        """Digest of the probabilities and weights that psi gives, to 12 digits after the point."""
+        """Digest the probabilities and weights that psi gives, to 12 digits after the point."""
         p = self.probabilities(psi.detach().cpu().double())
         return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
     def constrained(self, psi: Float[Tensor, "*n K"]) -> Float[Tensor, "*n K"]:
-        """Psi with every factor's part projected onto its constraint."""
+        """Project every factor's part of psi onto its constraint."""
         parts = self.split(psi)
         return self.join({f.name: f.project(parts[f.name]) for f in self.factors})
 
@@ -190,20 +216,20 @@ class SceneDistribution:
         return SceneNoise(noise, dict(zip(drawn, uniform, strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
-        """Exact samples of p_psi; no derivative reaches psi."""
+        """Draw exact samples of p_psi; no derivative reaches psi."""
         parts = self.split(psi)
         bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:
-        """Samples in given bins of every factor, uniform within each; without a light."""
+        """Draw samples in given bins of every factor, uniform within each; without a light."""
         placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.binned}
         return self._draw(placed, bins, noise)
 
     def lit(
         self, draw: SceneDraw, psi: Float[Tensor, "K"], noise: Float[Tensor, "n k"] | None = None
     ) -> SceneDraw:
-        """``draw`` under psi's light, differentiable in psi; with ``noise`` under lights drawn around it, detached."""
+        """Put draws under psi's light, differentiably; with ``noise`` under lights drawn around it, detached."""
         if self._light is None:
             return draw
         weights = self.split(psi)[self._light.name]
@@ -223,8 +249,9 @@ class SceneDistribution:
     def probes(
         self, name: str, each: int, psi: Float[Tensor, "K"], generator: torch.Generator, dtype: torch.dtype
     ) -> SceneDraw:
-        """``each`` draws in every stratum of one factor, stratum after stratum, all else from p_psi and the same in all
-        strata.
+        """Draw ``each`` samples in every stratum of one factor, stratum after stratum.
+
+        All else is from p_psi and the same in all strata.
         """
         size, lights = self.factor(name).size, self.factor(name).lights
         strata = torch.arange(size).repeat_interleave(each)
@@ -236,13 +263,13 @@ class SceneDistribution:
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise
     ) -> SceneDraw:
-        """Samples in given bins of one factor, all others drawn from p_psi."""
+        """Draw samples in given bins of one factor, all others from p_psi."""
         parts = self.split(psi)
         others = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned if f.name != name}
         return self.lit(self.at_bins({**others, name: bins}, noise), psi.detach())
 
     def log_prob(self, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "n"]:
-        """Log p of drawn bins and explored lights (for REINFORCE).
+        """Compute log p of drawn bins and explored lights (for REINFORCE).
 
         Raises:
             ValueError: a light that was not explored, which has no density.
@@ -256,8 +283,10 @@ class SceneDistribution:
         return torch.stack(logs).sum(0)
 
     def statistics(self, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
-        """Sufficient statistics of each factor's psi: the drawn bin, one-hot; or the drawn light before its projection,
-        centred. A light that was not drawn has none.
+        """Compute sufficient statistics of each factor's psi.
+
+        They are the drawn bin, one-hot, or the drawn light before its projection, centred. A light that was not drawn
+        has none.
         """
         statistics = {f.name: one_hot(draw.bins[:, i], f.size) for i, f in enumerate(self.binned)}
         if self._light is not None and draw.explored is not None:
@@ -265,11 +294,11 @@ class SceneDistribution:
         return statistics
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
-        """The bins of each draw's coordinates, see :meth:`BinnedFactor.stratum_of`; a column for each binned factor."""
+        """Find the bins of each draw's coordinates, see :meth:`BinnedFactor.stratum_of`; a column a binned factor."""
         return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
     def label_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """The first binned factor's bin, for reports; -1 where nothing is binned."""
+        """Find the first binned factor's bin, for reports; -1 where nothing is binned."""
         bins = self.bins_of(draw)
         return bins[:, 0] if bins.shape[1] else torch.full((len(draw),), -1)
 
@@ -290,5 +319,5 @@ class SceneDistribution:
 
 
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
-    """Bins as columns of one table, [n, 0] without factors."""
+    """Join bins as columns of one table, [n, 0] without factors."""
     return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)

@@ -1,13 +1,21 @@
-"""Uniform ranges of the coordinates that no parameter draws."""
+"""Coordinates that no parameter draws: their uniform ranges, and the unit of the camera's distance."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from neural_sim.parameter.distances import Unit, check_unit
+from neural_sim.ranges import Ascending, Positive, validated
+
+Unit = Literal["radii", "metres"]
+"""Each object's own radius, or metres for objects of known size."""
+NEAREST = 1.05
+"""Object radii: a camera any closer is inside the object."""
 
 
+@validated
 @dataclass(frozen=True)
 class Unlearned:
     """Uniform ranges of coordinates that no parameter draws: angles in degrees, the distance in ``distance_unit``.
@@ -16,25 +24,39 @@ class Unlearned:
         ValueError: a range that is not ordered, a distance within the object, an unknown unit.
     """
 
-    phi_deg: tuple[float, float] = (0.0, 360.0)
-    rho_deg: tuple[float, float] = (-45.0, 45.0)
-    distance: tuple[float, float] = (2.4, 4.0)
+    phi_deg: Annotated[tuple[float, float], Ascending()] = (0.0, 360.0)
+    rho_deg: Annotated[tuple[float, float], Ascending()] = (-45.0, 45.0)
+    distance: Annotated[tuple[Positive, Positive], Ascending()] = (2.4, 4.0)
     distance_unit: Unit = "radii"
 
     def __post_init__(self) -> None:
-        for name in ("phi_deg", "rho_deg", "distance"):
-            low, high = getattr(self, name)
-            if not low <= high:
-                raise ValueError(f"unlearned.{name} must be ordered, got {[low, high]}")
-        check_unit(self.distance_unit, "unlearned.distance_unit")
-        smallest = 1.0 if self.distance_unit == "radii" else 0.0
-        if not self.distance[0] > smallest:
-            raise ValueError(
-                f"unlearned.distance must be above {smallest:g} {self.distance_unit}, got {list(self.distance)}"
-            )
+        if self.distance_unit == "radii" and not self.distance[0] > 1.0:
+            raise ValueError(f"unlearned.distance: want more than 1 object radius, got {list(self.distance)}")
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """By coordinate, in radians and the unit of distances."""
         phi, rho = ((math.radians(r[0]), math.radians(r[1])) for r in (self.phi_deg, self.rho_deg))
         return {"phi": phi, "rho": rho, "distance": self.distance, "magnification": (1.0, 1.0)}
+
+
+def radii_in_metres(nearest: float, sizes: Mapping[str, float | None]) -> tuple[float, ...]:
+    """List the radii (metres) of ``sizes``, by object, for cameras no nearer than ``nearest`` metres.
+
+    Raises:
+        ValueError: an object of unknown size, or one that the nearest camera would be inside of.
+    """
+    unknown = [name for name, radius in sizes.items() if radius is None]
+    if unknown:
+        raise ValueError(
+            f"distances in metres want objects of known size, and nothing says that of {', '.join(unknown)}: "
+            "set objects.size, or give distances in object radii"
+        )
+    known = {name: radius for name, radius in sizes.items() if radius is not None}
+    for name, radius in known.items():
+        if not nearest > NEAREST * radius:
+            raise ValueError(
+                f"distances: a camera {nearest:g} m from {name}, of radius {radius:.3g} m, is inside of it; want more "
+                f"than {NEAREST * radius:.3g} m"
+            )
+    return tuple(known.values())

@@ -10,21 +10,25 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.ranges import Positive, validated
+
 _log = logging.getLogger(__name__)
 
+Momentum = Annotated[float, Ge(0), Lt(1)]
 CLIP = 10.0
 """The mirror step clips a gradient's root mean square to this many times the largest seen before."""
 
 
 @dataclass(frozen=True)
 class UpdateState:
-    """State of an update between steps: ``first`` and ``second`` moment of the direction, its noise variance, and the
-    number of steps.
+    """State of an update between steps: two moments of the direction, its noise variance, and the number of steps.
 
     ``refused`` counts gradients that are not finite, or whose squares are not: they change neither psi nor the moments.
     """
@@ -37,21 +41,12 @@ class UpdateState:
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"]) -> UpdateState:
+        """Begin without a step."""
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
-def check_rates(learning_rate: float, max_step: float | None, momentum: float) -> None:
-    """Raises ``ValueError`` for a setting out of its range, with its key."""
-    if not learning_rate > 0.0:
-        raise ValueError(f"learning_rate must be positive, got {learning_rate}")
-    if max_step is not None and not max_step > 0.0:
-        raise ValueError(f"max_step must be positive, got {max_step}")
-    if not 0.0 <= momentum < 1.0:
-        raise ValueError(f"momentum must lie in [0, 1), got {momentum}")
-
-
 def bound(step: Float[Tensor, "objects k"], largest: float) -> Float[Tensor, "objects k"]:
-    """The centred step, scaled down for each object whose largest component exceeds ``largest``."""
+    """Centre a step, and scale it down for each object whose largest component exceeds ``largest``."""
     centred = step - step.mean(-1, keepdim=True)
     size = centred.abs().amax(-1, keepdim=True)
     return centred * (largest / size.clamp_min(largest))
@@ -65,7 +60,7 @@ def _accept(
     second: Float[Tensor, "objects k"],
     noise: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
-    """Psi and the state after the step, or before it where the result is not finite: NaN would stay in the moments.
+    """Take a step, or refuse it where the result is not finite: NaN would stay in the moments.
 
     An infinite noise variance (an unknown standard error) keeps the old one for the same reason.
     """
@@ -76,6 +71,7 @@ def _accept(
     return psi, replace(before, refused=before.refused + 1)
 
 
+@validated
 @dataclass(frozen=True)
 class SGD:
     """Gradient descent with momentum (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
@@ -84,23 +80,21 @@ class SGD:
     not bounded, as in the paper.
     """
 
-    learning_rate: float
-    momentum: float = 0.9
-    max_step: float | None = None
-
-    def __post_init__(self) -> None:
-        check_rates(self.learning_rate, self.max_step, self.momentum)
+    learning_rate: Positive
+    momentum: Momentum = 0.9
+    max_step: Positive | None = None
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """Psi after one step, and the state to pass to the next."""
+        """Compute psi after one step, and the state to pass to the next."""
         velocity = self.momentum * state.first + gradient
         step = -self.learning_rate * velocity
         moved = psi + (step if self.max_step is None else bound(step, self.max_step))
         return _accept(psi, moved, state, velocity, state.second, state.noise)
 
 
+@validated
 @dataclass(frozen=True)
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
@@ -115,18 +109,15 @@ class Mirror:
     components within their noise do not move. Standard errors that are not finite shrink nothing.
     """
 
-    learning_rate: float = 3.0
-    momentum: float = 0.6
-    max_step: float = 3.0
+    learning_rate: Positive = 3.0
+    momentum: Momentum = 0.6
+    max_step: Positive = 3.0
     shrink: bool = True
-
-    def __post_init__(self) -> None:
-        check_rates(self.learning_rate, self.max_step, self.momentum)
 
     def step(
         self, psi: Tensor, log_p: Tensor, gradient: Tensor, standard_error: Tensor, state: UpdateState
     ) -> tuple[Tensor, UpdateState]:
-        """Psi after one step, and the state to pass to the next."""
+        """Compute psi after one step, and the state to pass to the next."""
         steps, rest = state.steps + 1, 1 - self.momentum
         p = log_p.exp()
         direction = gradient / p
@@ -144,7 +135,7 @@ class Mirror:
         return _accept(psi, moved, state, velocity, largest, noise)
 
     def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
-        """Factor that clips an outlier to ``CLIP`` times the scale, which never falls: one outlier must not set it."""
+        """Compute the factor that clips an outlier to ``CLIP`` times the scale, which never falls."""
         size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
         return torch.where(
             known > 0.0, (CLIP * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)
@@ -154,7 +145,7 @@ class Mirror:
 def shrinkage(
     direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]
 ) -> Float[Tensor, "objects k"]:
-    """Factors max(0, 1 - variance / direction^2); 1 where a variance is not finite, 0 where a direction is zero."""
+    """Compute max(0, 1 - variance / direction^2); 1 where a variance is not finite, 0 where a direction is zero."""
     factors = 1.0 - variance / direction.square().clamp_min(torch.finfo(direction.dtype).tiny)
     factors = torch.where(direction == 0.0, torch.zeros_like(factors), factors.clamp(0.0, 1.0))
     return torch.where(torch.isfinite(variance), factors, torch.ones_like(factors))

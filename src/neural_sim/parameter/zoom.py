@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
-from neural_sim.parameter.distances import NEAREST, Unit, check_unit
 from neural_sim.parameter.distributions import Specification
-from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Coordinate, Gap
+from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Coordinate, Floor, Gap
+from neural_sim.parameter.unlearned import NEAREST, Unit
+from neural_sim.ranges import Ascending, Positive, PositiveInt, validated
 
 By = Literal["distance", "focal_length"]
 
 
+@validated
 @dataclass(frozen=True)
 class Zoom:
     """``bins`` bins of equal ratio, which do not wrap: neighbouring centres differ in image size by (far / near)^(1/k).
@@ -31,28 +33,23 @@ class Zoom:
         ValueError: any of these out of its range, with the key and the value.
     """
 
-    bins: int = 4
+    bins: PositiveInt = 4
     by: By = "distance"
-    range: tuple[float, float] = (2.2, 8.5)
+    range: Annotated[tuple[Positive, Positive], Ascending(strictly=True)] = (2.2, 8.5)
     unit: Unit = "radii"
-    temperature: float = 0.1
-    floor: float = 0.005
+    temperature: Positive = 0.1
+    floor: Floor = 0.005
     initial: Specification = "uniform"
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
     gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:
-        if self.by not in get_args(By):
-            raise ValueError(f"parameter.zoom.by must be one of {get_args(By)}, got {self.by!r}")
-        check_unit(self.unit, "parameter.zoom.unit")
-        near, far = self.range
-        smallest = NEAREST if self.by == "distance" and self.unit == "radii" else 0.0
-        if not smallest < near < far:
+        if self.by == "distance" and self.unit == "radii" and not self.range[0] > NEAREST:
             raise ValueError(
-                f"parameter.zoom.range must be ordered and above {smallest}, got {list(self.range)}"
+                f"parameter.zoom.range: want more than {NEAREST} object radii, got {list(self.range)}"
             )
-        _ = self.factors
+        _ = self.factors  # raises for what their distributions do not take
 
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:

@@ -17,9 +17,8 @@ from torch import Tensor
 from neural_sim.checks import at_least
 from neural_sim.documents import markdown_table
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.parameter.bins import gumbel
+from neural_sim.parameter.bins import BinNoise, gumbel
 from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.parameter.noise import BinNoise
 from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.parameter.noise import SceneNoise
+from neural_sim.parameter.product import SceneNoise
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.layout import Layout
 from neural_sim.synthesis.training_set import Nuisance, Synthesizer

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neural_sim.parameter.noise import SceneNoise
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 
 
 @dataclass(frozen=True)

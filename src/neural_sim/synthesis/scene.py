@@ -12,8 +12,7 @@ from torch import Tensor
 
 from neural_sim.cameras import cameras_of, orbit
 from neural_sim.field.base import RadianceField
-from neural_sim.parameter.noise import SceneNoise
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.synthesis.assembly import RenderedImages, RenderedObject, Shared, one_each

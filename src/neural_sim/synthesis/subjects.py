@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.cameras import cameras_of, orbit
-from neural_sim.parameter.noise import SceneNoise
+from neural_sim.parameter.product import SceneNoise
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.assembly import RenderedObject
 from neural_sim.synthesis.draws import HARD, Draws, RelaxedDraws

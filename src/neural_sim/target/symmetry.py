@@ -11,9 +11,9 @@ from torch import Tensor
 
 from neural_sim.alpha import premultiplied
 from neural_sim.cameras import orbit
+from neural_sim.parameter.bins import BinNoise
 from neural_sim.parameter.factor import COORDINATES
-from neural_sim.parameter.noise import BinNoise, SceneNoise
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.renderer.subject import Subject
 from neural_sim.types import PinholeCamera, SceneDraw
 

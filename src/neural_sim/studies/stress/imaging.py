@@ -12,9 +12,8 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.detector.cached import CachedSet
-from neural_sim.parameter.noise import SceneNoise
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.hvp import gradient

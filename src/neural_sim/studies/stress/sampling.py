@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
-from neural_sim.parameter.noise import BinNoise, SceneNoise
+from neural_sim.parameter.bins import BinNoise
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import SceneDistribution, SceneNoise
 from neural_sim.studies.stress.cases import (
     DOUBLE,
     FALSE_ALARM,

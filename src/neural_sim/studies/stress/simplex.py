@@ -8,7 +8,7 @@ from fractions import Fraction
 import torch
 from torch import Tensor
 
-from neural_sim.parameter.simplex import project_simplex, project_sum
+from neural_sim.parameter.distributions import project_simplex, project_sum
 from neural_sim.studies.stress.cases import DOUBLE, SINGLE, Check, Checks, Scope, case, eps, short, worst
 
 

@@ -1,4 +1,4 @@
-"""Distances in metres: which objects they fit."""
+"""Distances that no parameter draws, and those in metres: which objects they fit."""
 
 import pytest
 
@@ -33,10 +33,9 @@ def test_objects_of_unknown_size_or_too_large_are_named():
         SceneDistribution.of([Zoom(range=(0.3, 0.9), unit="metres")], METRES).radii({"mug": 0.3})
 
 
-def test_other_units_are_refused():
-    with pytest.raises(ValueError, match=r"parameter\.zoom\.unit must be one of \('radii', 'metres'\)"):
-        Zoom(unit="feet")
-    with pytest.raises(ValueError, match=r"unlearned\.distance_unit must be one of"):
-        Unlearned(distance_unit="feet")
-    with pytest.raises(ValueError, match=r"unlearned\.distance must be above 0 metres"):
-        Unlearned(distance=(0.0, 1.0), distance_unit="metres")
+def test_a_distance_within_an_object_is_refused():
+    with pytest.raises(
+        ValueError, match=r"unlearned\.distance: want more than 1 object radius, got \[1\.0, 2\.0\]"
+    ):
+        Unlearned(distance=(1.0, 2.0))
+    assert Unlearned(distance=(1.0, 2.0), distance_unit="metres").distance == (1.0, 2.0)
