@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neural_sim.objects.procedural import Procedural
-from neural_sim.target.matlab import read_arrays
+from neural_sim.target.ycb_video import read_arrays
 
 MATRIX = np.array([[150.0, 0.0, 61.0], [0.0, 140.0, 43.5], [0.0, 0.0, 1.0]])
 SIZE = (120, 90)

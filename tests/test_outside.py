@@ -1,4 +1,4 @@
-"""A parameter, an estimator and a detector from outside the package: each one file and one YAML, in tests/outside."""
+"""A parameter, an estimator, a detector and a target from outside the package: each one file and one YAML."""
 
 import importlib.util
 import json
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from PIL import Image
 
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
@@ -81,6 +82,31 @@ def test_the_detector_s_boxes_are_those_that_it_was_assigned():
     torch.testing.assert_close(decoded, boxes[0, 1 - targets.labels[0, found]])
     anchors = found.nonzero()[:, 0]
     torch.testing.assert_close(detector.decode(targets.deltas[0, anchors], anchors), decoded)
+
+
+def test_a_target_is_parted_letterboxed_and_keyed_like_all_others(tmp_path):
+    """Twelve photographs of a can, of different greys, with one box each; half of them are scored."""
+    lines = ["file,class,x0,y0,x1,y1"]
+    for number in range(12):
+        Image.new("RGB", (40, 20), (20 * number,) * 3).save(tmp_path / f"{number}.png")
+        lines.append(f"{number}.png,can,4,2,24,12")
+    (tmp_path / "boxes.csv").write_text("\n".join(lines))
+    table = f"target.table={tmp_path}/boxes.csv"
+    words = ["target=my_table", table, "target.val_fraction=0.5", "target.train_fraction=0.5"]
+    config = composed(
+        *words, "objects.names=[can,mug]", "stages=[target_sets]", "progress=false", "training.image_size=64",
+        f"paths.store={tmp_path}/store", f"paths.mlflow={tmp_path}/mlflow.db",
+    )  # fmt: skip
+    context, _ = context_of(config, tmp_path)
+    graph = context.graph
+    made = context.results(graph.targets)
+    assert (len(made.train), len(made.val), len(made.test)) == (3, 3, 6)
+    for part in (made.train, made.val, made.test):
+        assert part.boxes.tolist() == [[pytest.approx([6.4, 19.2, 38.4, 35.2])]] * len(part)
+        assert part.labels.tolist() == [[0]] * len(part)
+    assert not graph.renders_target and len(graph.targets.description["target"]["digest"]) == 64
+    with pytest.raises(UserError, match=r"target\.val_fraction: want more than 0 and less than 1, got 1\.5"):
+        build(composed(*words, "target.val_fraction=1.5"))
 
 
 @pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])

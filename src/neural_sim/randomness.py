@@ -10,7 +10,8 @@ STREAMS: dict[str, tuple[int, int]] = {
     "psi": (1_000_003, 2),  # everything that a method draws on its way to a psi
     "photographs": (1_000_003, 3),  # the order in which photographs are chosen to train on
     "fine-tuning": (1_000_003, 4),  # new parameters and order of a training on photographs alone
-    # A rendered target's images.
+    # A target's images: the parts of photographs, or what a rendered target draws for each.
+    "target parts": (1, -1),
     "target val": (2_000_003, 0),
     "target test": (2_000_003, 1),
     "target train": (2_000_003, 2),

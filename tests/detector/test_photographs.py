@@ -5,7 +5,7 @@ from PIL import Image
 
 from neural_sim.detector.photographs import detect
 from neural_sim.detector.saved import SavedDetector
-from neural_sim.target.letterbox import letterbox
+from neural_sim.target.photographs import letterbox
 
 
 class Bright:

@@ -54,7 +54,7 @@ def test_what_is_written_is_read(root, made):
     assert sum(len(part) for part in target.parts(0).values()) == len(made) == 6
     hidden = 0
     for truth in made:
-        frame = target.frame(name_of(truth), depth=True)
+        frame = target.reader.frame(name_of(truth), depth=True)
         assert focal_lengths(frame.camera) == pytest.approx((MATRIX[0, 0], MATRIX[1, 1]), rel=1e-14)
         assert principal_point(frame.camera) == (MATRIX[0, 2] + 0.5, MATRIX[1, 2] + 0.5)
         np.testing.assert_allclose(frame.depth, truth.depth, atol=0.5 / FACTOR + 1e-9)
@@ -72,10 +72,10 @@ def test_what_is_written_is_read(root, made):
 
 def test_boxes_without_masks_are_the_same(root, made):
     target = of(root)
-    boxes = [[item.box for item in target.frame(name_of(truth)).objects] for truth in made]
+    boxes = [[item.box for item in target.reader.frame(name_of(truth)).objects] for truth in made]
     for file in root.glob("test/*/mask_visib/*.png"):
         file.unlink()
-    assert [[item.box for item in of(root).frame(name_of(truth)).objects] for truth in made] == boxes
+    assert [[item.box for item in of(root).reader.frame(name_of(truth)).objects] for truth in made] == boxes
 
 
 def test_the_models_centre_is_that_of_the_loaded_mesh(root, meshes):
@@ -83,11 +83,13 @@ def test_the_models_centre_is_that_of_the_loaded_mesh(root, meshes):
     target = of(root)
     for item in BOP(root / "models").load():
         np.testing.assert_allclose(
-            target._centre(item.name), item.transform[:3, 3], atol=1e-6
+            target.reader.centre(item.name), item.transform[:3, 3], atol=1e-6
         )  # metres; PLY has float32
-        np.testing.assert_allclose(target._centre(item.name), meshes[item.name].bounds.mean(0), atol=1e-6)
+        np.testing.assert_allclose(
+            target.reader.centre(item.name), meshes[item.name].bounds.mean(0), atol=1e-6
+        )
     (root / "models" / "models_info.json").unlink()
-    assert of(root)._centre("obj_000001") is None
+    assert of(root).reader.centre("obj_000001") is None
     assert of(root).class_names == NAMES  # of what the images show
 
 
@@ -148,9 +150,9 @@ def test_a_grey_or_jpeg_image_is_found(root, made):
     (folder / "rgb" / "000001.png").unlink()
     (folder / "gray").mkdir()
     Image.fromarray(made[0].image).convert("L").save(folder / "gray" / "000001.tif")
-    assert of(root).frame(name_of(made[0])).image.suffix == ".tif"
+    assert of(root).reader.frame(name_of(made[0])).image.suffix == ".tif"
     Image.fromarray(made[0].image).save(folder / "rgb" / "000001.jpg")
-    assert of(root).frame(name_of(made[0])).image.suffix == ".jpg"
+    assert of(root).reader.frame(name_of(made[0])).image.suffix == ".jpg"
 
 
 def edited(root, file, change):
@@ -181,17 +183,17 @@ def edited(root, file, change):
 def test_bad_entries_are_refused_with_file_and_key(root, made, file, change, message):
     edited(root, file, change)
     with pytest.raises(ValueError, match=rf"000001.{message}"):
-        of(root).frame(name_of(made[0]))
+        of(root).reader.frame(name_of(made[0]))
 
 
 def test_bad_files_are_refused(root, made):
     folder, name = root / "test" / "000001", name_of(made[0])
     Image.fromarray(np.zeros((8, 9), np.uint8)).save(folder / "mask_visib" / "000001_000002.png")
     with pytest.raises(ValueError, match=r"000001_000002\.png: is 9 x 8 pixels, its photograph 120 x 90"):
-        of(root).frame(name)
+        of(root).reader.frame(name)
     (folder / "rgb" / "000001.png").unlink()
     with pytest.raises(ValueError, match=r"rgb/000001\.png: not a readable image"):
-        of(root).frame(name)
+        of(root).reader.frame(name)
     (folder / "scene_gt.json").write_text("[]")
     with pytest.raises(ValueError, match=r"000001/scene_gt\.json: want entries by number"):
         of(root)

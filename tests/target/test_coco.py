@@ -83,8 +83,22 @@ def test_categories_can_be_renamed_or_left_out(tmp_path: Path) -> None:
     assert loaded.labels[0].tolist() == [1, 1]
     left_out = CocoTarget(path, categories={"cup": None, "dog": None}).load(NAMES, 80, 80)
     assert not left_out.present.any()
-    with pytest.raises(ValueError, match=r"\['cat'\] are not in the file"):
+    with pytest.raises(
+        ValueError, match=r"target\.categories: \['cat'\] are no categories of .*annotations\.json"
+    ):
         CocoTarget(path, categories={"cup": "mug", "dog": None, "cat": "can"}).load(NAMES, 80, 80)
+
+
+def test_categories_that_are_no_objects_can_be_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Their boxes are counted, the photographs stay."""
+    boxes = [{"image_id": 2, "category_id": id, "bbox": [4, 2, 20, 10]} for id in (7, 8, 8)]
+    path = write(tmp_path, categories=[{"id": 7, "name": "mug"}, {"id": 8, "name": "dog"}], annotations=boxes)
+    with caplog.at_level(logging.INFO):
+        loaded = CocoTarget(path, unmatched="leave_out").load(NAMES, 80, 80)
+    assert loaded.labels.tolist() == [[1], [-1]]
+    assert "boxes of categories that are no objects left out: {'dog': 2}" in caplog.text
 
 
 def test_images_may_lie_elsewhere_and_be_limited(tmp_path: Path) -> None:
@@ -252,17 +266,13 @@ def test_malformed_files_are_refused_with_path_and_place(
         CocoTarget(write(tmp_path, **changes)).load(NAMES, 16, 16)
 
 
-def test_what_is_no_json_and_bad_settings(tmp_path: Path) -> None:
+def test_what_is_no_json_or_no_file(tmp_path: Path) -> None:
     broken = tmp_path / "broken.json"
     broken.write_text("{")
     with pytest.raises(ValueError, match=r"broken\.json: not readable as JSON"):
         CocoTarget(broken).load(NAMES, 16, 16)
     with pytest.raises(ValueError, match=r"no such file: .*nowhere"):
         CocoTarget(tmp_path / "nowhere.json")
-    with pytest.raises(ValueError, match="val_fraction must lie in"):
-        CocoTarget(broken, val_fraction=1.0)
-    with pytest.raises(ValueError, match="limit must be at least 1 or null, got 0"):
-        CocoTarget(broken, limit=0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -290,11 +300,3 @@ def test_photographs_for_training_that_look_like_scored_ones_are_warned_of(
     for first, second in (("train", "val"), ("train", "test"), ("val", "test")):
         if set(scenes_in(made[first])) & set(scenes_in(made[second])):
             assert f"{second} images look like one of {first} (" in caplog.text
-
-
-@pytest.mark.parametrize("fraction", [0.0, 1.0, -0.5])
-def test_a_part_for_training_is_neither_all_nor_nothing(tmp_path: Path, fraction: float) -> None:
-    with pytest.raises(
-        ValueError, match=rf"target\.train_fraction must lie in \(0, 1\) or be null, got {fraction}"
-    ):
-        CocoTarget(videos(tmp_path), train_fraction=fraction)

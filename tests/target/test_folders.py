@@ -137,11 +137,6 @@ def test_the_digest_follows_the_photographs_that_are_taken(tmp_path):
     ("settings", "message"),
     [
         ({"root": "nowhere"}, r"target\.root: no such folder: nowhere; put photographs there"),
-        ({"val_fraction": 1.0}, r"target\.val_fraction must lie in \(0, 1\), got 1.0"),
-        ({"train_fraction": 0.0}, r"target\.train_fraction"),
-        ({"border": -1}, r"target\.border must be at least 0, got -1"),
-        ({"limit": 0}, r"target\.limit must be at least 1, got 0"),
-        ({"unmatched": "drop"}, r"target\.unmatched must be one of"),
         ({"classes": {"dog": "mug"}}, r"target\.classes: \['dog'\] are no folders of .*\['can', 'mug'\]"),
     ],
 )
@@ -158,5 +153,5 @@ def test_folders_without_photographs_are_refused(tmp_path):
         FolderTarget(tmp_path)
     (tmp_path / "can" / "broken.png").write_bytes(b"no picture")
     (tmp_path / "can" / "other.png").write_bytes(b"none")
-    with pytest.raises(ValueError, match=r"target\.root: .*broken\.png is not a readable picture"):
+    with pytest.raises(ValueError, match=r"target\.root: .*broken\.png: not a readable image"):
         sets_of(FolderTarget(tmp_path))

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neural_sim.target.frames import (
-    Frame,
-    PosedObject,
-    box_of_mask,
-    camera_of_matrix,
-    grid_of,
-    image_size,
-    opened,
-)
+from neural_sim.target.frames import Frame, PosedObject, box_of_mask, camera_of_matrix
+from neural_sim.target.photographs import grid_of, image_size, opened
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(8, 6, 0.7)

@@ -87,7 +87,7 @@ def test_meshes_land_on_the_real_masks(shared_data):
     if not root.is_dir():
         pytest.skip(f"no real frames: {root} does not exist")
     target = YcbVideoTarget(root, every=1)
-    frames = [target.frame(name, depth=True) for part in target.parts(0).values() for name in part]
+    frames = [target.reader.frame(name, depth=True) for part in target.parts(0).values() for name in part]
     names = sorted({item.name for frame in frames for item in frame.objects})
     meshes = {}
     for item in YCB(shared_data / "ycb", names).load():

@@ -41,7 +41,7 @@ def test_what_is_written_is_read(shared_root, made):
     assert sum(len(part) for part in target.parts(0).values()) == len(made) == 9
     partly = 0
     for truth in made:
-        frame = target.frame(FrameName(f"{truth.scene:04d}", truth.number), depth=True)
+        frame = target.reader.frame(FrameName(f"{truth.scene:04d}", truth.number), depth=True)
         assert focal_lengths(frame.camera) == pytest.approx((MATRIX[0, 0], MATRIX[1, 1]), rel=1e-14)
         assert principal_point(frame.camera) == (MATRIX[0, 2] + 0.5, MATRIX[1, 2] + 0.5)
         assert tuple(item.name for item in frame.objects) == truth.names
@@ -69,7 +69,7 @@ def test_labelled_images_have_boxes_labels_and_bins(shared_root, made):
     assert loaded.images.shape == (2, 3, 45, 60) and loaded.bins.shape == loaded.labels.shape
     assert loaded.present.sum(1).tolist() == [3, 1] and loaded.bins[1, 1:].eq(-1).all()
     for row, truth in enumerate(truths):
-        frame = target.frame(names[row])
+        frame = target.reader.frame(names[row])
         bins = bins_of_poses(POSES, torch.from_numpy(truth.poses), None)
         for i, item in enumerate(frame.objects):
             assert NAMES[loaded.labels[row, i]] == item.name
@@ -134,6 +134,18 @@ def test_scenes_for_training_are_none_of_the_others(shared_root):
     assert of(shared_root, train_fraction=0.5, val_fraction=0.6).training_count(0) == 3
 
 
+def test_frames_of_several_scenes_can_be_kept_together(shared_root):
+    """Here those of one number."""
+    for seed in range(5):
+        parts = of(shared_root, split_by=r"/00000(\d)").parts(seed)
+        assert all(len({name.scene for name in part}) == 3 for part in parts.values())
+        assert not {name.number for name in parts["val"]} & {name.number for name in parts["test"]}
+    with pytest.raises(
+        ValueError, match=r"target\.split_by: want a regular expression or null, got 'attribute:s'"
+    ):
+        of(shared_root, split_by="attribute:s")
+
+
 def lists(root, **named):
     (root / "image_sets").mkdir()
     for name, lines in named.items():
@@ -163,9 +175,7 @@ def test_every_so_manieth_frame_and_key_frames(root):
     assert numbers(parts["test"]) == ["0001/000002", "0001/000003"]  # all of them
     assert numbers(of(root, every=50, val_list="other").parts(0)["val"]) == ["0000/000003"]
     assert numbers(of(root, limit=2).parts(0)["val"]) == ["0000/000001", "0002/000001"]
-    with pytest.raises(
-        ValueError, match=r"scenes \['0001'\] are in the part that steers psi and in the part"
-    ):
+    with pytest.raises(ValueError, match=r"scenes \['0001'\] are in the part for validation and in the part"):
         of(root, val_list="mixed")
     with pytest.raises(ValueError, match=r"target\.test_list: no such file: .*exam\.txt"):
         of(root, test_list="exam")
@@ -204,7 +214,7 @@ def test_classes_that_are_no_objects(shared_root, caplog):
 
 def test_hidden_and_small_objects_have_no_box(shared_root, caplog):
     target = of(shared_root)
-    frames = [target.frame(name) for part in target.parts(0).values() for name in part]
+    frames = [target.reader.frame(name) for part in target.parts(0).values() for name in part]
     names = [FrameName(frame.scene, frame.number) for frame in frames]
     seen = sorted(item.visibility for frame in frames for item in frame.objects)
     between = 0.5 * (seen[4] + seen[5])
@@ -217,7 +227,7 @@ def test_hidden_and_small_objects_have_no_box(shared_root, caplog):
 
 def test_several_cameras(root, made, caplog):
     target = of(root)
-    assert TargetCamera().camera(8, 40.0, target) == target.frame(FrameName("0000", 1)).camera
+    assert TargetCamera().camera(8, 40.0, target) == target.reader.frame(FrameName("0000", 1)).camera
     change_meta(root, made[0], intrinsic_matrix=MATRIX * np.array([[1.01, 1.0, 1.0]] * 3))
     with caplog.at_level(logging.WARNING):
         camera = of(root).camera()
@@ -258,11 +268,11 @@ def test_the_real_sample(sample):
     assert (camera.width, camera.height) == (640, 480)
     assert focal_lengths(camera) == pytest.approx((1066.778, 1067.487))
     names = sorted(
-        {item.name for part in parts.values() for name in part for item in target.frame(name).objects}
+        {item.name for part in parts.values() for name in part for item in target.reader.frame(name).objects}
     )
     assert len(names) == 12
     for name in (name for part in parts.values() for name in part):
-        frame = target.frame(name, depth=True)
+        frame = target.reader.frame(name, depth=True)
         for item in frame.objects:
             assert item.mask is not None and item.box is not None and 0.5 < item.visibility <= 1.0
             depth = frame.depth[item.mask & (frame.depth > 0)]

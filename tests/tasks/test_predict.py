@@ -191,8 +191,8 @@ REFUSED = [
     (None, ["predict.images={photos}/none"], r"predict\.images: want a folder .*none, which does not exist"),
     (None, ["predict.images={photos}/*.gif"], r"predict\.images: want a folder .*\*\.gif, which no file matches"),
     (empty, ["predict.images={photos}/../empty"], r"predict\.images: no picture \(\.jpg, .* in .*empty"),
-    (broken, [], r"predict\.images: .*broken\.png is not a readable picture"),
-    (None, ["predict.images={photos}/notes.txt"], r"predict\.images: .*notes\.txt is not a readable picture"),
+    (broken, [], r"predict\.images: .*broken\.png: not a readable image"),
+    (None, ["predict.images={photos}/notes.txt"], r"predict\.images: .*notes\.txt: not a readable image"),
     (None, ["predict.model=null"], r"predict\.model: want a run's folder or its model\.safetensors, got null"),
     (None, ["predict.model={photos}"], r"predict\.model: .*photos has no model\.json"),
     (None, ["predict.draw_above=2.0"], r"predict\.draw_above must lie in \[0, 1\], got 2\.0"),
@@ -202,13 +202,13 @@ REFUSED = [
     (annotated, ["predict.annotations={photos}/labels.json"],
      r"predict\.annotations: .*labels\.json: categories \['go', 'stop', 'tree'\] are no objects.*predict\.categories"),
     (lambda photos: annotated(photos, categories=CATEGORIES[:2]), ["predict.annotations={photos}/labels.json", NAMED],
-     r"predict\.annotations: .*labels\.json: categories \['tree'\] are not in the file.*predict\.categories"),
+     r"predict\.categories: \['tree'\] are no categories of .*labels\.json, which has \["),
     (lambda photos: annotated(photos, images=[]), ["predict.annotations={photos}/labels.json", NAMED],
      r"predict\.annotations: .*labels\.json has no entry for any of the 4 pictures of predict\.images, such as a\.png"),
     (lambda photos: annotated(photos, images=[{"id": 1, "file_name": "a.png", "width": 12, "height": 9}]),
      ["predict.annotations={photos}/labels.json", NAMED], r"a\.png is listed with 12 x 9 pixels, .* has 120 x 90"),
     (lambda photos: annotated(photos, annotations=[{"image_id": 100, "category_id": 5, "bbox": [0, 0, 1, 1]}]),
-     ["predict.annotations={photos}/labels.json", NAMED], r"labels\.json: category id 5 is not declared"),
+     ["predict.annotations={photos}/labels.json", NAMED], r"labels\.json: category ids \[5\] of a\.png are not declared"),
 ]  # fmt: skip
 
 

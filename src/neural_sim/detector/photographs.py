@@ -9,7 +9,7 @@ from PIL import Image
 from torch import Tensor
 
 from neural_sim.detector.saved import SavedDetector
-from neural_sim.target.letterbox import letterbox
+from neural_sim.target.photographs import letterbox
 
 
 def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str, Tensor]]:

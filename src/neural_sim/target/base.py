@@ -1,15 +1,29 @@
-"""What a run asks of its target, whatever its images come from."""
+"""What a run asks of its target, and what all targets of photographs share."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import ClassVar
 
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from typing_extensions import override
+
+from neural_sim.objects.files import content_digest
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
+from neural_sim.ranges import NonNegative, PositiveInt
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.target.classes import Unmatched
+from neural_sim.target.photographs import Photograph, read
+from neural_sim.target.split import Look, PartOfAll, Split
 from neural_sim.types import LabelledImages, PinholeCamera
 
 
@@ -79,3 +93,121 @@ class Target(ABC):
     def digest(self) -> str | None:
         """Return the SHA-256 of the files that the images are made from, for the store's keys; None without files."""
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photographs(Target):
+    """Labelled photographs, letterboxed to the size of the run's images.
+
+    Args:
+        val_fraction: fraction of the photographs for validation, which psi is learned on, as near to it as whole groups
+            come; the rest is scored. Void where the data set has parts of its own.
+        train_fraction: of the photographs that are not scored, the fraction for training (``training.real``), whole
+            groups too; the others are for validation. None: all of them are.
+        split_by: what belongs together and so lies in one part, as frames of one video must, see
+            :func:`neural_sim.target.split.groups_of`; None: what the data set says, else every photograph is a group of
+            its own, and near-duplicates in two parts are warned of.
+        limit: at most this number of photographs; subclasses say of what, and which; None: all.
+        unmatched: what becomes of a class of the data set that is no object: ``refuse`` the data set, or ``leave_out``
+            the class.
+        minimum_side: boxes with a side shorter than this many pixels of the run's images are dropped and counted.
+    """
+
+    renders: ClassVar[bool] = False
+    val_fraction: PartOfAll = 0.3
+    train_fraction: PartOfAll | None = None
+    split_by: str | None = None
+    limit: PositiveInt | None = None
+    unmatched: Unmatched = "refuse"
+    minimum_side: NonNegative = 2.0
+
+    @property
+    def split(self) -> Split:
+        """How the photographs are parted."""
+        return Split(self.val_fraction, self.train_fraction, self.split_by)
+
+    @property
+    @override
+    def trains(self) -> bool:
+        return self.train_fraction is not None
+
+    @abstractmethod
+    def files(self) -> Mapping[str, Path]:
+        """Return the files that the images are made from, by names that do not depend on where they lie."""
+
+    @cached_property
+    def _contents(self) -> str:
+        return content_digest(self.files())
+
+    @override
+    def digest(self) -> str:
+        return self._contents
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnnotatedPhotographs(Photographs):
+    """Photographs with labels of their own, parted by groups and by their pixels: equal ones lie in one part.
+
+    A subclass says what there is to read: :attr:`source`, :meth:`files` and :meth:`photographs`. For the arguments see
+    :class:`Photographs`.
+    """
+
+    @property
+    @abstractmethod
+    def source(self) -> Path:
+        """The file or folder of the data set, for messages."""
+
+    @abstractmethod
+    def photographs(
+        self, objects: Sequence[str], distribution: SceneDistribution | None = None
+    ) -> list[Photograph]:
+        """Return the photographs of the data set.
+
+        Args:
+            objects: the run's objects in the order of their labels.
+            distribution: the scene parameters, for bins that must be bins of its first factor that has any; None: they
+                may be any.
+
+        Raises:
+            ValueError: labels that cannot be used, or classes that are no objects.
+        """
+
+    def load(self, objects: Sequence[str], height: int, width: int) -> LabelledImages:
+        """Read all photographs; labels are positions in ``objects``.
+
+        Raises:
+            ValueError: as of :meth:`photographs`, or a file that cannot be read.
+        """
+        return read(self.photographs(objects), height, width, self.minimum_side, self.source)[0]
+
+    @override
+    def sets(
+        self,
+        objects: Mapping[str, Subject],
+        distribution: SceneDistribution,
+        camera: PinholeCamera,
+        synthesizer: Synthesizer,
+        seed: int,
+        rig: LightRig | None = None,
+    ) -> dict[str, LabelledImages]:
+        photographs, generator = self.photographs(list(objects), distribution), stream(seed, "target parts")
+        images, placings = read(photographs, camera.height, camera.width, self.minimum_side, self.source)
+        looks = [
+            Look(photograph.name, photograph.group, image, placing.inside(image))
+            for photograph, image, placing in zip(photographs, images.images, placings, strict=True)
+        ]
+        parts = self.split.parts_by_look(looks, generator, self.source)
+        rows = {part: torch.tensor(own) for part, own in parts.items()}
+        chosen = self.choose(images, rows, list(objects), distribution, generator)
+        return {part: images.select(own) for part, own in chosen.items()}
+
+    def choose(
+        self,
+        images: LabelledImages,
+        rows: Mapping[str, Int[Tensor, "_"]],
+        objects: Sequence[str],
+        distribution: SceneDistribution,
+        generator: torch.Generator,
+    ) -> Mapping[str, Int[Tensor, "_"]]:
+        """Choose some of each part's ``rows``; all of them, unless a subclass does otherwise."""
+        return rows

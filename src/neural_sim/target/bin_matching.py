@@ -19,30 +19,17 @@ def matching(
     generator: torch.Generator,
     where: str,
 ) -> Int[Tensor, "chosen"]:
-    """Those of ``rows`` that follow ``targets``, the distributions over bins by the objects' names in label order.
+    """Choose those of ``rows`` that follow ``targets``, the distributions over bins by object in label order.
 
-    Of every object as many photographs as there are for its distribution, each at most once and at random within a bin.
-    The number in a bin is the distribution's, rounded up or down. Photographs without a box that has a bin are left
-    out, and objects without photographs too.
+    Of every object as many photographs are chosen as there are for its distribution, each at most once and at random
+    within a bin. The number in a bin is the distribution's, rounded up or down. Photographs without a box that has a
+    bin are left out, and objects without photographs too.
 
     Raises:
         ValueError: a photograph of several objects or bins, or none of a bin that the distribution needs; begins with
             ``where``.
     """
-    cells: dict[tuple[int, int], list[int]] = {}
-    for row in rows.tolist():
-        seen = {
-            (label, b)
-            for label, b in zip(images.labels[row].tolist(), _bins(images, row), strict=True)
-            if label >= 0
-        }
-        if len(seen) > 1:
-            raise ValueError(
-                f"{where}: want photographs of one object in one bin each, got one of {sorted(seen)}"
-            )
-        for label, b in seen:
-            if b >= 0:
-                cells.setdefault((label, b), []).append(row)
+    cells = _rows_by_cell(images, rows, where)
     chosen: list[int] = []
     for label, (name, p) in enumerate(targets.items()):
         own = [cells.get((label, b), []) for b in range(len(p))]
@@ -62,13 +49,31 @@ def matching(
     return torch.tensor(sorted(chosen))
 
 
+def _rows_by_cell(
+    images: LabelledImages, rows: Int[Tensor, "part"], where: str
+) -> dict[tuple[int, int], list[int]]:
+    """Return the rows that show an object in a bin, by its label and the bin."""
+    cells: dict[tuple[int, int], list[int]] = {}
+    for row in rows.tolist():
+        labels, bins = images.labels[row].tolist(), _bins(images, row)
+        seen = {(label, b) for label, b in zip(labels, bins, strict=True) if label >= 0}
+        if len(seen) > 1:
+            raise ValueError(
+                f"{where}: want photographs of one object in one bin each, got one of {sorted(seen)}"
+            )
+        for label, b in seen:
+            if b >= 0:
+                cells.setdefault((label, b), []).append(row)
+    return cells
+
+
 def _bins(images: LabelledImages, row: int) -> list[int]:
     own = images.bins[row]
     return own.expand(images.labels.shape[1]).tolist() if own.ndim == 0 else own.tolist()
 
 
 def most(p: Sequence[float], available: Sequence[int], generator: torch.Generator) -> list[int] | None:
-    """The largest :func:`apportioned` number of photographs that is available; None where not even one is."""
+    """Return the largest :func:`apportioned` number of photographs that is available; None where not even one is."""
     for total in range(sum(available), 0, -1):
         counts = apportioned(p, total, available, generator)
         if counts is not None:
@@ -79,8 +84,12 @@ def most(p: Sequence[float], available: Sequence[int], generator: torch.Generato
 def apportioned(
     p: Sequence[float], total: int, available: Sequence[int], generator: torch.Generator
 ) -> list[int] | None:
-    """``total`` photographs split among bins by largest remainders, each ``total * p`` rounded up or down; None where a
-    bin has too few. Of bins with equal remainders those that have enough are rounded up, at random.
+    """Split ``total`` photographs among bins by largest remainders, each ``total * p`` rounded up or down.
+
+    Of bins with equal remainders those that have enough are rounded up, at random.
+
+    Returns:
+        The number of each bin; None where a bin has too few photographs.
     """
     quotas = [total * value for value in p]
     counts = [math.floor(quota + 1e-9) for quota in quotas]

@@ -1,13 +1,13 @@
 """Scenes of a BOP benchmark data set: https://github.com/thodan/bop_toolkit, docs/bop_datasets_format.md.
 
-``<split>/<scene>/{scene_gt,scene_gt_info,scene_camera}.json`` beside ``rgb`` (or ``gray``), ``depth`` and
+``<split>/<scene>/{scene_gt,scene_gt_info,scene_camera}.json`` next to ``rgb`` (or ``gray``), ``depth`` and
 ``mask_visib``; ``models/models_info.json``; ``test_targets_bop19.json``. Millimetres, OpenCV axes.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,19 +15,21 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from typing_extensions import override
 
+from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
     FrameName,
+    FrameReader,
     Listed,
     PosedObject,
     box_of_mask,
     camera_of_matrix,
-    grid_of,
-    image_size,
     numbers,
     rigid,
 )
+from neural_sim.target.photographs import grid_of, image_size
 from neural_sim.target.posed import PosedTarget
 from neural_sim.types import PinholeCamera
 
@@ -36,30 +38,72 @@ TARGETS = "test_targets_bop19.json"
 IMAGES = ("rgb/*.png", "rgb/*.jpg", "gray/*.png", "gray/*.tif")
 
 
+@validated
 @dataclass(frozen=True)
 class BopTarget(PosedTarget):
-    """Frames of a BOP data set. An object's centre is that of its box in ``models/models_info.json``, its poses' origin
-    where there is none; its visibility is ``visib_fract``.
+    """Photographs of a BOP data set. Classes are ``obj_000001`` and so on.
 
     Args:
-        val: the folder of scenes whose frames steer psi, of each scene one in ``every``, such as ``train_real``; None:
+        val: the folder of scenes for validation, one in ``every`` photographs of each, such as ``train_real``; None:
             scenes of ``test``.
         test: the folder of scenes that are scored: the images of ``test_targets_bop19.json`` where present and the
-            folder is ``test``, else of each scene one in ``every``.
+            folder is ``test``, else one in ``every`` photographs of each scene.
 
-    Classes are ``obj_000001`` and so on. See :class:`PosedTarget` for the other arguments.
+    See :class:`PosedTarget` for the other arguments.
     """
 
     val: str | None = None
     test: str = "test"
 
-    @property
-    def class_names(self) -> list[str]:
-        """Those of ``models_info.json``, or of all that the frames show where there is none."""
+    @cached_property
+    @override
+    def reader(self) -> BopScenes:
+        return BopScenes(self._root)
+
+    @override
+    def listed(self) -> Listed:
+        whole = self.test == "test" and (self._root / TARGETS).is_file()
+        scored = _targets(self._root / TARGETS) if whole else self._thinned(self.test)
+        return Listed(scored, None) if self.val is None else Listed(self._thinned(self.val), scored)
+
+    def _thinned(self, split: str) -> list[FrameName]:
+        """Keep every n-th image of each scene of a folder."""
+        folder = self._root / split
+        scenes = sorted(path.parent.name for path in folder.glob("*/scene_gt.json"))
+        if not scenes:
+            raise ValueError(f"{folder}: holds no scene (<scene>/scene_gt.json)")
+        chosen = []
+        for scene in scenes:
+            chosen += [
+                FrameName(f"{split}/{scene}", n)
+                for n in self.reader.numbers(f"{split}/{scene}")[:: self.every]
+            ]
+        return chosen
+
+
+def _targets(path: Path) -> list[FrameName]:
+    entries = _json_of(path)
+    if not isinstance(entries, list):
+        raise ValueError(f"{path}: want a list of targets")
+    for number, entry in enumerate(entries):
+        _want(entry, ("scene_id", "im_id"), f"{path}: [{number}]")
+    return sorted({FrameName(f"test/{int(entry['scene_id']):06d}", int(entry["im_id"])) for entry in entries})
+
+
+@dataclass(frozen=True)
+class BopScenes(FrameReader):
+    """The files of a BOP data set.
+
+    An object's centre is that of its box in ``models/models_info.json``, its poses' origin where there is none; its
+    visibility is ``visib_fract``.
+    """
+
+    root: Path
+
+    @override
+    def class_names(self, scenes: Collection[str]) -> list[str]:
         if self._info:
             return sorted(map(_class_name, self._info))
-        listed = self._listed()
-        scenes = {name.scene for name in (*listed.val, *(listed.test or ()))}
         shown = (
             item
             for scene in scenes
@@ -70,13 +114,17 @@ class BopTarget(PosedTarget):
             {_class_name(item["obj_id"]) for item in shown if isinstance(item, dict) and "obj_id" in item}
         )
 
+    def numbers(self, scene: str) -> list[int]:
+        """List the images of a scene."""
+        return sorted(map(int, self._json(scene, "scene_gt.json")))
+
+    @override
     def frame(self, name: FrameName, depth: bool = False) -> Frame:
-        """See :class:`PosedTarget`."""
         poses, infos = self._entry(name, "scene_gt.json"), self._entry(name, "scene_gt_info.json")
         where = f"{self._folder(name) / 'scene_gt.json'}: {name.number}"
         if not isinstance(poses, list) or not isinstance(infos, list) or len(poses) != len(infos):
             raise ValueError(f"{where}: want a list of objects, and as many in scene_gt_info.json")
-        camera, size = self._camera(name), image_size(self._image(name))
+        camera, size = self.camera(name), image_size(self._image(name))
         objects = [
             self._object_of(name, i, *both, size) for i, both in enumerate(zip(poses, infos, strict=True))
         ]
@@ -110,7 +158,8 @@ class BopTarget(PosedTarget):
             _class_name(pose["obj_id"]), moved, box, float(numbers(info["visib_fract"], 1, where)[0]), mask
         )
 
-    def _camera(self, name: FrameName) -> PinholeCamera:
+    @override
+    def camera(self, name: FrameName) -> PinholeCamera:
         entry = self._entry(name, "scene_camera.json")
         where = f"{self._folder(name) / 'scene_camera.json'}: {name.number}"
         _want(entry, ("cam_K",), where)
@@ -131,7 +180,8 @@ class BopTarget(PosedTarget):
         _want(entry, ("depth_scale",), where)
         return grid_of(file, size) * (float(numbers(entry["depth_scale"], 1, where)[0]) * MILLIMETRE)
 
-    def _centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
+    @override
+    def centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
         entry = self._info.get(str(int(class_name.removeprefix("obj_"))))
         if entry is None:
             return None
@@ -142,11 +192,9 @@ class BopTarget(PosedTarget):
         )
         return (low + 0.5 * size) * MILLIMETRE
 
-    # --- files ---
-
     @property
     def _info_file(self) -> Path:
-        return self._root / "models" / "models_info.json"
+        return self.root / "models" / "models_info.json"
 
     @cached_property
     def _info(self) -> dict[str, Any]:
@@ -157,9 +205,9 @@ class BopTarget(PosedTarget):
         return {}
 
     def _json(self, scene: str, file: str) -> dict[str, Any]:
-        """A scene's file, read once."""
+        """Read a scene's file, once."""
         if (scene, file) not in self._read:
-            self._read[scene, file] = _mapping(self._root / scene / file)
+            self._read[scene, file] = _mapping(self.root / scene / file)
         return self._read[scene, file]
 
     def _entry(self, name: FrameName, file: str) -> Any:
@@ -169,51 +217,18 @@ class BopTarget(PosedTarget):
         return entries[str(name.number)]
 
     def _folder(self, name: FrameName) -> Path:
-        return self._root / name.scene
+        return self.root / name.scene
 
     def _image(self, name: FrameName) -> Path:
         files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in IMAGES]
         return next((file for file in files if file.is_file()), files[0])
 
-    def _files(self, name: FrameName) -> list[Path]:
+    @override
+    def files(self, name: FrameName) -> list[Path]:
         folder = self._folder(name)
         labels = [folder / file for file in ("scene_gt.json", "scene_gt_info.json", "scene_camera.json")]
         masks = (folder / "mask_visib").glob(f"{name.number:06d}_*.png")
         return [*labels, self._image(name), *masks, *([self._info_file] if self._info else [])]
-
-    # --- which frames ---
-
-    def _listed(self) -> Listed:
-        scored = (
-            self._targets
-            if self.test == "test" and (self._root / TARGETS).is_file()
-            else self._thinned(self.test)
-        )
-        return Listed(scored, None) if self.val is None else Listed(self._thinned(self.val), scored)
-
-    @property
-    def _targets(self) -> list[FrameName]:
-        path = self._root / TARGETS
-        entries = _json_of(path)
-        if not isinstance(entries, list):
-            raise ValueError(f"{path}: want a list of targets")
-        for number, entry in enumerate(entries):
-            _want(entry, ("scene_id", "im_id"), f"{path}: [{number}]")
-        return sorted(
-            {FrameName(f"test/{int(entry['scene_id']):06d}", int(entry["im_id"])) for entry in entries}
-        )
-
-    def _thinned(self, split: str) -> list[FrameName]:
-        """Of each scene of a folder one image in ``every``."""
-        folder = self._root / split
-        scenes = sorted(path.parent.name for path in folder.glob("*/scene_gt.json"))
-        if not scenes:
-            raise ValueError(f"{folder}: holds no scene (<scene>/scene_gt.json)")
-        chosen = []
-        for scene in scenes:
-            numbered = sorted(map(int, self._json(f"{split}/{scene}", "scene_gt.json")))
-            chosen += [FrameName(f"{split}/{scene}", number) for number in numbered[:: self.every]]
-        return chosen
 
 
 def _class_name(number: int | str) -> str:
@@ -234,7 +249,7 @@ def _json_of(path: Path) -> Any:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    """A JSON file of entries by number. Raises ``ValueError`` for another."""
+    """Read a JSON file of entries by number. Raises ``ValueError`` for another."""
     data = _json_of(path)
     if not isinstance(data, dict) or not all(key.isdigit() for key in data):
         raise ValueError(f"{path}: want entries by number")

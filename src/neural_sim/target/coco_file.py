@@ -1,71 +1,137 @@
-"""Reading COCO's annotation files."""
+"""COCO's annotation files, read and checked as a whole, for targets and for pictures that a detector is tried on."""
 
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-_log = logging.getLogger(__name__)
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 REQUIRED: dict[str, tuple[str, ...]] = {
     "images": ("id", "file_name"),
     "categories": ("id", "name"),
     "annotations": ("image_id", "category_id", "bbox"),
 }
+Entry = dict[str, Any]
+COCO_KIND = ("category", "categories")
+"""What COCO calls a class, and several."""
 
 
-def read_coco(path: Path) -> dict[str, Any]:
-    """The file's document, with the sections and entries of ``REQUIRED``.
+@dataclass(frozen=True)
+class CocoFile:
+    """The sections of a file, with the keys of ``REQUIRED``; ``document`` is all that it holds."""
 
-    Raises:
-        ValueError: not JSON, or a section, an entry's key or a box's side that is missing.
-    """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
-    for section, keys in REQUIRED.items():
-        entries = data.get(section) if isinstance(data, dict) else None
-        if not isinstance(entries, list):
-            raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
-        for number, entry in enumerate(entries):
-            missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
-            if missing:
-                raise ValueError(f"{path}: {section}[{number}] lacks {missing}")
-            if section == "annotations" and len(entry["bbox"]) != 4:
-                raise ValueError(f"{path}: annotations[{number}].bbox must be x, y, width, height")
-    return data
+    path: Path
+    document: Mapping[str, Any]
 
+    @classmethod
+    def read(cls, path: Path) -> CocoFile:
+        """Read a file.
 
-def labels_of_categories(
-    categories: Sequence[Mapping[str, Any]],
-    mapping: Mapping[str, str | None] | None,
-    class_names: Sequence[str],
-    path: Path,
-    key: str,
-) -> dict[Any, int | None]:
-    """Category id -> class index, None for a category left out.
+        Raises:
+            ValueError: not JSON, or a section, an entry's key or a box's side that is missing.
+        """
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: not readable as JSON ({error})") from error
+        for section, keys in REQUIRED.items():
+            entries = document.get(section) if isinstance(document, dict) else None
+            if not isinstance(entries, list):
+                raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
+            for number, entry in enumerate(entries):
+                missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
+                if missing:
+                    raise ValueError(f"{path}: {section}[{number}] lacks {missing}")
+                if section == "annotations" and len(entry["bbox"]) != 4:
+                    raise ValueError(f"{path}: annotations[{number}].bbox must be x, y, width, height")
+        return cls(path, document)
 
-    ``mapping`` is category name -> class name, null to leave a category out; names not listed stand for themselves.
-    ``path`` is the file and ``key`` the setting that has the mapping, for messages.
+    @property
+    def images(self) -> list[Entry]:
+        """The entries of images."""
+        return self.document["images"]
 
-    Raises:
-        ValueError: a category that is no class, or one in the mapping that the file has not.
-    """
-    mapping = dict(mapping or {})
-    named = {entry["id"]: mapping.get(entry["name"], entry["name"]) for entry in categories}
-    strange = sorted({name for name in named.values() if name is not None and name not in class_names})
-    absent = sorted(set(mapping) - {entry["name"] for entry in categories})
-    if strange or absent:
-        raise ValueError(
-            f"{path}: categories {strange or absent} are "
-            f"{'no objects' if strange else 'not in the file'}; objects are {list(class_names)}, the file's "
-            f"categories {[entry['name'] for entry in categories]}. Map them by {key}, "
-            "{name: object} or {name: null} to leave one out"
+    @property
+    def annotations(self) -> list[Entry]:
+        """The entries of boxes."""
+        return self.document["annotations"]
+
+    @property
+    def category_names(self) -> list[str]:
+        """The names of the categories."""
+        return [entry["name"] for entry in self.document["categories"]]
+
+    @property
+    def crowds(self) -> int:
+        """How many annotations are of crowds, which are no objects' boxes."""
+        return sum(bool(item.get("iscrowd", 0)) for item in self.annotations)
+
+    def by_id(self, labels: Mapping[str, int | None]) -> dict[Any, int | None]:
+        """Return the labels of categories by their ids; ``labels`` are by their names."""
+        return {entry["id"]: labels.get(entry["name"]) for entry in self.document["categories"]}
+
+    def rows_by_image(self, labels: Mapping[Any, int | None]) -> dict[Any, list[int]]:
+        """Return the places of annotations by image id: those of objects, without crowds.
+
+        Args:
+            labels: label by category id, None for a category that is no object.
+
+        Raises:
+            ValueError: an annotation of a category that is not declared.
+        """
+        names = {entry["id"]: entry["file_name"] for entry in self.images}
+        rows: dict[Any, list[int]] = {}
+        for row, item in enumerate(self.annotations):
+            image = item["image_id"]
+            if item["category_id"] not in labels:
+                raise ValueError(
+                    f"{self.path}: category ids {[item['category_id']]} of {names.get(image, image)} are not declared"
+                )
+            if not item.get("iscrowd", 0) and labels[item["category_id"]] is not None:
+                rows.setdefault(image, []).append(row)
+        return rows
+
+    def boxes(self, rows: Iterable[int]) -> Float[Tensor, "b 4"]:
+        """Return (x0, y0, x1, y1) in pixels of the annotations at these places."""
+        boxes = torch.tensor([self.annotations[row]["bbox"] for row in rows], dtype=torch.float32).reshape(
+            -1, 4
         )
-    for name in set(class_names) - set(named.values()):
-        _log.warning("%s: no category for object %s, which gets no score", path, name)
-    return {id: None if name is None else list(class_names).index(name) for id, name in named.items()}
+        boxes[:, 2:] += boxes[:, :2]
+        return boxes
+
+    def bins(self, attribute: str) -> list[int]:
+        """Return the pose bin of each annotation from 0, which the file counts from 1; -1 where nothing says it.
+
+        Args:
+            attribute: of the annotation, or else of its image; dots lead into entries of entries.
+
+        Raises:
+            ValueError: a bin that is no whole number from 1, or no bin at all.
+        """
+        where = f"{self.path}: target.bin_attribute={attribute!r}"
+        of_image = {entry["id"]: _value(entry, attribute) for entry in self.images}
+        bins = []
+        for row, item in enumerate(self.annotations):
+            value = _value(item, attribute)
+            value = of_image.get(item["image_id"]) if value is None else value
+            if value is not None and (type(value) is not int or value < 1):
+                raise ValueError(
+                    f"{where}: want a whole number from 1, annotations[{row}] or its image has {value!r}"
+                )
+            bins.append(-1 if value is None else value - 1)
+        if all(b < 0 for b in bins):
+            raise ValueError(f"{where}: no annotation and no image has it")
+        return bins
+
+
+def _value(entry: Mapping[str, Any], attribute: str) -> Any:
+    value: Any = entry
+    for key in attribute.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value

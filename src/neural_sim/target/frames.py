@@ -1,19 +1,18 @@
-"""A photograph whose objects' poses are known, as YCB-Video and BOP have them, and what their readers share."""
+"""A photograph whose objects' poses are known, the reader that a data set has, and what readers share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
-from PIL import Image
 
 from neural_sim.cameras import opencv_camera
 from neural_sim.objects.capture import ROTATION_TOLERANCE
+from neural_sim.target.photographs import by, image_size
 from neural_sim.types import PinholeCamera
 
 
@@ -29,7 +28,7 @@ class FrameName(NamedTuple):
 
 @dataclass(frozen=True)
 class Listed:
-    """Photographs that steer psi and photographs that are scored; ``test`` None: scenes of ``val`` are set aside."""
+    """Photographs for validation and photographs that are scored; ``test`` None: scenes of ``val`` are set aside."""
 
     val: Sequence[FrameName]
     test: Sequence[FrameName] | None
@@ -89,17 +88,45 @@ class Frame:
     def __post_init__(self) -> None:
         size = (self.camera.width, self.camera.height)
         if (got := image_size(self.image)) != size:
-            raise ValueError(f"{self.image}: is {_by(got)} pixels, its camera {_by(size)}")
+            raise ValueError(f"{self.image}: is {by(got)} pixels, its camera {by(size)}")
         grids = {f"the mask of {item.name}": item.mask for item in self.objects} | {"the depth": self.depth}
         for what, grid in grids.items():
             if grid is not None and grid.shape[::-1] != size:
                 raise ValueError(
-                    f"{self.image}: {what} is {_by(grid.shape[::-1])} pixels, its camera {_by(size)}"
+                    f"{self.image}: {what} is {by(grid.shape[::-1])} pixels, its camera {by(size)}"
                 )
 
 
+class FrameReader(Protocol):
+    """The files of a data set: what one photograph is said to show. Which ones there are to take, a target says."""
+
+    def class_names(self, scenes: Collection[str]) -> list[str]:
+        """List the data set's classes; where no file has them, those that the scenes show."""
+        ...
+
+    def frame(self, name: FrameName, depth: bool = False) -> Frame:
+        """Read one photograph, with its depth where that is asked for.
+
+        Raises:
+            ValueError: files that are missing or contradict each other, with the file and what is wrong.
+        """
+        ...
+
+    def camera(self, name: FrameName) -> PinholeCamera:
+        """Read the camera of one photograph."""
+        ...
+
+    def files(self, name: FrameName) -> list[Path]:
+        """List the files that its labelled image is made from."""
+        ...
+
+    def centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
+        """Return an object's centre in the frame of its poses, in metres; None: the origin."""
+        ...
+
+
 def rigid(rotation: Any, translation: Any, where: str) -> Float[np.ndarray, "4 4"]:
-    """A 4 x 4 pose of a rotation (9 numbers, row by row) and a translation (3).
+    """Return the 4 x 4 pose of a rotation (9 numbers, row by row) and a translation (3).
 
     Raises:
         ValueError: another number of numbers, some that are not finite, or a matrix that is no rotation to the digits
@@ -121,7 +148,7 @@ def rigid(rotation: Any, translation: Any, where: str) -> Float[np.ndarray, "4 4
 
 
 def numbers(values: Any, count: int, where: str) -> Float[np.ndarray, "count"]:
-    """``count`` finite numbers.
+    """Return ``count`` finite numbers.
 
     Raises:
         ValueError: anything else; ``where`` says whose they are.
@@ -136,7 +163,7 @@ def numbers(values: Any, count: int, where: str) -> Float[np.ndarray, "count"]:
 
 
 def camera_of_matrix(matrix: Any, width: int, height: int, where: str) -> PinholeCamera:
-    """The camera of an OpenCV camera matrix (9 numbers, row by row).
+    """Return the camera of an OpenCV camera matrix (9 numbers, row by row).
 
     Raises:
         ValueError: a matrix of another form or with skew, or a principal point outside of the image, as one has that
@@ -155,48 +182,9 @@ def camera_of_matrix(matrix: Any, width: int, height: int, where: str) -> Pinhol
         raise ValueError(f"{where}: {error}") from error
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
-    """The image of a file.
-
-    Raises:
-        ValueError: no such file, or none that can be read as an image, to its end where its pixels are asked for.
-    """
-    try:
-        with Image.open(path) as image:
-            yield image
-    except OSError as error:  # UnidentifiedImageError is one
-        raise ValueError(f"{path}: not a readable image ({error})") from error
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) by the file's header. Raises ``ValueError`` for a file that is none, see :func:`opened`."""
-    with opened(path) as image:
-        return image.size
-
-
-def grid_of(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """The numbers of an image of one channel, such as labels or depth, [height, width].
-
-    Raises:
-        ValueError: no such file, or one of another ``size`` (width, height) or number of channels.
-    """
-    if (got := image_size(path)) != size:
-        raise ValueError(f"{path}: is {_by(got)} pixels, its photograph {_by(size)}")
-    with opened(path) as image:
-        grid = np.asarray(image)
-    if grid.ndim != 2:
-        raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")
-    return grid
-
-
 def box_of_mask(mask: Bool[np.ndarray, "height width"]) -> tuple[float, float, float, float] | None:
-    """(x0, y0, x1, y1) along the edges of the pixels; None for an empty mask."""
+    """Return (x0, y0, x1, y1) along the edges of the pixels; None for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None
     return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
-
-
-def _by(size: tuple[int, ...]) -> str:
-    return " x ".join(map(str, size))

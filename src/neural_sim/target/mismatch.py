@@ -44,7 +44,7 @@ class Mismatch:
 
 
 def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "values"]]:
-    """What is compared, a value for each image, or for each box where the name says so.
+    """Return what is compared, a value for each image, or for each box where the name says so.
 
     Sizes and offsets are in fractions of the image's size (of its area's root, and of its half diagonal), brightness
     and contrast of sRGB values in [0, 1], noise and sharpness of luma.
@@ -90,9 +90,11 @@ def luma_of(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
 
 
 def noise(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
-    """Standard deviation of white noise, by Immerkaer's difference of two Laplacians (Fast Noise Variance Estimation,
-    1996), which does not see edges that are straight over three pixels. The median replaces the mean, so that texture
-    counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has the norm 6.
+    """Estimate the standard deviation of white noise by Immerkaer's difference of two Laplacians.
+
+    It does not see edges that are straight over three pixels (Fast Noise Variance Estimation, 1996). The median
+    replaces the mean, so that texture counts less; for Gaussian noise |x| has the median 0.6745 sigma, and the mask has
+    the norm 6.
     """
     mask = luma.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
     filtered = torch.nn.functional.conv2d(luma[:, None], mask[None, None])
@@ -112,7 +114,7 @@ def sharpness(luma: Float[Tensor, "n h w"]) -> Float[Tensor, "n"]:
 def matching_settings(
     target: LabelledImages, synthesised: LabelledImages, found: list[Mismatch], largest_blur: float = 3.0
 ) -> dict[str, str]:
-    """Settings that would match what differs, by key; those of ``synthesis`` whose effect is known."""
+    """Return settings that would match what differs, by key; those of ``synthesis`` whose effect is known."""
     differs = {m.name: m for m in found if m.counts}
     settings: dict[str, str] = {}
     mine, other = statistics(target), statistics(synthesised)
@@ -137,8 +139,9 @@ def matching_settings(
 
 
 def distance_factor(found: list[Mismatch]) -> float | None:
-    """By what the distances of the camera would have to be multiplied for boxes of the target's size; None where sizes
-    agree. Sizes are inversely proportional to distance where objects are small against it.
+    """Return the factor on the camera's distances that would give boxes the target's size; None where sizes agree.
+
+    Sizes are inversely proportional to distance where objects are small against it.
     """
     size: Mapping[str, Mismatch] = {m.name: m for m in found}
     if "box size" not in size or not size["box size"].counts:
@@ -147,8 +150,9 @@ def distance_factor(found: list[Mismatch]) -> float | None:
 
 
 def _blur_to(wanted: Tensor, synthesised: LabelledImages, largest: float, level: float) -> float:
-    """The blur at which the synthesised images' median sharpness is ``wanted``, on a grid up to ``largest``. Noise of
-    the target's ``level``, which adds to the steps between pixels, is added after each.
+    """Find the blur, on a grid up to ``largest``, at which the synthesised images' median sharpness is ``wanted``.
+
+    Noise of the target's ``level``, which adds to the steps between pixels, is added after each.
     """
     deviations, images = torch.linspace(0.0, largest, _BLURS), synthesised.images
     grain = level * torch.randn(images.shape, generator=torch.Generator().manual_seed(0)).to(images)

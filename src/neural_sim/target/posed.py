@@ -1,178 +1,160 @@
-"""Target sets of photographs whose objects' poses are known; readers of a data set's files derive from it."""
+"""Target sets of photographs whose objects' poses are known."""
 
 from __future__ import annotations
 
 import logging
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.digests import digest
-from neural_sim.objects.files import content_digest
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
+from neural_sim.ranges import Fraction, PositiveInt
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
 from neural_sim.synthesis.training_set import Synthesizer
-from neural_sim.target.assembling import Photo, assemble, boxes_by_bin, large_enough
-from neural_sim.target.base import Target
-from neural_sim.target.frames import Frame, FrameName, Listed, opened
-from neural_sim.target.letterbox import letterbox
-from neural_sim.target.split import check_fraction, evenly, for_training, split
+from neural_sim.target.base import Photographs
+from neural_sim.target.classes import ClassMap
+from neural_sim.target.frames import Frame, FrameName, FrameReader, Listed, PosedObject
+from neural_sim.target.photographs import Photograph, read
+from neural_sim.target.split import evenly, groups_of
 from neural_sim.target.viewpoint import bins_of_poses
 from neural_sim.types import LabelledImages, PinholeCamera
 
 _log = logging.getLogger(__name__)
 
-Unmatched = Literal["refuse", "leave_out"]
+Radii = Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
-class PosedTarget(Target):
-    """Photographs with poses, letterboxed to the detector's image size.
+class PosedTarget(Photographs):
+    """Photographs with poses, which are parted by scenes before any of them is read.
+
+    A subclass says which photographs there are (:meth:`listed`) and who reads them (:attr:`reader`). ``split_by`` is
+    searched for in ``<scene>/<number>``; None: the photographs of a scene belong together. Of more photographs in a
+    part than ``limit``, evenly spaced ones are taken.
 
     Args:
         root: the data set's folder.
         classes: class name in the data set -> object name, null to leave a class out. Names not listed stand for
             themselves.
-        unmatched: what becomes of a class that a photograph shows and that is no object: ``refuse`` the data set, or
-            ``leave_out`` its boxes.
-        every: of the frames of a scene one in so many is taken, where no list of the data set says which.
-        val_fraction: of the photographs, for the part that steers psi, where the data set has no part of its own for
-            that: as near to it as whole scenes come, see :func:`neural_sim.target.split.split`.
-        train_fraction: of the photographs that are not scored, for training (``training.real``), as near to it as whole
-            scenes come; the others steer psi. None: all of them do.
-        limit: at most so many photographs in each part, evenly spaced.
+        every: keep every n-th photograph of a scene, where no list of the data set says which.
         min_visibility: objects of which a smaller fraction is visible have no box.
-        minimum_side: boxes with a side shorter than this many pixels after resizing are dropped and counted.
+
+    See :class:`Photographs` for the other arguments.
 
     Raises:
-        ValueError: no such folder, a list or a scene that is missing, a number out of its range, fewer than two scenes
-            to split.
+        ValueError: no such folder, a list or a scene that is missing, a number out of its range, fewer than two groups
+            to part.
     """
 
-    renders: ClassVar[bool] = False  # of the objects it takes the names and sizes alone
     root: str | Path
     classes: Mapping[str, str | None] | None = None
-    unmatched: Unmatched = "refuse"
-    every: int = 50
-    val_fraction: float = 0.3
-    train_fraction: float | None = None
-    limit: int | None = None
-    min_visibility: float = 0.1
-    minimum_side: float = 2.0
+    every: PositiveInt = 50
+    min_visibility: Fraction = 0.1
 
     def __post_init__(self) -> None:
         if not self._root.is_dir():
             raise ValueError(f"target.root: {self._root} is not a folder")
-        for key in ("every", "limit"):
-            if (value := getattr(self, key)) is not None and value < 1:
-                raise ValueError(f"target.{key} must be at least 1, got {value}")
-        if not 0.0 < self.val_fraction < 1.0:
-            raise ValueError(f"target.val_fraction must lie in (0, 1), got {self.val_fraction}")
-        check_fraction(self.train_fraction)
-        if not 0.0 <= self.min_visibility <= 1.0:
-            raise ValueError(f"target.min_visibility must lie in [0, 1], got {self.min_visibility}")
-        if self.unmatched not in get_args(Unmatched):
-            raise ValueError(f"target.unmatched must be one of {get_args(Unmatched)}, got {self.unmatched!r}")
-        strange = sorted(set(self.classes or {}) - set(self.class_names))
-        if strange:
-            raise ValueError(
-                f"target.classes: {strange} are no classes of {self._root}, which has {self.class_names}"
-            )
+        self._class_map.check_listed(self.class_names)
         self.parts(0)  # refused here rather than after the fields are fitted
-
-    # --- what a reader gives ---
 
     @property
     @abstractmethod
-    def class_names(self) -> list[str]:
-        """The data set's classes."""
+    def reader(self) -> FrameReader:
+        """Who reads the data set's files."""
 
     @abstractmethod
-    def frame(self, name: FrameName, depth: bool = False) -> Frame:
-        """One photograph, with its depth where that is asked for.
+    def listed(self) -> Listed:
+        """List the photographs of the data set.
 
         Raises:
-            ValueError: files that are missing or contradict each other, with the file and what is wrong.
+            ValueError: a list or a scene that is missing or cannot be read.
         """
 
-    @abstractmethod
-    def _camera(self, name: FrameName) -> PinholeCamera:
-        """The camera of one photograph."""
+    @property
+    def class_names(self) -> list[str]:
+        """The data set's classes."""
+        return self.reader.class_names({name.scene for name in self._all})
 
-    @abstractmethod
-    def _listed(self) -> Listed:
-        """The photographs of the set."""
-
-    @abstractmethod
-    def _files(self, name: FrameName) -> list[Path]:
-        """The files that its labelled image is made from."""
-
-    def _centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:
-        """An object's centre in the frame of its poses, in metres; None: the origin."""
-        return None
-
-    # --- what a run asks for ---
+    # --- which photographs ---
 
     @property
     def _root(self) -> Path:
         return Path(self.root).expanduser()
 
     @cached_property
-    def _chosen(self) -> Listed:
-        listed = self._listed()
+    def _listed(self) -> Listed:
+        """The photographs, of which there are some for each part, and none of a scene in two parts."""
+        listed = self.listed()
         if not listed.val or (listed.test is not None and not listed.test):
             raise ValueError(f"{self._root}: holds no photographs for {'test' if listed.val else 'val'}")
         scenes = sorted({name.scene for name in listed.val})
         both = sorted(set(scenes) & {name.scene for name in listed.test or ()})
         if both:
             raise ValueError(
-                f"{self._root}: scenes {both} are in the part that steers psi and in the part that is scored"
+                f"{self._root}: scenes {both} are in the part for validation and in the part that is scored"
             )
-        if listed.test is None and len(scenes) < 2:
+        if listed.test is None and self.split_by is None and len(scenes) < 2:
             raise ValueError(
                 f"{self._root}: want at least two scenes, one for val and one for test, got {scenes}"
             )
         return listed
 
     @property
-    def trains(self) -> bool:
-        """Whether some of the photographs are for training."""
-        return self.train_fraction is not None
+    def _all(self) -> list[FrameName]:
+        return [*self._listed.val, *(self._listed.test or ())]
 
-    def training_count(self, seed: int) -> int:
-        """How many photographs the part ``train`` has, none of which is read for that."""
-        return len(self.parts(seed).get("train", []))
+    @cached_property
+    def _groups(self) -> Sequence[Hashable]:
+        """The group of each photograph that is not listed as scored."""
+        if self.split_by is None:
+            return [name.scene for name in self._listed.val]
+        return groups_of(list(map(str, self._listed.val)), self.split_by, self._root)
 
     def parts(self, seed: int) -> dict[str, list[FrameName]]:
-        """The photographs of ``val``, which steers psi, ``test`` and any ``train``; they share no scene."""
-        listed, generator = self._chosen, torch.Generator().manual_seed(seed)
-        scenes = [name.scene for name in listed.val]
-        rows, test = list(range(len(scenes))), listed.test
+        """Return the photographs of ``val``, ``test`` and any ``train``; no group is in two of them."""
+        val, test, generator = self._listed.val, self._listed.test, stream(seed, "target parts")
         if test is None:
-            val, scored = (part.tolist() for part in split(scenes, self.val_fraction, generator))
-            rows, test = val, [listed.val[row] for row in scored]
-        unscored = for_training(rows, scenes, self.train_fraction, generator)
-        parts = {part: [listed.val[row] for row in own] for part, own in unscored.items()}
-        return {part: evenly(sorted(names), self.limit) for part, names in {**parts, "test": test}.items()}
+            rows = self.split.parts(self._groups, generator)
+        else:
+            rows = self.split.unscored(range(len(val)), self._groups, generator)
+        parts = {part: [val[row] for row in own] for part, own in rows.items()}
+        if test is not None:
+            parts["test"] = list(test)
+        return {part: evenly(sorted(names), self.limit) for part, names in parts.items()}
 
+    @override
+    def training_count(self, seed: int) -> int:
+        return len(self.parts(seed).get("train", []))
+
+    @override
+    def files(self) -> dict[str, Path]:
+        names = sorted(set(self._all))
+        files = sorted({path for name in names for path in self.reader.files(name)})
+        return {path.relative_to(self._root).as_posix(): path for path in files}
+
+    @override
+    def digest(self) -> str:
+        return digest({"val": self._listed.val, "test": self._listed.test, "files": super().digest()})
+
+    @override
     def camera(self) -> PinholeCamera:
-        """The one that took most of the photographs; others are logged.
+        """Return the camera that took most of the photographs; others are logged.
 
         Raises:
             ValueError: photographs of several sizes.
         """
-        names = [*self._chosen.val, *(self._chosen.test or ())]
-        counted = Counter(map(self._camera, names))
+        names = self._all
+        counted = Counter(map(self.reader.camera, names))
         camera, count = counted.most_common(1)[0]
         sizes = {(other.width, other.height) for other in counted}
         if len(sizes) > 1:
@@ -186,17 +168,9 @@ class PosedTarget(Target):
             )  # fmt: skip
         return camera
 
-    @cached_property
-    def _digest(self) -> str:
-        names = sorted({*self._chosen.val, *(self._chosen.test or ())})
-        files = sorted({path for name in names for path in self._files(name)})
-        contents = content_digest({path.relative_to(self._root).as_posix(): path for path in files})
-        return digest({"val": self._chosen.val, "test": self._chosen.test, "files": contents})
+    # --- what they show ---
 
-    def digest(self) -> str:
-        """SHA-256 of which photographs there are and of their files' contents, for store keys."""
-        return self._digest
-
+    @override
     def sets(
         self,
         objects: Mapping[str, Subject],
@@ -206,9 +180,6 @@ class PosedTarget(Target):
         seed: int,
         rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
-        """``val``, ``test`` and any ``train``, with the objects' names as classes; takes the arguments of every target
-        set.
-        """
         radii = {name: item.radius for name, item in objects.items()}
         size, names, made = (camera.height, camera.width), list(objects), {}
         for part, frames in self.parts(seed).items():
@@ -222,80 +193,82 @@ class PosedTarget(Target):
     def load(
         self,
         names: Sequence[FrameName],
-        class_names: Sequence[str],
+        objects: Sequence[str],
         height: int,
         width: int,
         distribution: SceneDistribution | None = None,
-        radii: Mapping[str, float | None] | None = None,
+        radii: Radii | None = None,
     ) -> LabelledImages:
-        """Any photographs of the data set; labels are positions in ``class_names``.
+        """Read any photographs of the data set; labels are positions in ``objects``.
 
         With ``distribution`` each box has the bin that its pose falls in, see
-        :func:`neural_sim.target.viewpoint.bins_of_poses`, which ``radii`` (metres, by class name) are for.
+        :func:`neural_sim.target.viewpoint.bins_of_poses`, which ``radii`` (metres, by object) are for.
 
         Raises:
             ValueError: files that are missing or contradict each other, a class that is no object.
         """
-        unknown = sorted({name for name in (self.classes or {}).values() if name} - set(class_names))
+        unknown = sorted({name for name in (self.classes or {}).values() if name} - set(objects))
         if unknown:
-            raise ValueError(f"target.classes: {unknown} are no objects; objects are {list(class_names)}")
-        for name in sorted(set(class_names) - {self._object(known) for known in self.class_names}):
-            _log.warning("%s: no class for object %s, which gets no score", self._root, name)
-        photos, dropped, left_out = [], 0, Counter()
+            raise ValueError(f"target.classes: {unknown} are no objects; objects are {list(objects)}")
+        labels = self._class_map.labels(self.class_names, objects)
+        photographs, left_out = [], Counter()
         for name in names:
-            frame = self.frame(name)
-            photo, small = self._photo(frame, class_names, height, width, distribution, radii or {}, left_out)
-            photos.append(photo)
-            dropped += small
+            frame = self.reader.frame(name)
+            left_out.update(self._strange(frame, labels, objects))
+            photographs.append(self._photograph(frame, labels, distribution, radii or {}))
         if left_out:
             _log.info("%s: boxes of classes that are no objects left out: %s", self._root, dict(left_out))
-        if dropped:
-            _log.warning("%s: %d boxes shorter than %g px dropped", self._root, dropped, self.minimum_side)
-        return assemble(photos)
+        return read(photographs, height, width, self.minimum_side, self._root)[0]
 
-    def _object(self, class_name: str) -> str | None:
-        return (self.classes or {}).get(class_name, class_name)
+    @property
+    def _class_map(self) -> ClassMap:
+        return ClassMap(self.classes, self._root, unmatched=self.unmatched)
 
-    def _photo(
+    def _strange(self, frame: Frame, labels: Mapping[str, int | None], objects: Sequence[str]) -> list[str]:
+        """List the classes of a photograph that are no objects, unless these are refused."""
+        strange = [item.name for item in frame.objects if item.name not in labels]
+        if strange and self.unmatched == "refuse":
+            raise ValueError(
+                f"{frame.image}: shows {strange[0]}, which is no object; objects are {list(objects)}. Map it by "
+                "target.classes, {name: object} or {name: null}, or set target.unmatched=leave_out"
+            )
+        return strange
+
+    def _photograph(
         self,
         frame: Frame,
-        class_names: Sequence[str],
-        height: int,
-        width: int,
+        labels: Mapping[str, int | None],
         distribution: SceneDistribution | None,
-        radii: Mapping[str, float | None],
-        left_out: Counter[str],
-    ) -> tuple[Photo, int]:
-        """The letterboxed photograph, and how many of its boxes were too small."""
-        with opened(frame.image) as photo:
-            image, placing = letterbox(photo, height, width)
-        boxes, labels, bins = [], [], []
+        radii: Radii,
+    ) -> Photograph:
+        boxes, own, bins = [], [], []
         for item in frame.objects:
-            object_name = self._object(item.name)
-            if object_name is not None and object_name not in class_names:
-                if self.unmatched == "refuse":
-                    raise ValueError(
-                        f"{frame.image}: shows {item.name}, which is no object; objects are {list(class_names)}. Map "
-                        "it by target.classes, {name: object} or {name: null}, or set target.unmatched=leave_out"
-                    )
-                left_out[item.name] += 1
-                continue
-            if object_name is None or item.box is None or item.visibility < self.min_visibility:
+            label = labels.get(item.name)
+            if label is None or item.box is None or item.visibility < self.min_visibility:
                 continue
             boxes.append(item.box)
-            labels.append(class_names.index(object_name))
-            bins.append(self._bin(item.name, item.object_to_camera, distribution, radii.get(object_name)))
-        placed = placing.boxes(torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4))
-        large = large_enough(placed, self.minimum_side)
-        kept = [torch.tensor(row, dtype=torch.long)[large] for row in (labels, bins)]
-        made = Photo(image, placed[large], kept[0], kept[1] if distribution is not None else None)
-        return made, int((~large).sum())
+            own.append(label)
+            bins.append(self._bin(item, distribution, radii))
+        return Photograph(
+            frame.image,
+            torch.tensor(own, dtype=torch.long),
+            torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4),
+            None if distribution is None else torch.tensor(bins, dtype=torch.long),
+        )
 
-    def _bin(
-        self, class_name: str, pose: np.ndarray, distribution: SceneDistribution | None, radius: float | None
-    ) -> int:
+    def _bin(self, item: PosedObject, distribution: SceneDistribution | None, radii: Radii) -> int:
         if distribution is None:
             return -1
-        centre = self._centre(class_name)
+        centre = self.reader.centre(item.name)
         at: Tensor | None = None if centre is None else torch.from_numpy(centre)[None]
-        return int(bins_of_poses(distribution, torch.from_numpy(pose)[None], radius, at))
+        radius = radii.get(self._class_map.object_of(item.name) or "")
+        return int(bins_of_poses(distribution, torch.from_numpy(item.object_to_camera)[None], radius, at))
+
+
+def boxes_by_bin(images: LabelledImages, names: Sequence[str]) -> str:
+    """Return the numbers of boxes of each object in each bin, for the log."""
+    counts = [Counter((images.bins[images.labels == label] + 1).tolist()) for label in range(len(names))]
+    return "; ".join(
+        f"{name} " + ", ".join(f"{b or 'unknown'}: {count}" for b, count in sorted(own.items()))
+        for name, own in zip(names, counts, strict=True) if own
+    )  # fmt: skip

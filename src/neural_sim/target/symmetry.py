@@ -26,7 +26,7 @@ def equivalent_bins(
     samples: int = 6,
     tolerance: float = 0.01,
 ) -> list[list[int]]:
-    """Groups of a factor's bins (from 0) whose views agree, as lists that cover all bins.
+    """Group a factor's bins (from 0) whose views agree, in lists that cover all bins.
 
     Two bins belong together when, under one of four alignments of the angles within them (the offset in the bin and the
     second angle, each as it is or mirrored about the middle of its range), the mean absolute difference of their

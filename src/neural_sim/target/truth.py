@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from PIL import Image
 from torch import Tensor
 
-from neural_sim.target.coco_file import labels_of_categories, read_coco
-from neural_sim.target.photo_files import PhotoFiles
+from neural_sim.target.classes import ClassMap
+from neural_sim.target.coco_file import COCO_KIND, CocoFile
+from neural_sim.target.photographs import PhotoFiles
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -25,9 +26,8 @@ _log = logging.getLogger(__name__)
 class Truth:
     """The COCO file ``path`` as classes of a detector and as entries of ``photos``.
 
-    ``categories`` maps the file's category names to class names, see :func:`coco_file.labels_of_categories`; ``node``
-    is the configuration's node that names both, for messages. A photograph's entry is the one whose ``file_name`` is
-    its path below the photographs' folder or below the file's, else the only one of its name.
+    ``categories`` maps the file's category names to class names, null to leave one out. A photograph's entry is the one
+    whose ``file_name`` is its path below the photographs' folder or below the file's, else the only one of its name.
 
     Raises:
         ValueError: no such file, one that is not in COCO form, a category without a class, or no entry for any of the
@@ -38,44 +38,43 @@ class Truth:
     categories: Mapping[str, str | None] | None
     class_names: Sequence[str]
     photos: PhotoFiles
-    node: str = "predict"
 
     def __post_init__(self) -> None:
         if not self.path.is_file():
-            raise ValueError(f"{self.node}.annotations: no such file: {self.path}")
+            raise ValueError(f"predict.annotations: no such file: {self.path}")
         _ = self.labels
         found, total = len(self.entries), len(self.photos.paths)
         if not found:
             raise ValueError(
-                f"{self.node}.annotations: {self.path} has no entry for any of the {total} pictures of "
-                f"{self.node}.images, such as {self.photos.name(self.photos.paths[0])}"
+                f"predict.annotations: {self.path} has no entry for any of the {total} pictures of "
+                f"predict.images, such as {self.photos.name(self.photos.paths[0])}"
             )
         if found < total:
             _log.warning(
                 "%s: no entry for %d of %d pictures; they are not scored", self.path, total - found, total
             )
-        if found < len(self._document["images"]):
-            missing = len(self._document["images"]) - found
+        if found < len(self._file.images):
+            missing = len(self._file.images) - found
             _log.warning(
                 "%s: %d of its images are not among the pictures; they are not scored", self.path, missing
             )
 
     @cached_property
-    def _document(self) -> dict[str, Any]:
+    def _file(self) -> CocoFile:
         try:
-            return read_coco(self.path)
+            return CocoFile.read(self.path)
         except ValueError as error:
-            raise ValueError(f"{self.node}.annotations: {error}") from error
+            raise ValueError(f"predict.annotations: {error}") from error
 
     @cached_property
     def labels(self) -> dict[Any, int | None]:
         """Class index by category id, None for a category left out."""
-        categories = self._document["categories"]
-        key = f"{self.node}.categories"
-        try:
-            return labels_of_categories(categories, self.categories, self.class_names, self.path, key)
-        except ValueError as error:
-            raise ValueError(f"{self.node}.annotations: {error}") from error
+        names = self._file.category_names
+        source = f"predict.annotations: {self.path}"
+        classes = ClassMap(self.categories, source, "predict.categories", COCO_KIND, None)
+        classes.check_listed(names)
+        classes.refuse(names, self.class_names)
+        return self._file.by_id(classes.labels(names, self.class_names))
 
     @cached_property
     def category_ids(self) -> dict[int, Any]:
@@ -89,7 +88,7 @@ class Truth:
     @cached_property
     def entries(self) -> dict[Path, dict[str, Any]]:
         """The file's image entries by photograph."""
-        by_name = {str(entry["file_name"]): entry for entry in self._document["images"]}
+        by_name = {str(entry["file_name"]): entry for entry in self._file.images}
         by_last: dict[str, list[dict[str, Any]]] = {}
         for name, entry in by_name.items():
             by_last.setdefault(Path(name).name, []).append(entry)
@@ -105,23 +104,14 @@ class Truth:
         return found
 
     @cached_property
-    def _annotations(self) -> dict[Any, list[dict[str, Any]]]:
-        by_image: dict[Any, list[dict[str, Any]]] = {}
-        crowds = 0
-        for item in self._document["annotations"]:
-            if item["category_id"] not in self.labels:
-                raise ValueError(
-                    f"{self.node}.annotations: {self.path}: category id {item['category_id']} is not declared"
-                )
-            crowds += bool(item.get("iscrowd", 0))
-            if not item.get("iscrowd", 0) and self.labels[item["category_id"]] is not None:
-                by_image.setdefault(item["image_id"], []).append(item)
-        if crowds:
-            _log.warning("%s: %d crowds are left out", self.path, crowds)
-        return by_image
+    def _rows(self) -> dict[Any, list[int]]:
+        """The places of annotations by image id."""
+        if self._file.crowds:
+            _log.warning("%s: %d crowds are left out", self.path, self._file.crowds)
+        return self._file.rows_by_image(self.labels)
 
     def boxes(self, path: Path, photo: Image.Image) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:
-        """(x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry; crowds are left out.
+        """Return (x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry, without crowds.
 
         Raises:
             ValueError: a photograph of another size than its entry says.
@@ -130,17 +120,16 @@ class Truth:
         listed = entry.get("width", photo.width), entry.get("height", photo.height)
         if listed != photo.size:
             raise ValueError(
-                f"{self.node}.annotations: {self.path}: {entry['file_name']} is listed with {listed[0]} x {listed[1]} "
+                f"predict.annotations: {self.path}: {entry['file_name']} is listed with {listed[0]} x {listed[1]} "
                 f"pixels, {path} has {photo.width} x {photo.height}"
             )
-        items = self._annotations.get(entry["id"], [])
-        boxes = torch.tensor([item["bbox"] for item in items], dtype=torch.float32).reshape(-1, 4)
-        boxes[:, 2:] += boxes[:, :2]
-        return boxes, torch.tensor([self.labels[item["category_id"]] for item in items], dtype=torch.long)
+        rows = self._rows.get(entry["id"], [])
+        labels = [self.labels[self._file.annotations[row]["category_id"]] for row in rows]
+        return self._file.boxes(rows), torch.tensor(labels, dtype=torch.long)
 
 
 def without_pixels(truths: Sequence[tuple[Tensor, Tensor]]) -> LabelledImages:
-    """Boxes and labels of several photographs as a set to score detections on, which needs no pixels."""
+    """Return boxes and labels of several photographs as a set to score detections on, which needs no pixels."""
     most = max(1, *(len(labels) for _, labels in truths)) if truths else 1
     boxes, labels = torch.zeros(len(truths), most, 4), torch.full((len(truths), most), -1)
     for row, (box, label) in enumerate(truths):
@@ -149,6 +138,6 @@ def without_pixels(truths: Sequence[tuple[Tensor, Tensor]]) -> LabelledImages:
 
 
 def _below(path: Path, folder: Path) -> str:
-    """A path below a folder with ``/``; empty where it lies elsewhere."""
+    """Return a path below a folder with ``/``; empty where it lies elsewhere."""
     path, folder = path.resolve(), folder.resolve()
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else ""

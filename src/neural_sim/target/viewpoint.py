@@ -39,7 +39,7 @@ def viewpoint_of(
     phi_range: Range = (0.0, TURN),
     rho_range: Range = (-math.pi, math.pi),
 ) -> Viewpoint:
-    """The orbit's camera that sees an object from the side from which a real camera sees it.
+    """Find the orbit's camera that sees an object from the side from which a real camera sees it.
 
     An orbit's camera looks straight at the object, a real one rarely does. Its direction from the object is kept, and
     it is turned to face the object by the smallest rotation that does; what is left over is the roll. Where the object
@@ -53,7 +53,8 @@ def viewpoint_of(
     Args:
         object_to_camera: rigid, OpenCV axes (x right, y down, view along +z); the object stands upright along its +z.
         centre: of the object in its own frame, in the unit of the poses; None: its origin.
-        phi_range, rho_range: the angles that are drawn, in radians.
+        phi_range: the first angles that are drawn, in radians.
+        rho_range: the second angles that are drawn, in radians.
 
     Raises:
         ValueError: a camera that stands in the object's centre, or has it straight behind its back.
@@ -90,7 +91,7 @@ def bins_of_poses(
     radius: float | None,
     centre: Float[Tensor, "#n 3"] | None = None,
 ) -> Int[Tensor, "n"]:
-    """The bin of each pose by the first binned factor of p_psi, from 0, as :attr:`LabelledImages.bins` has it.
+    """Return the bin of each pose by the first binned factor of p_psi, from 0, as :attr:`LabelledImages.bins` has it.
 
     Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is
     not told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance
@@ -127,7 +128,7 @@ def _orbit_axes(phi: Tensor, rho: Tensor) -> tuple[Float[Tensor, "n 3"], Float[T
 def _named(
     phi: Tensor, rho: Tensor, roll: Tensor, phi_range: Range, rho_range: Range
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same angles in the turn about the middle of their ranges, the roll in the turn about 0."""
+    """Return the same angles in the turn about the middle of their ranges, the roll in the turn about 0."""
     middles = 0.5 * sum(phi_range), 0.5 * sum(rho_range), 0.0
     phi, rho, roll = (
         middle + torch.remainder(angle - middle + math.pi, TURN) - math.pi

@@ -7,26 +7,30 @@ line <scene>/<frame> for each frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import scipy.io
+from scipy.io.matlab import MatReadError
+from typing_extensions import override
 
+from neural_sim.extras import require
+from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
     FrameName,
+    FrameReader,
     Listed,
     PosedObject,
     box_of_mask,
     camera_of_matrix,
-    grid_of,
-    image_size,
     numbers,
     rigid,
 )
-from neural_sim.target.matlab import read_arrays
+from neural_sim.target.photographs import grid_of, image_size
 from neural_sim.target.posed import PosedTarget
 from neural_sim.types import PinholeCamera
 
@@ -40,97 +44,44 @@ CLASSES = (
 Box = tuple[float, float, float, float]
 
 
+@validated
 @dataclass(frozen=True)
 class YcbVideoTarget(PosedTarget):
-    """Frames of YCB-Video. An object's centre is taken to be its poses' origin.
-
-    An object's visibility is the fraction of its whole projection's box (clipped to the image) that the box of its
-    visible pixels covers: the data set has no masks of whole objects.
+    """Photographs of YCB-Video.
 
     Args:
-        val_list: the list of ``image_sets`` whose frames steer psi, of each scene one in ``every``; None: ``train``
+        val_list: the list of ``image_sets`` for validation, one in ``every`` photographs of each scene; None: ``train``
             where present, else scenes without another part.
-        test_list: the list whose frames are scored, all of them; None: ``keyframe`` where present, else scenes without
-            another part.
+        test_list: the list that is scored, all of it; None: ``keyframe`` where present, else scenes without another
+            part.
 
-    See :class:`PosedTarget` for the others.
+    See :class:`PosedTarget` for the other arguments.
     """
 
     val_list: str | None = None
     test_list: str | None = None
 
-    @property
-    def class_names(self) -> list[str]:
-        return list(CLASSES)
+    @cached_property
+    @override
+    def reader(self) -> YcbVideoScenes:
+        return YcbVideoScenes(self._root)
 
-    def frame(self, name: FrameName, depth: bool = False) -> Frame:
-        """See :class:`PosedTarget`."""
-        meta = self._file(name, "meta.mat")
-        image, label_file = self._file(name, "color.png"), self._file(name, "label.png")
-        arrays = read_arrays(meta, ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth"))
-        size = image_size(image)
-        camera = camera_of_matrix(arrays["intrinsic_matrix"], *size, f"{meta}: intrinsic_matrix")
-        classes = [int(value) for value in arrays["cls_indexes"].reshape(-1)]
-        poses = _poses(arrays["poses"], classes, meta)
-        labels = grid_of(label_file, size) if label_file.is_file() else None
-        if labels is not None and (stray := sorted(set(np.unique(labels).tolist()) - {0, *classes})):
-            raise ValueError(f"{label_file}: shows classes {stray}, of which {meta.name} has no pose")
-        whole = _boxes(self._file(name, "box.txt"), size)
-        objects = []
-        for index, pose in zip(classes, poses, strict=True):
-            class_name = CLASSES[index - 1]
-            if class_name not in whole:
-                raise ValueError(
-                    f"{self._file(name, 'box.txt')}: has no box of {class_name}, of which {meta.name} has a pose"
-                )
-            mask = None if labels is None else labels == index
-            box = whole[class_name] if mask is None else box_of_mask(mask)
-            objects.append(PosedObject(class_name, pose, box, _visibility(box, whole[class_name]), mask))
-        depths = self._depth(name, size, arrays["factor_depth"]) if depth else None
-        return Frame(name.scene, name.number, image, camera, tuple(objects), depths)
-
-    def _depth(self, name: FrameName, size: tuple[int, int], factor: np.ndarray) -> np.ndarray | None:
-        file = self._file(name, "depth.png")
-        per_metre = float(numbers(factor, 1, f"{self._file(name, 'meta.mat')}: factor_depth")[0])
-        return grid_of(file, size) / per_metre if file.is_file() else None
-
-    def _camera(self, name: FrameName) -> PinholeCamera:
-        meta = self._file(name, "meta.mat")
-        matrix = read_arrays(meta, ("intrinsic_matrix",))["intrinsic_matrix"]
-        return camera_of_matrix(
-            matrix, *image_size(self._file(name, "color.png")), f"{meta}: intrinsic_matrix"
-        )
-
-    def _files(self, name: FrameName) -> list[Path]:
-        return [self._file(name, end) for end in ("color.png", "label.png", "box.txt", "meta.mat")]
-
-    def _file(self, name: FrameName, end: str) -> Path:
-        return self._root / "data" / name.scene / f"{name.number:06d}-{end}"
-
-    # --- which frames ---
-
-    def _listed(self) -> Listed:
+    @override
+    def listed(self) -> Listed:
         val = self._list("val_list", self.val_list, "train")
         test = self._list("test_list", self.test_list, "keyframe")
         if val is not None:
             val = self._thinned(val)
         if val is None and test is None:
-            return Listed(self._thinned(self._all), None)
+            return Listed(self._thinned(self.reader.names), None)
         if val is None:
             val = self._without(test or ())
         return Listed(val, self._without(val) if test is None else test)
 
     def _without(self, taken: Sequence[FrameName]) -> list[FrameName]:
-        """Every so manieth frame of the scenes that ``taken`` has none of."""
+        """Keep every n-th photograph of the scenes that ``taken`` has none of."""
         scenes = {name.scene for name in taken}
-        return self._thinned([name for name in self._all if name.scene not in scenes])
-
-    @cached_property
-    def _all(self) -> list[FrameName]:
-        found = (self._root / "data").glob("*/*-color.png")
-        return sorted(
-            FrameName(path.parent.name, int(path.name.removesuffix("-color.png"))) for path in found
-        )
+        return self._thinned([name for name in self.reader.names if name.scene not in scenes])
 
     def _thinned(self, names: Sequence[FrameName]) -> list[FrameName]:
         scenes: dict[str, list[FrameName]] = {}
@@ -139,7 +90,7 @@ class YcbVideoTarget(PosedTarget):
         return [name for scene in scenes.values() for name in scene[:: self.every]]
 
     def _list(self, key: str, given: str | None, usual: str) -> list[FrameName] | None:
-        """The frames of a list; None where none is given and there is no usual one."""
+        """Read the photographs of a list; None where none is given and there is no usual one."""
         path = self._root / "image_sets" / f"{given or usual}.txt"
         if not path.is_file():
             if given is None:
@@ -153,12 +104,86 @@ class YcbVideoTarget(PosedTarget):
             if not scene or "/" in scene or not frame.isdigit():
                 raise ValueError(f"{path}: line {number}: want <scene>/<frame>, got {line!r}")
             names.append(FrameName(scene, int(frame)))
-        absent = [name for name in names if not self._file(name, "color.png").is_file()]
+        absent = [name for name in names if not self.reader.file(name, "color.png").is_file()]
         if absent:
             raise ValueError(
                 f"{path}: {len(absent)} of {len(names)} frames have no image, the first {absent[0]}"
             )
         return names
+
+
+@dataclass(frozen=True)
+class YcbVideoScenes(FrameReader):
+    """The files of YCB-Video. An object's centre is taken to be its poses' origin.
+
+    An object's visibility is the fraction of its whole projection's box (clipped to the image) that the box of its
+    visible pixels covers: the data set has no masks of whole objects.
+    """
+
+    root: Path
+
+    @cached_property
+    def names(self) -> list[FrameName]:
+        """All photographs."""
+        found = (self.root / "data").glob("*/*-color.png")
+        return sorted(
+            FrameName(path.parent.name, int(path.name.removesuffix("-color.png"))) for path in found
+        )
+
+    @override
+    def class_names(self, scenes: Collection[str]) -> list[str]:
+        return list(CLASSES)
+
+    @override
+    def centre(self, class_name: str) -> None:
+        return None
+
+    @override
+    def frame(self, name: FrameName, depth: bool = False) -> Frame:
+        meta = self.file(name, "meta.mat")
+        image, label_file = self.file(name, "color.png"), self.file(name, "label.png")
+        arrays = read_arrays(meta, ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth"))
+        size = image_size(image)
+        camera = camera_of_matrix(arrays["intrinsic_matrix"], *size, f"{meta}: intrinsic_matrix")
+        classes = [int(value) for value in arrays["cls_indexes"].reshape(-1)]
+        poses = _poses(arrays["poses"], classes, meta)
+        labels = grid_of(label_file, size) if label_file.is_file() else None
+        if labels is not None and (stray := sorted(set(np.unique(labels).tolist()) - {0, *classes})):
+            raise ValueError(f"{label_file}: shows classes {stray}, of which {meta.name} has no pose")
+        whole = _boxes(self.file(name, "box.txt"), size)
+        objects = []
+        for index, pose in zip(classes, poses, strict=True):
+            class_name = CLASSES[index - 1]
+            if class_name not in whole:
+                raise ValueError(
+                    f"{self.file(name, 'box.txt')}: has no box of {class_name}, of which {meta.name} has a pose"
+                )
+            mask = None if labels is None else labels == index
+            box = whole[class_name] if mask is None else box_of_mask(mask)
+            objects.append(PosedObject(class_name, pose, box, _visibility(box, whole[class_name]), mask))
+        depths = self._depth(name, size, arrays["factor_depth"]) if depth else None
+        return Frame(name.scene, name.number, image, camera, tuple(objects), depths)
+
+    def _depth(self, name: FrameName, size: tuple[int, int], factor: np.ndarray) -> np.ndarray | None:
+        file = self.file(name, "depth.png")
+        per_metre = float(numbers(factor, 1, f"{self.file(name, 'meta.mat')}: factor_depth")[0])
+        return grid_of(file, size) / per_metre if file.is_file() else None
+
+    @override
+    def camera(self, name: FrameName) -> PinholeCamera:
+        meta = self.file(name, "meta.mat")
+        matrix = read_arrays(meta, ("intrinsic_matrix",))["intrinsic_matrix"]
+        return camera_of_matrix(
+            matrix, *image_size(self.file(name, "color.png")), f"{meta}: intrinsic_matrix"
+        )
+
+    @override
+    def files(self, name: FrameName) -> list[Path]:
+        return [self.file(name, end) for end in ("color.png", "label.png", "box.txt", "meta.mat")]
+
+    def file(self, name: FrameName, end: str) -> Path:
+        """Return the file of a photograph whose name ends so."""
+        return self.root / "data" / name.scene / f"{name.number:06d}-{end}"
 
 
 def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.ndarray]:
@@ -180,7 +205,7 @@ def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.nda
 
 
 def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
-    """Boxes of whole projections by class, along pixel edges and clipped to the image; None: outside of it."""
+    """Read the boxes of whole projections by class, along pixel edges and clipped to the image; None: outside of it."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
@@ -202,3 +227,33 @@ def _visibility(visible: Box | None, whole: Box | None) -> float:
         return 1.0
     areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (visible, whole)]
     return min(1.0, areas[0] / areas[1])
+
+
+def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read arrays of a MATLAB file, of version 5 or of version 7.3, which is HDF5, with MATLAB's shapes.
+
+    Other arrays in the file are not read. MATLAB stores arrays column by column, which HDF5 reads as the transpose. It
+    drops trailing dimensions of size 1: the poses of one object are 3 x 4, those of two 3 x 4 x 2.
+
+    Raises:
+        ValueError: a file that is missing or no MATLAB file, or lacks a name.
+    """
+    require("bop", str(path))
+    import h5py
+
+    try:
+        if h5py.is_hdf5(path):
+            with h5py.File(path, "r") as file:
+                found = {
+                    name: np.asarray(file[name]).T
+                    for name in names
+                    if isinstance(file.get(name), h5py.Dataset)
+                }
+        else:
+            found = scipy.io.loadmat(path, variable_names=list(names))
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+        raise ValueError(f"{path}: not a readable MATLAB file ({error})") from error
+    lacking = [name for name in names if name not in found]
+    if lacking:
+        raise ValueError(f"{path}: lacks {lacking}")
+    return {name: np.asarray(found[name]) for name in names}

@@ -16,7 +16,7 @@ from neural_sim.detector.saved import DOCUMENT, SavedDetector
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
 from neural_sim.report.predictions import draw, result_rows, save_picture, scores_document, scores_table
-from neural_sim.target.photo_files import PhotoFiles
+from neural_sim.target.photographs import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
 from neural_sim.tasks.context import Context, Task
 

@@ -206,7 +206,7 @@ def test_our_own_reader_takes_bop_back(boxes, whole):
     target = BopTarget(root, test="train", every=1)
     assert target.class_names == ["obj_000001", "obj_000002", "obj_000003"]
     for number in range(7):
-        frame = target.frame(FrameName(f"train/{number // 4:06d}", number % 4), depth=True)
+        frame = target.reader.frame(FrameName(f"train/{number // 4:06d}", number % 4), depth=True)
         image = made.source.image(number)
         assert np.abs(frame.depth - image.depth * 1e-3).max() <= 0.5e-4 + 1e-7
         for found, item in zip(frame.objects, image.objects, strict=True):

@@ -1,0 +1,284 @@
+"""Photographs from files to tensors: which files there are, their pixels, letterboxed, and the boxes with them."""
+
+from __future__ import annotations
+
+import glob
+import logging
+import os
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from neural_sim.synthesis.background import PHOTO_SUFFIXES
+from neural_sim.types import LabelledImages
+
+_log = logging.getLogger(__name__)
+
+GREY = 0.5
+
+
+# --- files ---
+
+
+@contextmanager
+def opened(path: Path, where: str = "") -> Iterator[Image.Image]:
+    """Open a picture; all pictures of targets are read through here.
+
+    Args:
+        path: the file.
+        where: what messages begin with; empty: the path.
+
+    Raises:
+        ValueError: no such file, or none that can be read as an image, to its end where its pixels are asked for.
+    """
+    try:
+        with Image.open(path) as image:
+            yield image
+    except OSError as error:  # UnidentifiedImageError is one
+        raise ValueError(f"{where or path}: not a readable image ({error})") from error
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) by the file's header. Raises ``ValueError`` as :func:`opened` does."""
+    with opened(path) as image:
+        return image.size
+
+
+def grid_of(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """Read the numbers [height, width] of an image of one channel, such as labels or depth.
+
+    Raises:
+        ValueError: no such file, or one of another ``size`` (width, height) or number of channels.
+    """
+    if (got := image_size(path)) != size:
+        raise ValueError(f"{path}: is {by(got)} pixels, its photograph {by(size)}")
+    with opened(path) as image:
+        grid = np.asarray(image)
+    if grid.ndim != 2:
+        raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")
+    return grid
+
+
+def by(size: tuple[int, ...]) -> str:
+    """Return a size in words, such as 64 x 48."""
+    return " x ".join(map(str, size))
+
+
+@dataclass(frozen=True)
+class PhotoFiles:
+    """The photographs under a folder, at any depth, or those that a glob (``**`` goes down) or a path names.
+
+    Args:
+        where: the folder, glob or path; ``~`` is the user's home.
+        key: the setting that it comes from, for messages.
+
+    Raises:
+        ValueError: nothing of that name, or no photograph there.
+    """
+
+    where: str
+    key: str
+
+    def __post_init__(self) -> None:
+        if not self.paths:
+            if self._folder.is_dir():
+                raise ValueError(f"{self.key}: no picture ({', '.join(PHOTO_SUFFIXES)}) in {self.where}")
+            raise ValueError(
+                f"{self.key}: want a folder of pictures, a glob or a picture, got {self.where}, "
+                + ("which no file matches" if glob.has_magic(self.where) else "which does not exist")
+            )
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self.where).expanduser()
+
+    @cached_property
+    def paths(self) -> Sequence[Path]:
+        """The files in the order of their names."""
+        if self._folder.is_dir():
+            return sorted(
+                p for p in self._folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file()
+            )
+        found = glob.glob(str(self._folder), recursive=True)
+        return sorted(path for path in map(Path, found) if path.is_file())
+
+    @cached_property
+    def root(self) -> Path:
+        """The folder below which all photographs lie."""
+        if self._folder.is_dir():
+            return self._folder
+        return Path(os.path.commonpath([path.parent for path in self.paths]))
+
+    def name(self, path: Path) -> str:
+        """Return a photograph's path below :attr:`root`, with ``/``."""
+        return path.relative_to(self.root).as_posix()
+
+    def read(self, path: Path) -> Image.Image:
+        """Read a photograph in RGB. Raises ``ValueError`` where it cannot be read."""
+        with opened(path, f"{self.key}: {path}") as photo:
+            return photo.convert("RGB")
+
+
+# --- pixels and boxes ---
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """Where a photograph of ``width`` x ``height`` lies in the new image (pixels)."""
+
+    width: int
+    height: int
+    left: int
+    top: int
+    inner_width: int
+    inner_height: int
+
+    def boxes(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
+        """Bring (x0, y0, x1, y1) of the photograph, clipped to it, into the new image."""
+        size, inner, offset = self._sides(boxes)
+        return torch.minimum(boxes.clamp_min(0.0), size) * (inner / size) + offset
+
+    def of_photo(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
+        """Bring (x0, y0, x1, y1) of the new image into the photograph, clipped to it: the inverse of :meth:`boxes`."""
+        size, inner, offset = self._sides(boxes)
+        return torch.minimum(((boxes - offset) * (size / inner)).clamp_min(0.0), size)
+
+    def inside(self, image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 _ _"]:
+        """Return the part of the new image that the photograph fills."""
+        return image[:, self.top : self.top + self.inner_height, self.left : self.left + self.inner_width]
+
+    def _sides(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return width and height, twice, of the photograph and of its part of the new image, and where that begins."""
+        size = like.new_tensor([self.width, self.height, self.width, self.height])
+        inner = like.new_tensor([self.inner_width, self.inner_height] * 2)
+        return size, inner, like.new_tensor([self.left, self.top] * 2)
+
+
+def letterbox(
+    photo: Image.Image, height: int, width: int
+) -> tuple[Float[Tensor, "3 height width"], Letterbox]:
+    """Scale a photograph to one size without distortion, centred on grey; values are in [0, 1]."""
+    scale = min(width / photo.width, height / photo.height)
+    inner_width = max(1, min(width, round(scale * photo.width)))
+    inner_height = max(1, min(height, round(scale * photo.height)))
+    left, top = (width - inner_width) // 2, (height - inner_height) // 2
+    resized = photo.convert("RGB").resize((inner_width, inner_height), Image.Resampling.BILINEAR)
+    image = torch.full((3, height, width), GREY)
+    pixels = torch.from_numpy(np.asarray(resized, dtype=np.float32) / 255.0).movedim(-1, 0)
+    image[:, top : top + inner_height, left : left + inner_width] = pixels
+    return image, Letterbox(photo.width, photo.height, left, top, inner_width, inner_height)
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A labelled photograph of a data set, not yet read.
+
+    Args:
+        path: its file.
+        labels: the class of each box, a position in the run's objects.
+        boxes: (x0, y0, x1, y1) in the file's pixels, along their edges; None: one box, which is the whole photograph.
+        bins: the pose bin of each box, from 0, -1 where it is unknown; None: no box has one.
+        name: what messages call it.
+        group: what a split keeps together.
+        where: what messages about the file begin with; empty: its path.
+        border: pixels that are cut off each side.
+    """
+
+    path: Path
+    labels: Int[Tensor, "b"]
+    boxes: Float[Tensor, "b 4"] | None = None
+    bins: Int[Tensor, "b"] | None = None
+    name: str = ""
+    group: Hashable = None
+    where: str = ""
+    border: int = 0
+
+    def letterboxed(self, height: int, width: int) -> tuple[Float[Tensor, "3 height width"], Letterbox]:
+        """Read the photograph at one size.
+
+        Raises:
+            ValueError: a file that cannot be read, or nothing left within the border.
+        """
+        with opened(self.path, self.where) as photo:
+            if self.border == 0:
+                return letterbox(photo, height, width)
+            if min(photo.size) <= 2 * self.border:
+                raise ValueError(
+                    f"target.border: {self.border} leaves nothing of {self.path}, of {photo.size} pixels"
+                )
+            return letterbox(ImageOps.crop(photo.convert("RGB"), self.border), height, width)
+
+
+def read(
+    photographs: Sequence[Photograph], height: int, width: int, minimum_side: float, source: object
+) -> tuple[LabelledImages, list[Letterbox]]:
+    """Read photographs as one labelled set of images of one size.
+
+    Args:
+        photographs: at least one.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        minimum_side: boxes with a shorter side, in pixels of the images, are dropped and counted in the log. A box that
+            is the whole photograph is kept.
+        source: the data set, for the log.
+
+    Returns:
+        The set, boxes padded to the longest list among them, bins by box where some photograph has any; and where each
+        photograph lies in its image.
+
+    Raises:
+        ValueError: no photographs, or one that cannot be read.
+    """
+    if not photographs:
+        raise ValueError("target: want at least one photograph, got none")
+    images, placings, kept, dropped = [], [], [], 0
+    for photograph in photographs:
+        image, placing = photograph.letterboxed(height, width)
+        labelled = _placed(photograph, placing, minimum_side)
+        images.append(image)
+        placings.append(placing)
+        kept.append(labelled)
+        dropped += len(photograph.labels) - len(labelled.labels)
+    if dropped:
+        _log.warning("%s: %d boxes shorter than %g px dropped", source, dropped, minimum_side)
+    return _padded(torch.stack(images), kept), placings
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """Boxes of a letterboxed photograph."""
+
+    boxes: Float[Tensor, "b 4"]
+    labels: Int[Tensor, "b"]
+    bins: Int[Tensor, "b"] | None
+
+
+def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> _Boxes:
+    """Bring a photograph's boxes into the letterboxed image, without those that are too small there."""
+    if photograph.boxes is None:
+        whole = torch.tensor([[0.0, 0.0, placing.width, placing.height]])
+        return _Boxes(placing.boxes(whole), photograph.labels, photograph.bins)
+    boxes = placing.boxes(photograph.boxes)
+    large = ((boxes[:, 2:] - boxes[:, :2]) >= minimum_side).all(-1)
+    bins = None if photograph.bins is None else photograph.bins[large]
+    return _Boxes(boxes[large], photograph.labels[large], bins)
+
+
+def _padded(images: Float[Tensor, "n 3 h w"], kept: Sequence[_Boxes]) -> LabelledImages:
+    most = max(1, *(len(one.labels) for one in kept))
+    boxes = torch.zeros(len(kept), most, 4)
+    labels, bins = (torch.full((len(kept), most), -1) for _ in range(2))
+    for row, one in enumerate(kept):
+        count = len(one.labels)
+        boxes[row, :count], labels[row, :count] = one.boxes, one.labels
+        bins[row, :count] = -1 if one.bins is None else one.bins
+    by_box = any(one.bins is not None for one in kept)
+    return LabelledImages(images, boxes, labels, bins if by_box else torch.full((len(kept),), -1))
