@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import cast
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +16,7 @@ from neural_sim.types import PinholeCamera, Rays
 def orbit(
     phi: Float[Tensor, "*n"], rho: Float[Tensor, "*n"], distance: Float[Tensor, "*n"], *, radius: float = 1.0
 ) -> Float[Tensor, "*n 4 4"]:
-    """Camera-to-world poses that look at the origin, differentiable in all three arguments.
+    """Compute camera-to-world poses that look at the origin, differentiable in all three arguments.
 
     The object stands upright along world +z. ``phi`` goes once round the great circle through the poles: 0 above,
     pi/2 beside (world +x), pi below, 3 pi/2 on the other side (world -x). ``rho`` turns that circle about the
@@ -34,25 +35,25 @@ def orbit(
 
 
 def focal_length(camera: PinholeCamera) -> float:
-    """Vertical focal length in pixels."""
+    """Compute the vertical focal length in pixels."""
     return 0.5 * camera.height / math.tan(0.5 * camera.field_of_view)
 
 
 def focal_lengths(camera: PinholeCamera) -> tuple[float, float]:
-    """Horizontal and vertical focal length in pixels."""
+    """Compute the horizontal and vertical focal length in pixels."""
     vertical = focal_length(camera)
     return camera.aspect * vertical, vertical
 
 
 def principal_point(camera: PinholeCamera) -> tuple[float, float]:
-    """The principal point (x, y) in pixels from the image's upper left corner: half a pixel more than OpenCV's."""
+    """Locate the principal point (x, y), in pixels from the image's upper left corner: OpenCV's plus half a pixel."""
     return (0.5 * camera.width, 0.5 * camera.height) if camera.centre is None else camera.centre
 
 
 def opencv_camera(
     width: int, height: int, fx: float, fy: float, cx: float | None = None, cy: float | None = None
 ) -> PinholeCamera:
-    """The camera of an OpenCV camera matrix, in pixels.
+    """Make the camera of an OpenCV camera matrix, in pixels.
 
     OpenCV's origin is the centre of the upper left pixel: ``cx`` of a centred camera is (width - 1) / 2, the default.
 
@@ -68,7 +69,7 @@ def opencv_camera(
 
 
 def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    """The camera of this one's images resized to another width and height."""
+    """Make the camera of this one's images resized to another width and height."""
     x, y = principal_point(camera)
     (fx, fy), across, down = focal_lengths(camera), width / camera.width, height / camera.height
     centre = None if camera.centre is None else (across * x, down * y)
@@ -77,8 +78,9 @@ def resized(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
-    """The camera of images of another size that show, centred and in the same proportions, all that this one's do: in
-    their direction of more room they show more.
+    """Make the camera of images of another size that show all that this one's do, centred, in the same proportions.
+
+    In their direction of more room they show more.
     """
     scale = min(width / camera.width, height / camera.height)
     fy = scale * focal_length(camera)
@@ -89,7 +91,7 @@ def reframed(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
 
 
 def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int) -> PinholeCamera:
-    """The camera of a part of this one's images, which may reach beyond them; ``left`` and ``top`` in pixels."""
+    """Make the camera of a part of this one's images, which may reach beyond them; ``left``, ``top`` in pixels."""
     x, y = principal_point(camera)
     angle = 2.0 * math.atan(0.5 * height / focal_length(camera))
     return PinholeCamera(width, height, angle, camera.aspect, (x - left, y - top))
@@ -98,15 +100,17 @@ def cropped(camera: PinholeCamera, left: int, top: int, width: int, height: int)
 def turned(
     camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], shift: tuple[float, float]
 ) -> Float[Tensor, "4 4"]:
-    """The pose turned about its own place by the smallest angle after which what projected to the principal point does
-    so ``shift`` pixels (right, down) of it. The direction from the object to the camera stays.
+    """Turn a pose about its own place, so that what projected to the principal point does so ``shift`` pixels off.
+
+    ``shift`` is (right, down); the turn is the smallest that does it. The direction from the object to the camera
+    stays.
     """
     fx, fy = focal_lengths(camera)
     ahead = camera_to_world.new_tensor([0.0, 0.0, -1.0])
     aim = camera_to_world.new_tensor([shift[0] / fx, -shift[1] / fy, -1.0])
-    aim = aim / aim.norm()
+    aim = aim / cast(Tensor, aim.norm())  # pyright: ignore[reportUnknownMemberType]
     # Rodrigues' formula for the turn of ``ahead`` onto ``aim``, whose axis is their cross product.
-    axis, cosine = torch.linalg.cross(ahead, aim), ahead @ aim
+    axis, cosine = torch.cross(ahead, aim, dim=-1), ahead @ aim
     x, y, z = axis.unbind()
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
@@ -117,7 +121,7 @@ def turned(
 
 
 def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
-    """The camera with ``magnification`` times its focal length."""
+    """Make the camera with ``magnification`` times its focal length."""
     return replace(
         camera, field_of_view=2.0 * math.atan(math.tan(0.5 * camera.field_of_view) / magnification)
     )
@@ -126,12 +130,14 @@ def magnified(camera: PinholeCamera, magnification: float) -> PinholeCamera:
 def cameras_of(
     camera: PinholeCamera, magnification: Float[Tensor, "n"] | None
 ) -> list[tuple[PinholeCamera, slice]]:
-    """Cameras and the images of each: one camera for all images, or one for each focal length (``magnification``, in
-    units of the camera's).
+    """List cameras and the images of each: one camera for all images, or one for each focal length.
+
+    ``magnification`` are the focal lengths in units of the camera's.
     """
     if magnification is None:
         return [(camera, slice(None))]
-    return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(magnification.tolist())]
+    sizes = cast(list[float], magnification.tolist())  # pyright: ignore[reportUnknownMemberType]
+    return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(sizes)]
 
 
 def pixel_rays(
@@ -140,7 +146,7 @@ def pixel_rays(
     pixel: Int[Tensor, "rays"],
     magnification: Float[Tensor, "views"] | None = None,
 ) -> Rays:
-    """Rays (*m, rays, 3) through the centres of the pixels with the given flat indices into [views, height, width].
+    """Cast rays (*m, rays, 3) through the pixels' centres; ``pixel`` are flat indices into [views, height, width].
 
     Row 0 is the top of the image. Rays are linear in the poses and differentiable by ``magnification``, the views'
     focal lengths in units of the camera's. All callers share this arithmetic: a rounding error that moves a sample to
@@ -158,13 +164,13 @@ def pixel_rays(
     if magnification is not None:
         x, y = x / magnification[view], y / magnification[view]
     local = torch.stack([x, -y, -torch.ones_like(x)], -1)
-    local = local / local.norm(dim=-1, keepdim=True)
+    local = local / cast(Tensor, local.norm(dim=-1, keepdim=True))  # pyright: ignore[reportUnknownMemberType]
     pose = camera_to_world.index_select(-3, view)
     return Rays(pose[..., :3, 3], torch.einsum("...rij,rj->...ri", pose[..., :3, :3], local))
 
 
 def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Rays:
-    """Rays through every pixel centre: shapes (*n, height, width, 3), differentiable in the pose."""
+    """Cast rays through every pixel centre: shapes (*n, height, width, 3), differentiable in the pose."""
     poses = camera_to_world.reshape(-1, 4, 4)
     count = len(poses) * camera.height * camera.width
     bundle = pixel_rays(camera, poses, torch.arange(count, device=poses.device))
@@ -175,7 +181,7 @@ def rays(camera: PinholeCamera, camera_to_world: Float[Tensor, "*n 4 4"]) -> Ray
 def ray_rates(
     camera: PinholeCamera, rays: Rays, rates: Float[Tensor, "*m views 4 4"], pixel: Int[Tensor, "rays"]
 ) -> Rays:
-    """Derivatives (*m, rays, 3) of these pixels' rays for derivatives ``rates`` of the camera-to-world matrices.
+    """Differentiate these pixels' rays (*m, rays, 3), for derivatives ``rates`` of the camera-to-world matrices.
 
     Directions stay of unit length: the component along them is removed (for a rotating camera it is rounding error, for
     a changing focal length the derivative of the normalisation).
@@ -188,7 +194,7 @@ def ray_rates(
 def unit_sphere_span(
     bundle: Rays, radius: float = 1.0
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
-    """Distances along unit-length rays at which they enter and leave the sphere about the origin.
+    """Find the distances along unit-length rays at which they enter and leave the sphere about the origin.
 
     Entry >= exit where a ray misses it; entry is 0 for an origin inside.
     """

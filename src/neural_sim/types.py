@@ -65,11 +65,13 @@ class PosedViews:
         return self.images.shape[0]
 
     def select(self, index: Tensor) -> PosedViews:
+        """Select views."""
         weights = None if self.light_weights is None else self.light_weights[index]
         known = None if self.known is None else self.known[index]
         return PosedViews(self.images[index], self.camera_to_world[index], self.camera, weights, known)
 
     def to(self, device: torch.device) -> PosedViews:
+        """Copy the tensors to ``device``."""
         weights = None if self.light_weights is None else self.light_weights.to(device)
         known = None if self.known is None else self.known.to(device)
         return PosedViews(
@@ -103,10 +105,11 @@ class LabelledImages:
         return self.images.shape[0]
 
     def select(self, index: Tensor | slice) -> LabelledImages:
+        """Select images."""
         return LabelledImages(self.images[index], self.boxes[index], self.labels[index], self.bins[index])
 
     def to(self, device: torch.device | str) -> LabelledImages:
-        """The same on ``device``."""
+        """Copy the tensors to ``device``."""
         return LabelledImages(*(getattr(self, f.name).to(device) for f in fields(LabelledImages)))
 
     @property
@@ -116,8 +119,12 @@ class LabelledImages:
 
     @staticmethod
     def concatenate(parts: list[LabelledImages]) -> LabelledImages:
-        """Join sets of equal image size; boxes are padded to the longest list among them. Where one set has a bin for
-        each box all have, those of an image that has one for all its boxes being equal.
+        """Join sets of equal image size; boxes are padded to the longest list among them.
+
+        Where one set has a bin for each box all have, those of an image that has one for all its boxes being equal.
+
+        Raises:
+            ValueError: no sets.
         """
         if not parts:
             raise ValueError("concatenate: got no image sets, want at least one")
@@ -163,6 +170,7 @@ class SceneDraw:
         return self.phi.shape[0]
 
     def select(self, index: Tensor | slice) -> SceneDraw:
+        """Select images."""
         values = {f.name: getattr(self, f.name) for f in fields(SceneDraw) if f.name != "radius"}
         chosen = {name: value[index] for name, value in values.items() if value is not None}
         return SceneDraw(**chosen, radius=self.radius)

@@ -2,7 +2,6 @@
 
 import itertools
 
-import pytest
 import torch
 
 from neural_sim.baseline.lts import LearningToSimulate, score
@@ -114,9 +113,3 @@ def test_the_advantage_against_the_moving_averages_written_out():
 def test_no_step_exceeds_its_bound():
     path = run([0.0, 1.0, -50.0, 80.0], learning_rate=100.0, max_step=0.3)
     assert all((after - before).abs().max() <= 0.3 + 1e-12 for before, after in itertools.pairwise(path))
-
-
-@pytest.mark.parametrize("bad", [{"learning_rate": 0.0}, {"max_step": -1.0}, {"decay": 1.0}, {"rounds": 0}])
-def test_bad_settings_name_their_key(bad):
-    with pytest.raises(ValueError, match=f"baseline.{next(iter(bad))}"):
-        LearningToSimulate(**bad)

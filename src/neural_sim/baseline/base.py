@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.ranges import PositiveFraction, validated
 from neural_sim.types import SceneDraw
 
 Draws = Sequence[SceneDraw]
@@ -26,11 +27,11 @@ class Search(Protocol):
         ...
 
     def ask(self) -> Float[Tensor, "objects K"]:
-        """The psi whose images come next."""
+        """Ask for the psi whose images come next."""
         ...
 
     def tell(self, reward: float, draws: Draws) -> None:
-        """The reward of a detector trained on images of the psi last asked for; larger is better."""
+        """Tell the reward of a detector trained on images of the psi last asked for; larger is better."""
         ...
 
 
@@ -51,6 +52,7 @@ class RewardMethod(Protocol):
         ...
 
 
+@validated
 @dataclass(frozen=True)
 class Fixed:
     """No optimisation: images from the initial distribution (``ns``, the paper's NS) or the target's (``oracle``)."""
@@ -58,34 +60,22 @@ class Fixed:
     name: str
     which: Literal["initial", "target"]
 
-    def __post_init__(self) -> None:
-        if self.which not in ("initial", "target"):
-            raise ValueError(f"baseline.which must be initial or target, got {self.which!r}")
 
-
+@validated
 @dataclass(frozen=True)
 class HypergradientLoop:
-    """psi moves by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
+    """Steps of psi by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
 
     name: str
 
 
+@validated
 @dataclass(frozen=True)
 class Response:
-    """psi moves by the measured response of training, without a derivative: a training for each bin, in which ``part``
-    of every object's images moves to it (:mod:`outer.response`).
+    """Steps of psi by the measured response of training, without a derivative (:mod:`outer.response`).
+
+    It takes a training for each bin, in which ``part`` of every object's images moves to it.
     """
 
     name: str
-    part: float = 0.15
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.part <= 1.0:
-            raise ValueError(f"baseline.part must lie in (0, 1], got {self.part}")
-
-
-def positive(**values: float) -> None:
-    """Raises ``ValueError`` for a value that is not positive, by its key."""
-    for key, value in values.items():
-        if not value > 0:
-            raise ValueError(f"baseline.{key} must be positive, got {value}")
+    part: PositiveFraction = 0.15

@@ -7,18 +7,22 @@ set. One number is the reward of all objects and bins, so that thousands of roun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.baseline.base import Draws, positive
+from neural_sim.baseline.base import Draws, Search
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import bound
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import SceneDraw
 
 
+@validated
 @dataclass(frozen=True)
 class LearningToSimulate:
     """Ascent along ``(R - b) d log p(training set) / d psi`` with a moving average b of past rewards.
@@ -39,24 +43,19 @@ class LearningToSimulate:
 
     explores: ClassVar[bool] = True
     name: str = "lts"
-    learning_rate: float = 0.5
-    decay: float = 0.8
-    max_step: float = 1.0
-    rounds: int = 2
-
-    def __post_init__(self) -> None:
-        positive(learning_rate=self.learning_rate, max_step=self.max_step, rounds=self.rounds)
-        if not 0.0 <= self.decay < 1.0:
-            raise ValueError(f"baseline.decay must lie in [0, 1), got {self.decay}")
+    learning_rate: Positive = 0.5
+    decay: Annotated[float, Ge(0), Lt(1)] = 0.8
+    max_step: Positive = 1.0
+    rounds: PositiveInt = 2
 
     def begin(
         self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
     ) -> Policy:
-        """A policy that starts at ``psi``."""
+        """Make a policy that starts at ``psi``."""
         return Policy(self, distribution, psi.detach().clone())
 
 
-class Policy:
+class Policy(Search):
     """See :class:`LearningToSimulate`."""
 
     def __init__(
@@ -67,12 +66,15 @@ class Policy:
         self._first = torch.zeros_like(psi)  # the first round's score
 
     @property
+    @override
     def psi(self) -> Float[Tensor, "objects K"]:
         return self._psi
 
+    @override
     def ask(self) -> Float[Tensor, "objects K"]:
         return self._psi
 
+    @override
     def tell(self, reward: float, draws: Draws) -> None:
         advantage = self._advantage(reward)
         slope = torch.stack(
@@ -94,7 +96,7 @@ class Policy:
         self._psi = self._distribution.constrained(self._psi + self._distribution.join(moved))
 
     def _advantage(self, reward: float) -> float:
-        """``R - b`` over the running standard deviation of rewards; then b is updated."""
+        """Compute ``R - b`` over the running standard deviation of rewards, then update b."""
         above, rest = reward - self._mean, 1.0 - self._settings.decay
         self._told += 1
         if self._told == 1:
@@ -107,7 +109,7 @@ class Policy:
 
 
 def score(distribution: SceneDistribution, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "K"]:
-    """``d log p(draws) / d psi`` of independent draws together."""
+    """Compute ``d log p(draws) / d psi`` of independent draws together."""
     leaf = psi.detach().requires_grad_()
     with torch.enable_grad():
         total = distribution.log_prob(leaf, draw).sum()

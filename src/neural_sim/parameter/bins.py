@@ -109,7 +109,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
     count, k = gumbel.shape
     p = log_p.double().softmax(-1)
     if bool(p.isnan().any()):
-        raise ValueError(f"parameter: want finite psi to draw bins from, got log p {log_p.tolist()}")
+        raise ValueError(f"parameter: want finite psi to draw bins from, got log p {log_p.tolist()}")  # pyright: ignore[reportUnknownMemberType]
     ends = torch.cat([p.new_zeros(1), (count * p[:-1].cumsum(-1) - offset).ceil(), p.new_tensor([count])])
     wanted = ends.diff().long()
     values = log_p.double() + gumbel.double()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -33,8 +34,8 @@ def distribution(specification: Specification, bins: int, where: str = "distribu
         if set(specification) == {"dominant"}:
             return _peaked([specification["dominant"]], bins, where)
         if set(specification) == {"modes"} and isinstance(specification["modes"], Sequence):
-            return _peaked(list(specification["modes"]), bins, where)
-    elif isinstance(specification, Sequence) and not isinstance(specification, str):
+            return _peaked(list(cast(Sequence[object], specification["modes"])), bins, where)
+    elif not isinstance(specification, str) and isinstance(specification, Sequence):  # pyright: ignore[reportUnnecessaryIsInstance]
         return _numbers(specification, bins, where)
     raise ValueError(
         f"{where}: want uniform, {{dominant: b}}, {{modes: [b, ...]}} or {bins} numbers, got {specification!r}"
@@ -109,4 +110,4 @@ def _check_weights(values: Tensor) -> None:
     if values.ndim == 0 or values.shape[-1] == 0:
         raise ValueError(f"simplex: want at least one weight, got shape {tuple(values.shape)}")
     if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"simplex: weights must be finite, got {values.tolist()}")
+        raise ValueError(f"simplex: weights must be finite, got {values.tolist()}")  # pyright: ignore[reportUnknownMemberType]

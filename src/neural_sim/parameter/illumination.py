@@ -172,5 +172,5 @@ def _affine_numbers(values: Sequence[float], anchors: int, where: str) -> Float[
     if len(weights) != anchors:
         raise ValueError(f"{where}: want {anchors} numbers, got {len(weights)}")
     if not bool(torch.isfinite(weights).all()) or abs(float(weights.sum()) - 1.0) > 1e-6:
-        raise ValueError(f"{where}: want finite weights that add up to 1, got {weights.tolist()}")
+        raise ValueError(f"{where}: want finite weights that add up to 1, got {weights.tolist()}")  # pyright: ignore[reportUnknownMemberType]
     return weights

@@ -139,7 +139,7 @@ class SceneDistribution:
 
     def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
         """Split psi, or any vector of psi's shape, into every factor's part."""
-        parts = psi.split([factor.size for factor in self.factors], -1)
+        parts = torch.split(psi, [factor.size for factor in self.factors], -1)
         return dict(zip(self.names, parts, strict=True))
 
     def join(self, parts: Mapping[str, Float[Tensor, "*n k"]]) -> Float[Tensor, "*n K"]:
@@ -206,14 +206,14 @@ class SceneDistribution:
         learned = {f.coordinate for f in self.binned}
         drawn = [c for c in COORDINATES if c != "magnification" or c in learned]
         uniform = torch.rand((len(drawn), n), generator=generator, dtype=torch.float64).to(dtype)
-        noise = {}
+        noise: dict[str, BinNoise] = {}
         for f in self.binned:
             offset = float(torch.rand((), generator=generator, dtype=torch.float64)) if balanced else None
             noise[f.name] = BinNoise(gumbel[f.name], offset)
         light = None
         if explore and self.lights:
             light = torch.randn((n, self.lights), generator=generator, dtype=torch.float64).to(dtype)
-        return SceneNoise(noise, dict(zip(drawn, uniform, strict=True)), light)
+        return SceneNoise(noise, dict(zip(drawn, uniform.unbind(), strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
         """Draw exact samples of p_psi; no derivative reaches psi."""
@@ -240,7 +240,9 @@ class SceneDistribution:
 
     def relaxed(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
         """Draw samples that are differentiable in psi, see :meth:`BinnedFactor.relaxed`."""
-        parts, placed, bins = self.split(psi), {}, {}
+        parts = self.split(psi)
+        placed: dict[str, Tensor] = {}
+        bins: dict[str, Tensor] = {}
         for f in self.binned:
             within = noise.uniform[f.coordinate]
             placed[f.coordinate], bins[f.name] = f.relaxed(parts[f.name], noise.bins[f.name], within)
@@ -308,14 +310,20 @@ class SceneDistribution:
         bins: Mapping[str, Int[Tensor, "n"]],
         noise: SceneNoise,
     ) -> SceneDraw:
-        values = {}
+        values: dict[str, Tensor] = {}
         for coordinate in COORDINATES:
             low, high = self.ranges[coordinate]
             if coordinate in placed:
                 values[coordinate] = placed[coordinate]
             elif coordinate in noise.uniform:
                 values[coordinate] = low + (high - low) * noise.uniform[coordinate]
-        return SceneDraw(**values, bins=_columns([bins[f.name] for f in self.binned], values["phi"]))
+        return SceneDraw(
+            phi=values["phi"],
+            rho=values["rho"],
+            distance=values["distance"],
+            magnification=values.get("magnification"),
+            bins=_columns([bins[f.name] for f in self.binned], values["phi"]),
+        )
 
 
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:

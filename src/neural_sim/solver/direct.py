@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.solver.base import Iterate, LinearSolver, Status, System
-from neural_sim.solver.operator import norm
+from neural_sim.solver.operator import eigenpairs, norm
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Exact(LinearSolver):
         scale = float(matrix.abs().max())
         if scale == 0.0:
             return Iterate(torch.zeros_like(rhs), Status.LEAST_SQUARES, 1)
-        values, vectors = torch.linalg.eigh(matrix / scale)
+        values, vectors = eigenpairs(matrix / scale)
         operator.observe(float(values[0]) * scale, float(values[-1]) * scale)
         kept = values.abs() > values.numel() * torch.finfo(values.dtype).eps * values.abs().max()
         inverted = torch.where(

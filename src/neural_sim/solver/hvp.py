@@ -80,7 +80,7 @@ class HessianOperator:
                     torch.autograd.grad(
                         slope, point, rows, retain_graph=True, is_grads_batched=True, materialize_grads=True
                     )[0]
-                    for rows in basis.split(batch)
+                    for rows in torch.split(basis, batch)
                 ]
                 total += torch.cat(parts)
         return total

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.base import Search
-from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, in_range, norm, numbers, plain_norm
+from neural_sim.solver.operator import (
+    Matvec,
+    NonFiniteProduct,
+    Watched,
+    eigenpairs,
+    in_range,
+    norm,
+    numbers,
+    plain_norm,
+)
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,8 @@ class Krylov:
         makes r + |beyond|^2 y_m Q z conjugate to the whole space.
         """
         shifted = self.tridiagonal + shift * torch.eye(len(self.tridiagonal), dtype=torch.float64)
-        factor, info = torch.linalg.cholesky_ex(shifted)
+        found = cast(tuple[Tensor, Tensor], torch.linalg.cholesky_ex(shifted))  # pyright: ignore[reportUnknownMemberType]
+        factor, info = found
         if int(info) != 0:
             return None
         ends = torch.zeros(len(shifted), 2, dtype=torch.float64)
@@ -143,7 +154,7 @@ def _extremes(
     tridiagonal = (
         torch.diag(torch.tensor(alphas, dtype=torch.float64)) + torch.diag(off, 1) + torch.diag(off, -1)
     )
-    values, vectors = torch.linalg.eigh(tridiagonal)
+    values, vectors = eigenpairs(tridiagonal)
     errors = betas[len(alphas) - 1] * vectors[-1].abs()  # residual of a Ritz pair: beta_m |e_m^T y|
     low, high = float(values[0]), float(values[-1])
     krylov = Krylov(basis, tridiagonal, size, beyond)

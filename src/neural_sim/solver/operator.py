@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -35,7 +36,7 @@ def unflatten(vector: Float[Tensor, "n"], like: Mapping[str, Tensor]) -> dict[st
         raise ValueError(
             f"unflatten: got shape {tuple(vector.shape)}, want ({wanted},) for {len(like)} parameters"
         )
-    pieces = vector.split([tensor.numel() for tensor in like.values()])
+    pieces = torch.split(vector, [tensor.numel() for tensor in like.values()])
     return {
         name: piece.view(tensor.shape) for (name, tensor), piece in zip(like.items(), pieces, strict=True)
     }
@@ -59,12 +60,13 @@ class Shifted:
 
 def numbers(*scalars: Float[Tensor, ""]) -> list[float]:
     """Read several scalars as Python numbers by one transfer: the host waits for the device once."""
-    return torch.stack([scalar.double() for scalar in scalars]).tolist()
+    stacked = torch.stack([scalar.double() for scalar in scalars])
+    return cast(list[float], stacked.tolist())  # pyright: ignore[reportUnknownMemberType]
 
 
 def plain_norm(vector: Tensor) -> Float[Tensor, ""]:
     """Take the Euclidean norm in float64, where squares stay in its range; still on the device."""
-    return torch.linalg.vector_norm(vector, dtype=torch.float64)
+    return cast(Tensor, torch.linalg.vector_norm(vector, dtype=torch.float64))  # pyright: ignore[reportUnknownMemberType]
 
 
 def plain_dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> Float[Tensor, ""]:
@@ -84,12 +86,17 @@ def in_range(size: float, vector: Tensor) -> float:
     # Squares leave the range of float64: the same after scaling by a power of two, which is exact.
     exponent = math.frexp(float(vector.abs().max()))[1]
     scaled = torch.ldexp(vector.double(), torch.tensor(-exponent))
-    return math.ldexp(float(torch.linalg.vector_norm(scaled)), exponent)
+    return math.ldexp(float(plain_norm(scaled)), exponent)
 
 
 def dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> float:
     """Take the inner product in float64."""
     return float(plain_dot(left, right))
+
+
+def eigenpairs(symmetric: Float[Tensor, "n n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n n"]]:
+    """Find the eigenvalues, ascending, and the eigenvectors, as columns."""
+    return cast(tuple[Tensor, Tensor], torch.linalg.eigh(symmetric))  # pyright: ignore[reportUnknownMemberType]
 
 
 @dataclass(frozen=True)
