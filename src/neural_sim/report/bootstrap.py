@@ -43,14 +43,21 @@ class Hits:
 
 
 Outcomes = Matches | Hits
-"""Of one class over a set, which its score is computed from."""
+"""What the score of one class over a set is computed from."""
 
 
 def match(
     predictions: Sequence[Mapping[str, Tensor]], images: LabelledImages, label: int, score: Score = "AP"
 ) -> Outcomes:
-    """What a ``score`` of one class is computed from. For AP by COCO's rules: an image's best detection first, each to
-    the free box it overlaps most.
+    """Return what the score of one class is computed from.
+
+    For AP by COCO's rules: an image's best detection first, each to the free box that it overlaps most.
+
+    Args:
+        predictions: of every image.
+        images: the images with their boxes.
+        label: of the class.
+        score: AP or accuracy.
     """
     if score == "accuracy":
         own = (images.labels == label).any(1).cpu().numpy().astype(int)
@@ -88,7 +95,7 @@ def _greedy(overlap: Float[np.ndarray, "detections boxes"]) -> Bool[np.ndarray, 
 
 
 def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None = None) -> float:
-    """The score of one class; ``weights`` say how often each image counts. nan without a box."""
+    """Return the score of one class; ``weights`` say how often each image counts. nan without a box."""
     if isinstance(outcomes, Matches):
         return average_precision(outcomes, weights)
     shown = outcomes.boxes_per_image * (1.0 if weights is None else weights)
@@ -97,7 +104,7 @@ def class_score(outcomes: Outcomes, weights: Float[np.ndarray, "images"] | None 
 
 
 def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | None = None) -> float:
-    """AP over the COCO overlaps with 101 recalls; ``weights`` say how often each image counts. nan without a box."""
+    """Return AP over COCO's overlaps with 101 recalls, nan without a box; ``weights``: how often each image counts."""
     weights = np.ones(len(matches.boxes_per_image)) if weights is None else weights
     boxes = float((weights * matches.boxes_per_image).sum())
     if boxes == 0.0:
@@ -117,7 +124,7 @@ def average_precision(matches: Matches, weights: Float[np.ndarray, "images"] | N
 def class_scores(
     matches: Sequence[Sequence[Sequence[Outcomes]]], draws: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "groups rows classes"], Float[np.ndarray, "draws groups rows classes"]]:
-    """Scores of ``matches`` [group][detector][class], as they are and under resampled test images.
+    """Return scores of ``matches`` [group][detector][class], as they are and under resampled test images.
 
     Detectors scored on as many images have the same ones resampled, so that differences between those that share a
     test set are paired.
@@ -138,7 +145,7 @@ def class_scores(
 
 
 def mean_of_known(scores: Float[np.ndarray, "*rows classes"]) -> Float[np.ndarray, "*rows"]:
-    """Over the classes with a value; nan where none has one."""
+    """Return the mean over the classes with a value; nan where none has one."""
     known = ~np.isnan(scores)
     counts = known.sum(-1)
     return np.where(counts, np.where(known, scores, 0.0).sum(-1) / np.maximum(counts, 1), np.nan)

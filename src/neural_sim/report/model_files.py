@@ -4,26 +4,43 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector
 from neural_sim.extras import require
+from neural_sim.report.tracking import Run
 
 _log = logging.getLogger(__name__)
 
 ONNX = "model.onnx"
 CHECKED = 50
 """Test images on which onnxruntime is compared with torch."""
+NAME = "detector"
+"""The name of the model in the run."""
+CODE = Path(__file__).parent / "pyfunc_model.py"
+REQUIRED = (
+    "torch",
+    "torchvision",
+    "lightning",
+    "safetensors",
+    "numpy",
+    "pandas",
+    "pillow",
+    "jaxtyping",
+    "mlflow",
+)
+"""What the model's code imports; the code of this package travels with it."""
 
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """What the report writes of the detector trained on the learned distribution, beside ``model.safetensors`` and
-    ``model.json``, which it always writes.
+    """What the report writes of the final detector besides ``model.safetensors`` and ``model.json``.
 
     Args:
         onnx: ``model.onnx``; wants the packages of the extra ``onnx``.
@@ -51,17 +68,57 @@ class ModelFiles:
             require("onnx", "model.onnx")
 
     def write(self, saved: SavedDetector, images: Float[Tensor, "n 3 h w"], folder: Path) -> Path:
-        """The files in ``folder``, whose ``model.safetensors`` is returned. ONNX is checked on ``images``."""
+        """Write the files to ``folder`` and return its ``model.safetensors``; ONNX is checked on ``images``."""
         path = saved.save(folder)
         if self.onnx:
             made = export(saved, folder / ONNX, self.nms)
             if (
                 not self.nms
-            ):  # detections are not comparable one by one: scores that are nearly equal change places
-                difference = largest_difference(saved, made, images[:CHECKED])
+            ):  # whose detections are not comparable one by one: nearly equal scores change places
+                shown = images[:CHECKED]
+                difference = largest_difference(saved, made, shown)
                 level = logging.INFO if difference <= TOLERANCE else logging.WARNING
-                count = len(images[:CHECKED])
-                _log.log(
-                    level, "%s: onnxruntime within %.1e of torch on %d test images", ONNX, difference, count
-                )
+                text = "%s: onnxruntime within %.1e of torch on %d test images"
+                _log.log(level, text, ONNX, difference, len(shown))
         return path
+
+
+def log_detector(
+    run: Run, folder: Path, example: UInt8[np.ndarray, "n h w 3"], registered_name: str | None = None
+) -> str:
+    """Write a detector to an open run as a pyfunc model.
+
+    The model takes RGB photographs of any one size and gives a table of detections, see
+    :class:`pyfunc_model.PhotographDetector`.
+
+    Args:
+        run: open in MLflow.
+        folder: holds ``model.safetensors`` and ``model.json``.
+        example: photographs to show how the model is called.
+        registered_name: under which a version of the model is registered; None: it is not.
+
+    Returns:
+        Its URI, ``models:/...``, for ``mlflow.pyfunc.load_model``.
+    """
+    with run.fluent() as mlflow:
+        from mlflow.models import Model, ModelSignature
+        from mlflow.types import ColSpec, Schema, TensorSpec
+
+        boxes = (ColSpec("double", name) for name in ("score", "x0", "y0", "x1", "y1"))
+        photographs = TensorSpec(np.dtype(np.uint8), (-1, -1, -1, 3))
+        logged = Model.log(
+            artifact_path=None,
+            name=NAME,
+            flavor=mlflow.pyfunc,
+            run_id=run.run_id,
+            registered_model_name=registered_name,
+            python_model=str(CODE),
+            artifacts={"weights": str(folder / WEIGHTS), "document": str(folder / DOCUMENT)},
+            code_paths=[str(Path(__file__).parents[1])],
+            signature=ModelSignature(
+                Schema([photographs]), Schema([ColSpec("long", "image"), ColSpec("string", "label"), *boxes])
+            ),
+            input_example=example,
+            pip_requirements=[f"{name}=={version(name)}" for name in REQUIRED],
+        )
+    return logged.model_uri

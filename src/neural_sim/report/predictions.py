@@ -1,11 +1,9 @@
-"""Predictions on photographs: pictures with boxes, and COCO's results."""
+"""Predictions on photographs: pictures with boxes, and a table of scores."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -23,8 +21,14 @@ def draw(
     above: float,
     truth: Tensor | None = None,
 ) -> Image.Image:
-    """A copy of an RGB photograph with the boxes of detections that score ``above`` that or more, the best on top, each
-    with its class and score; true boxes, (x0, y0, x1, y1) in pixels, are thin and white.
+    """Draw detections on a copy of an RGB photograph, the best on top, each with its class and score.
+
+    Args:
+        photo: the photograph.
+        found: its detections.
+        class_names: by label.
+        above: the least score that is drawn.
+        truth: true boxes, (x0, y0, x1, y1) in pixels, drawn thin and white.
     """
     drawn = photo.copy()
     pen, side = ImageDraw.Draw(drawn), max(photo.size)
@@ -58,32 +62,8 @@ def save_picture(picture: Image.Image, folder: Path, name: str) -> Path:
     return path
 
 
-def result_rows(
-    found: Mapping[str, Tensor], image_id: Any, category_ids: Mapping[int, Any]
-) -> list[dict[str, Any]]:
-    """COCO's result rows of one image, bbox as (x, y, width, height) in pixels. Nothing is rounded, so that the rows
-    score what the detections do. Classes without a category have no rows.
-    """
-    rows = zip(*(found[key].tolist() for key in ("boxes", "labels", "scores")), strict=True)
-    return [
-        {
-            "image_id": image_id,
-            "category_id": category_ids[label],
-            "bbox": [x0, y0, x1 - x0, y1 - y0],
-            "score": score,
-        }
-        for (x0, y0, x1, y1), label, score in rows
-        if label in category_ids
-    ]
-
-
-def scores_document(scores: TestScore, images: int) -> dict[str, Any]:
-    """The content of scores.json; classes without a true box are null."""
-    return {"images": images, **_known(dataclasses.asdict(scores))}
-
-
 def scores_table(scores: TestScore, images: int) -> str:
-    """The score by class in percent, as it is printed."""
+    """Return the score by class in percent, as it is printed."""
     if isinstance(scores, AveragePrecision):
         name, columns = "AP", {"AP": scores.per_class, "AP50": scores.per_class_ap50}
         means = [scores.ap, scores.ap50]
@@ -94,10 +74,3 @@ def scores_table(scores: TestScore, images: int) -> str:
     for of, row in rows.items():
         lines.append(f"{of[:27]:<28}" + "".join(f"{100 * value:>8.1f}" for value in row))
     return "\n".join(lines)
-
-
-def _known(tree: Any) -> Any:
-    """NaN as None, so that the file is JSON by the standard."""
-    if isinstance(tree, dict):
-        return {key: _known(value) for key, value in tree.items()}
-    return tree if tree == tree else None

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from mlflow.pyfunc import PythonModel  # pyright: ignore[reportPrivateImportUsage]
 from PIL import Image
+from typing_extensions import override
 
 from neural_sim.detector.photographs import detect
 from neural_sim.detector.saved import SavedDetector
@@ -18,13 +19,17 @@ COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")
 
 
 class PhotographDetector(PythonModel):
-    """RGB photographs of one size, uint8 [n, h, w, 3], to a table with a row a detection, image by image and the best
-    first: the image's number from 0, the class's name, the score, the box in the photograph's pixels.
+    """Turns RGB photographs of one size, uint8 [n, h, w, 3], into a table with a row a detection.
+
+    Rows are by image, the best first: the image's number from 0, the class's name, the score, the box in the
+    photograph's pixels.
     """
 
+    @override
     def load_context(self, context: Any) -> None:
         self.saved = SavedDetector.load(Path(context.artifacts["weights"]).parent)
 
+    @override
     def predict(self, context: Any, model_input: Any, params: Any = None) -> pd.DataFrame:
         pixels = np.asarray(model_input, dtype=np.uint8)
         if pixels.ndim != 4 or pixels.shape[-1] != 3:

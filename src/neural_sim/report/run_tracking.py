@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from neural_sim.detector.metrics import mean_of
 from neural_sim.report import tracking
-from neural_sim.report.pyfunc import log_detector
+from neural_sim.report.model_files import log_detector
 from neural_sim.report.run import RunResults
 
 _COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "products", "cpu_seconds")
@@ -60,7 +60,7 @@ class LiveRun:
     def detector(
         self, folder: Path, example: UInt8[np.ndarray, "n h w 3"], registered_name: str | None = None
     ) -> str:
-        """Write the run's detector as a model, see :func:`pyfunc.log_detector`."""
+        """Write the run's detector as a model, see :func:`model_files.log_detector`."""
         return log_detector(self._run, folder, example, registered_name)
 
     def finish(self, results: RunResults, folder: Path) -> None:
@@ -81,7 +81,7 @@ def live_run(
     biased: Sequence[str],
     begun: float | None = None,
 ) -> Iterator[LiveRun]:
-    """A run with the configuration as its parameters, RUNNING inside, see :func:`tracking.opened`."""
+    """Open a run with the configuration as its parameters, see :func:`tracking.opened`."""
     seed, gap = config["seed"], config.get("gap", "disjoint")
     name = f"{method} seed {seed}" + ("" if gap == "disjoint" else f" gap {gap}")
     tags = {
@@ -96,7 +96,7 @@ def live_run(
 
 
 def _key(results: RunResults) -> str:
-    """The score's name in metrics."""
+    """Return the score's name in metrics."""
     return results.score.lower()
 
 
@@ -143,8 +143,9 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
 
 
 def _curve(results: RunResults) -> dict[str, dict[int, float]]:
-    """The score of all objects and of the biased ones by what was spent; the step is that, so that runs chart side by
-    side.
+    """Return the score of all objects and of the biased ones by what was spent.
+
+    That is the step, so that runs chart side by side.
     """
     series: dict[str, dict[int, float]] = {}
     for point in results.curve:

@@ -233,7 +233,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _allowed(name: str) -> str:
-    """A name of MLflow's characters: those of an object need not be."""
+    """Replace characters that MLflow does not take, which an object's name may have."""
     return re.sub(r"[^/\w.\- :]", "_", name)
 
 

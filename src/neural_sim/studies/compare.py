@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any
+
+from annotated_types import Ge, MinLen
 
 from neural_sim.detector.metrics import IN_FULL
 from neural_sim.documents import markdown_table
+from neural_sim.ranges import validated
 from neural_sim.report import figures, tracking
 from neural_sim.report.comparison import ONLY_AT_END, Clock, Comparison, biased_ap, compare
 from neural_sim.report.costs import HEAD, NOTE, Costs, cells, costs, costs_table
@@ -24,6 +27,7 @@ from neural_sim.tasks.context import Context, Task
 UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of processor time"}
 
 
+@validated
 @dataclass(frozen=True)
 class Compare(Task):
     """Compare finished runs of MLflow experiments, each experiment by itself and at each gap.
@@ -34,24 +38,13 @@ class Compare(Task):
         draws: of the bootstrap over test images.
         clock: ``seconds`` on the wall, or ``cpu_seconds``, those of all cores together, for runs that shared a machine.
         methods: these; null: all that have runs. Seeds are those that all of them have.
-
-    Raises:
-        ValueError: no experiment, fewer than two draws, or another clock.
     """
 
-    experiments: tuple[str, ...]
+    experiments: Annotated[tuple[str, ...], MinLen(1)]
     reference: str = "neural_sim"
-    draws: int = 300
+    draws: Annotated[int, Ge(2)] = 300
     clock: Clock = "seconds"
     methods: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if not self.experiments or self.draws < 2:
-            raise ValueError(
-                f"compare: want experiments and at least 2 draws, got {list(self.experiments)}, {self.draws}"
-            )
-        if self.clock not in get_args(Clock):
-            raise ValueError(f"compare.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
     def run(self, context: Context) -> None:
         """Write compare.md, compare.json, the figures and report.html to the run's folder, and a run to MLflow.

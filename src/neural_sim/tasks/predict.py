@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,8 @@ from neural_sim.detector.photographs import detect
 from neural_sim.detector.saved import DOCUMENT, SavedDetector
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
-from neural_sim.report.predictions import draw, result_rows, save_picture, scores_document, scores_table
+from neural_sim.report.coco import result_rows
+from neural_sim.report.predictions import draw, save_picture, scores_table
 from neural_sim.target.photographs import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
 from neural_sim.tasks.context import Context, Task
@@ -87,7 +89,8 @@ class PredictTask(Task):
                 [found for found, _ in scored], without_pixels([t for _, t in scored]), saved.class_names,
                 saved.detector.score,
             )  # fmt: skip
-            write_json(folder / "scores.json", scores_document(ap, len(scored)), indent=None)
+            document = {"images": len(scored), **dataclasses.asdict(ap)}
+            write_json(folder / "scores.json", document, indent=None)
             print(scores_table(ap, len(scored)))
         print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
 

@@ -14,9 +14,8 @@ from neural_sim.documents import write_json
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.foreseen import foresee
 from neural_sim.outer.labelled import labelled_gains
-from neural_sim.report.page.preflight_page import write_preflight_page
+from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
-from neural_sim.report.preflight import Preflight
 from neural_sim.stages.stage import Stage
 from neural_sim.target.mismatch import distance_factor, matching_settings, mismatches
 from neural_sim.tasks.context import Context, Task

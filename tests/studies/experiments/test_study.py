@@ -176,7 +176,7 @@ def test_seconds_that_differ_are_a_median_and_a_range():
     ("arguments", "message"),
     [
         ({"only": ["none"]}, r"experiments.only: no row \['none'\], want some of gaps"),
-        ({"draws": 1}, "experiments.draws"),
+        ({"draws": 1}, "draws: want at least 2, got 1"),
         (
             {"paper": {"claims": {}, "tables": {"one": TABLE}}},
             r"gap_levels: the paper's numbers have no \['gains'\]",

@@ -63,9 +63,10 @@ def detected(
 
 
 def right(detections: Mapping[str, Tensor], boxes: Tensor, labels: Tensor, score: Score = "AP") -> bool:
-    """Whether an image's best detections, as many as it has objects, are these objects: each of the right class, with
-    an overlap of ``OVERLAP``, or for accuracy of the right class alone. Without objects, whether nothing scores
-    ``SHOWN``.
+    """Return whether an image's best detections, as many as it has objects, are these objects.
+
+    Each has the right class and an overlap of ``OVERLAP``; for accuracy the right class alone. An image without objects
+    is right where nothing scores ``SHOWN``.
     """
     best = _best(detections, len(boxes))
     if not len(boxes):

@@ -16,10 +16,14 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class BinScore:
-    """AP or accuracy (a fraction) of an object on the images that show it from one bin (from 1), by detector, the one
-    in question last.
+    """Scores of an object on the images that show it from one bin.
 
-    ``fraction`` is the part of the object's images that are from this bin.
+    Args:
+        name: of the object.
+        bin: from 1.
+        images: their number.
+        fraction: the part of the object's images that are from this bin.
+        ap: AP or accuracy (a fraction) by detector, the one in question last.
     """
 
     name: str
@@ -51,8 +55,14 @@ def bin_scores(
     at_least: int = 5,
     score: Score = "AP",
 ) -> list[BinScore]:
-    """Every object's bins with ``at_least`` images or more, by the detections of each detector. Images of unknown bins
-    are left out.
+    """Score every object's bins that have images enough; images of unknown bins are left out.
+
+    Args:
+        names: of the objects.
+        detections: of each detector.
+        test: the test images.
+        at_least: images of a bin.
+        score: AP or accuracy.
     """
     scores = []
     for label, name in enumerate(names):
@@ -70,12 +80,12 @@ def bin_scores(
 
 
 def weakest(scores: Sequence[BinScore], count: int = 3) -> list[BinScore]:
-    """The bins that take most from their objects' AP, the worst first."""
+    """Return the bins that take most from their objects' AP, the worst first."""
     return sorted(scores, key=lambda score: -score.missing)[:count]
 
 
 def by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
-    """The bins of each object."""
+    """Group the bins by object."""
     grouped: dict[str, list[BinScore]] = {}
     for score in scores:
         grouped.setdefault(score.name, []).append(score)
@@ -83,7 +93,7 @@ def by_object(scores: Sequence[BinScore]) -> dict[str, list[BinScore]]:
 
 
 def _bins_shown(test: LabelledImages, label: int) -> Bool[Tensor, "images bins"]:
-    """Which images show an object from which bin."""
+    """Return which images show an object from which bin."""
     own = test.labels == label
     bins = test.bins if test.bins.ndim == 2 else test.bins[:, None].expand_as(test.labels)
     known = own & (bins >= 0)

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge
 
 from neural_sim.configuration import conf_directory
 from neural_sim.documents import markdown_table, write_json
+from neural_sim.ranges import validated
 from neural_sim.report import figures
 from neural_sim.report.costs import costs_table
 from neural_sim.report.runs import LeftOut
@@ -85,6 +88,7 @@ class Row:
         return self.command or f"python -m src.main +experiment={self.experiment}"
 
 
+@validated
 @dataclass(frozen=True)
 class Experiments(Task):
     """Write the page of experiments; ``+experiment=experiments_table``.
@@ -98,7 +102,7 @@ class Experiments(Task):
         draws: of the bootstrap over test images.
 
     Raises:
-        ValueError: an unknown row, claim or table, or fewer than two draws.
+        ValueError: an unknown row, claim or table.
     """
 
     rows: Mapping[str, Mapping[str, Any]]
@@ -106,14 +110,12 @@ class Experiments(Task):
     only: Sequence[str] | None = None
     page: str | None = None
     reference: str = "neural_sim"
-    draws: int = 300
+    draws: Annotated[int, Ge(2)] = 300
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.only or ()) - set(self.rows))
         if unknown:
             raise ValueError(f"experiments.only: no row {unknown}, want some of {', '.join(self.rows)}")
-        if self.draws < 2:
-            raise ValueError(f"experiments.draws must be at least 2, got {self.draws}")
         for row in (Row(**arguments) for arguments in self.rows.values()):
             missing = [c for c in row.claims if c not in self.paper["claims"]]
             missing += [t for t in (row.table,) if t is not None and t not in self.paper["tables"]]

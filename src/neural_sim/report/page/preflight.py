@@ -1,25 +1,42 @@
-"""What is known before an optimisation, and whether it is worth it."""
+"""What is known before an optimisation and whether it is worth it; preflight.html."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+
+import torch
 
 from neural_sim.detector.protocol import Score
 from neural_sim.outer.foreseen import Foreseen
 from neural_sim.outer.labelled import Labelled, equivalent
+from neural_sim.report.page import pictures, render
 from neural_sim.report.page.verdict import listed
-from neural_sim.report.page.weak_bins import BinScore, weakest
+from neural_sim.report.page.weak_bins import BinScore, by_object, weakest
 from neural_sim.target.mismatch import Mismatch
+from neural_sim.types import LabelledImages
+
+FILE = "preflight.html"
+SHOWN = 18
+"""Images of either side."""
 
 
 @dataclass(frozen=True)
 class Preflight:
-    """``foreseen``: gains of every object and factor, of which those count that are significant at ``level`` over all
-    of them. ``bins``: the ``score`` of the initial distribution's detector by bin of the validation images.
-    ``settings`` would match ``mismatches``, and camera distances times ``distance_factor`` the sizes of boxes (None:
-    they agree). ``labelled``: what numbers of labelled photographs in training are worth; empty where none are for
-    training.
+    """What is known before an optimisation.
+
+    Args:
+        experiment: its name.
+        names: of the objects.
+        foreseen: expected gains of every object and factor.
+        level: of significance, over all of them, from which they count.
+        bins: the score of the initial distribution's detector by bin of the validation images.
+        mismatches: statistics of renders and of the target.
+        settings: what would match them.
+        distance_factor: camera distances times this would match the sizes of boxes; None: they agree.
+        labelled: what numbers of labelled photographs in training are worth; empty where none are for training.
+        score: what detectors are scored by.
     """
 
     experiment: str
@@ -46,7 +63,7 @@ class Preflight:
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Whether an optimisation is worth it, in one sentence."""
         if not self.promising:
             return (
                 "Not worth optimising as it is configured: no object's derivative can be told from zero, so the loop "
@@ -84,7 +101,7 @@ class Preflight:
         return f"A first step is worth {equal} of them. {sentence}"
 
     def summary(self) -> str:
-        """What is printed."""
+        """Return what is printed."""
         lines = [
             self.verdict,
             self.worth,
@@ -108,7 +125,7 @@ class Preflight:
 
     @property
     def differing(self) -> list[Mismatch]:
-        """The statistics that differ."""
+        """The statistics that differ by much."""
         return [m for m in self.mismatches if m.counts]
 
     @property
@@ -119,3 +136,26 @@ class Preflight:
             keys = "unlearned.distance, or parameter=[zoom] to learn it"
             lines.append(f"camera distances times {self.distance_factor:.2f} ({keys})")
         return lines
+
+
+def write_preflight_page(
+    report: Preflight, target: LabelledImages, synthesised: LabelledImages, folder: Path
+) -> Path:
+    """Write preflight.html; images of both sets, spread over them, are side by side."""
+    sides = {
+        called: pictures.labelled(
+            images, torch.linspace(0, len(images) - 1, min(SHOWN, len(images))).long().tolist(), report.names
+        )
+        for called, images in (
+            ("The target's validation images", target),
+            ("Synthesised images", synthesised),
+        )
+    }
+    largest = max((abs(gain) for f in report.foreseen for gain in f.by_bin), default=0.0) or 1.0
+    path = folder / FILE
+    text = render.page(
+        "preflight.html", title=f"{report.experiment}: preflight", report=report, sides=sides, largest=largest,
+        bins=by_object(report.bins), weak=weakest(report.bins), promising=report.promising,
+    )  # fmt: skip
+    path.write_text(text, encoding="utf-8")
+    return path

@@ -7,9 +7,8 @@ import torch
 
 from neural_sim.outer.foreseen import Foreseen
 from neural_sim.outer.labelled import Labelled
-from neural_sim.report.page.preflight_page import write_preflight_page
+from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import BinScore
-from neural_sim.report.preflight import Preflight
 from neural_sim.target.mismatch import Mismatch
 from neural_sim.types import LabelledImages
 

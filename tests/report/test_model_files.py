@@ -11,7 +11,7 @@ from PIL import Image
 
 from neural_sim.detector.photographs import detect
 from neural_sim.detector.saved import SavedDetector
-from neural_sim.report.pyfunc import log_detector
+from neural_sim.report.model_files import log_detector
 from neural_sim.report.tracking import opened
 
 
