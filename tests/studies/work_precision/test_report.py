@@ -11,9 +11,9 @@ from neural_sim.studies.work_precision.report import (
     document,
     figure,
     markdown,
+    publish,
     slug,
-    track,
-    write,
+    text_of,
     write_docs,
 )
 from neural_sim.studies.work_precision.series import Order, Point, Series
@@ -37,7 +37,7 @@ SERIES = (
 
 
 def test_the_document_has_a_row_a_setting_and_what_beats_a_default():
-    held = document(SERIES, MACHINE, ["a note"])
+    held = document(SERIES, MACHINE)
     assert json.loads(json.dumps(held, allow_nan=False)) == held
     rows = {row["setting"]: row for row in held["series"] if row["name"] == "renderer/opacity"}
     wanted = {"name", "setting", "error", "error_kind", "seconds", "memory_mb", "default", "pareto"}
@@ -55,7 +55,7 @@ def test_the_document_has_a_row_a_setting_and_what_beats_a_default():
 
 
 def test_the_tables_are_written_from_the_json_alone():
-    held = json.loads(json.dumps(document(SERIES, MACHINE, [])))
+    held = json.loads(json.dumps(document(SERIES, MACHINE)))
     text = markdown(held, "renderer")
     assert (
         "| **final** (default) | 0.01 | 4 | 3 |  |  |" in text
@@ -72,40 +72,34 @@ def test_the_tables_are_written_from_the_json_alone():
 )
 def test_how_much_better_a_setting_is_than_the_default(error, words):
     two = (Point("default", 1.0, 4.0, None, True, "a"), Point("clever", error, 2.0, None, False, "a"))
-    held = document([Series("field/can", "error", two, ())], MACHINE, [])
+    held = document([Series("field/can", "error", two, ())], MACHINE)
     assert f"clever has {words} and takes 0.50 of the time." in markdown(held, "field")
 
 
-def test_files_and_figures(tmp_path):
-    text = write(SERIES, document(SERIES, MACHINE, ["a note"]), tmp_path)
-    assert (tmp_path / "work_precision.md").read_text() == text + "\n" and text.endswith("a note")
-    names = {path.stem for path in (tmp_path / "figures").glob("*.png")}
+def test_files_figures_and_metrics(context):
+    held = document(SERIES, MACHINE)
+    run = publish(context, SERIES, held)
+    assert (context.folder / "work_precision.md").read_text() == text_of(held) + "\n"
+    assert json.loads((context.folder / "work_precision.json").read_text()) == held
+    names = {path.stem for path in (context.folder / "figures").glob("*.png")}
     assert names == {slug(series.name) for series in SERIES} == {"renderer_opacity", "field_grid"}
-    assert image.imread(tmp_path / "figures" / "renderer_opacity.png").std() > 0.01
+    assert image.imread(context.folder / "figures" / "renderer_opacity.png").std() > 0.01
     axes = figure(SERIES[0]).axes[0]
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert [t.get_text() for t in axes.get_legend().get_texts()] == ["quality", "other"]
+    metrics = MlflowClient(context.uri).get_run(run.run_id).data.metrics
+    assert metrics["renderer_opacity/default_error"] == 0.01
+    assert metrics["renderer_opacity/defaults_not_optimal"] == 1.0
+    assert metrics["renderer_opacity/order_quality"] == 1.98
 
 
 def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
     page = tmp_path / "numerics.md"
     page.write_text("kept\n")
-    held = document(SERIES, MACHINE, [])
+    held = document(SERIES, MACHINE)
     for _ in range(2):  # the second replaces the first
         write_docs(held, page, "python -m src.main +experiment=work_precision")
     text = page.read_text()
     assert text.startswith("kept\n") and text.count("## Error against run time: renderer\n") == 1
     assert text.count("## Error against run time: field\n") == 1
     assert "    python -m src.main +experiment=work_precision\n" in text
-
-
-@pytest.mark.slow  # a new MLflow store takes ten seconds
-def test_a_run_is_logged(tmp_path, uri):
-    config = {"name": "work_precision", "seed": 2, "work_precision": {"repeats": 3}}
-    (tmp_path / "run").mkdir()  # not the folder that holds the store
-    run = track(SERIES, config, uri, tmp_path / "run", begun=5.0)
-    logged = MlflowClient(uri).get_run(run.run_id)
-    assert logged.info.start_time == 5000 and logged.data.params["work_precision.repeats"] == "3"
-    assert logged.data.metrics["renderer_opacity/default_error"] == 0.01
-    assert logged.data.metrics["renderer_opacity/defaults_not_optimal"] == 1.0
-    assert logged.data.metrics["renderer_opacity/order_quality"] == 1.98

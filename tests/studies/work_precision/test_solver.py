@@ -14,7 +14,7 @@ from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.studies.work_precision import solver as family
 from neural_sim.studies.work_precision.series import Timing
-from neural_sim.studies.work_precision.solver import Oracle, Solver, product_problem, relative
+from neural_sim.studies.work_precision.solver import Inverse, Oracle, Solver, product_problem, relative
 
 SOLVERS = {
     "cg": AdjointSolver(), "minres": AdjointSolver(MinimumResidual()), "identity": AdjointSolver(Identity()),
@@ -60,9 +60,8 @@ def test_the_oracle_is_the_dense_solve():
 @pytest.fixture(scope="module")
 def inverse():
     problem = Quadratic()
-    measured = Solver(SOLVERS, steps=(4, 25), rtols=(1e-9,), conditions=())._inverse(
-        problem.inner, problem.validation, Timing(1), 0
-    )
+    solvers = Solver(SOLVERS, steps=(4, 25), rtols=(1e-9,), conditions=())
+    measured = solvers._inverse(Inverse.of(problem.inner, problem.validation, Timing(1), 0))
     return {series.name: series for series in measured}
 
 

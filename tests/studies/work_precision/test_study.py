@@ -13,8 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.studies.work_precision import study as stage
-from neural_sim.studies.work_precision.study import FAMILIES, WorkPrecisionStep
+from neural_sim.studies.work_precision.study import COMMAND, FAMILIES, WorkPrecision
 from neural_sim.tasks.walk import walk
 
 ROOT = Path(__file__).parents[3]
@@ -32,11 +31,15 @@ def test_the_experiment_has_every_family_and_the_stages_that_they_need():
     graph = context.graph
 
     def read(*families):
-        return {*WorkPrecisionStep(families=families).reads(context)}
+        return keys(WorkPrecision(families=families).reads(context))
+
+    def keys(stages):
+        return {stage.key for stage in stages}
 
     assert not read("quadrature", "solver")
-    assert read("renderer", "derivative") == {*graph.fields} and read("field") == {*graph.views}
-    assert read(*FAMILIES) == {*graph.fields, *graph.views, graph.warm_start, graph.targets, graph.learned}
+    assert read("renderer", "derivative") == keys(graph.fields) and read("field") == keys(graph.views)
+    each = [*graph.fields, *graph.views, graph.warm_start, graph.targets, graph.learned]
+    assert read(*FAMILIES) == keys(each)
 
 
 def test_the_parts_are_those_of_the_configuration(tmp_path):
@@ -63,22 +66,19 @@ def test_bad_settings_name_their_key(override, message, tmp_path):
         context_of(composed(override), tmp_path)
 
 
-def test_one_family_leaves_its_files_and_its_section_of_a_page(tmp_path, monkeypatch):
-    class Nowhere:
-        where = "not logged"
-
-    monkeypatch.setattr(stage, "track", lambda *arguments: Nowhere())
+def test_one_family_leaves_its_files_and_its_section_of_a_page(tmp_path, context):
     page = tmp_path / "page.md"
     config = composed(
         "scale=smoke", "work_precision.families=[quadrature]", f"work_precision.docs={page}",
         "work_precision.quadrature.samples=[8,16,32]", "work_precision.quadrature.rays=8",
+        f"paths.mlflow={context.config['paths']['mlflow']}",
     )  # fmt: skip
-    walk(*context_of(config, tmp_path / "run"))
-    held = json.loads((tmp_path / "run" / "work_precision.json").read_text())
+    walk(*context_of(config, context.folder))
+    held = json.loads((context.folder / "work_precision.json").read_text())
     assert {row["name"].split("/")[0] for row in held["series"]} == {"quadrature"}
     assert all(math.isfinite(row["error"]) for row in held["series"])
     assert "## Error against run time: quadrature" in page.read_text()
-    assert stage.COMMAND in page.read_text()
+    assert COMMAND in page.read_text()
 
 
 @pytest.mark.slow

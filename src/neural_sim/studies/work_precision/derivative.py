@@ -21,7 +21,7 @@ from neural_sim.field.rendering import render_samples
 from neural_sim.gradient.pathwise import contract
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 from neural_sim.synthesis.motion import RIGID, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
@@ -42,14 +42,15 @@ class Case:
     cotangent: Maps
 
     def double(self) -> Case:
-        """The same in float64."""
+        """Return the same in float64."""
         maps = Maps(self.cotangent.rgb.double(), self.cotangent.opacity.double())
         field = copy.deepcopy(self.field).double()
         return replace(self, field=field, pose=self.pose.double(), rates=self.rates.double(), cotangent=maps)
 
     def rays(self, moved: Float[Tensor, "m"], pixels: Tensor) -> Rays:
-        """Rays of ``pixels`` where the camera has moved by these numbers. Most of the moved matrices are no rotations;
-        directions stay of unit length.
+        """Return rays of ``pixels`` where the camera has moved by these numbers.
+
+        Most of the moved matrices are no rotations; directions stay of unit length.
         """
         pose = self.pose + torch.einsum("m,mnij->nij", moved, self.rates)
         rays = cameras.pixel_rays(self.camera, pose, pixels)
@@ -57,7 +58,7 @@ class Case:
 
 
 def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) -> Case:
-    """The first three numbers are phi, rho and distance, the others random directions of the pose's twelve entries."""
+    """Make an image by phi, rho and distance, then by random directions of the pose's twelve entries."""
     generator, device = torch.Generator().manual_seed(0), next(field.parameters()).device
     camera = PinholeCamera(size, size, math.radians(40.0))
     draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, dtype=torch.long))
@@ -71,7 +72,7 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
 
 
 def forward(of: Case) -> Float[Tensor, "m"]:
-    """By forward mode, in the pass that renders."""
+    """Differentiate by forward mode, in the pass that renders."""
     moved = of.renderer.render_with_tangents(of.field, of.camera, of.pose, of.rates)[1]
     return torch.cat(
         list(contract({str(i): tangent for i, tangent in enumerate(moved)}, of.cotangent).values())
@@ -79,8 +80,9 @@ def forward(of: Case) -> Float[Tensor, "m"]:
 
 
 def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
-    """By reverse mode, ``patch`` rays at a time, after a pass that renders (``gradient.pathwise.draw_cotangents``, for
-    a camera that moves linearly in any number of numbers).
+    """Differentiate by reverse mode, ``patch`` rays at a time, after a pass that renders.
+
+    As ``gradient.pathwise.draw_cotangents``, for a camera that moves linearly in any number of numbers.
     """
     of.renderer.render(of.field, of.camera, of.pose)
     rgb, opacity = of.cotangent.rgb.reshape(-1, 3), of.cotangent.opacity.reshape(-1)
@@ -97,7 +99,7 @@ def reverse(of: Case, patch: int) -> Float[Tensor, "m"]:
 
 @torch.no_grad()
 def difference(of: Case, step: float, same: bool) -> Float[Tensor, "m"]:
-    """By central differences of renders of all rays, two for each number.
+    """Differentiate by central differences of renders of all rays, two for each number.
 
     ``same``: at the samples of the unmoved camera, as the derivatives have it. Otherwise each render chooses its own,
     so that samples behind the termination come and go, in jumps that no small step removes.
@@ -147,7 +149,7 @@ class Derivative:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Errors relative to the norm of the whole image's reverse mode in float64, of the first object."""
+        """Measure errors relative to the norm of the whole image's reverse mode in float64, of the first object."""
         del seed  # the camera and the cotangent are the same for all seeds
         for count in self.numbers:
             of = case(world.fields[0], world.renderer, self.size, count)
@@ -172,7 +174,7 @@ class Derivative:
             )
 
     def ways(self, of: Case, precise: Case) -> Iterator[tuple[str, str, Case, Way]]:
-        """Setting, line, the problem in its type, and how it is differentiated."""
+        """Yield setting, line, the problem in its type, and how it is differentiated."""
         yield "forward", "forward", of, forward
         chunks = replace(of, renderer=NerfRenderer(of.renderer.quality, rays_per_chunk=512))
         yield "forward, chunks of 512 rays", "forward", chunks, forward

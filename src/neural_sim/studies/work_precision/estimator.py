@@ -22,7 +22,7 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.update import shrinkage
 from neural_sim.studies.frozen import FrozenLoop, centred
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 from neural_sim.types import SceneDraw
 
 Estimates = Float[Tensor, "repeats objects k"]
@@ -36,7 +36,7 @@ class Variant:
     bin_mean: str = "circular"
 
     def of(self, loop: FrozenLoop) -> FrozenLoop:
-        """The same state with these settings."""
+        """Return the same state with these settings."""
         return loop.with_factor(dataclasses.replace(loop.bins, bin_mean=self.bin_mean))
 
 
@@ -98,7 +98,7 @@ class Estimators:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """At the initial psi of the run's loop and the v that its solver gives; means over repeats and objects."""
+        """Measure at the initial psi of the run's loop and its solver's v; means over repeats and objects."""
         loop = world.loop
         random = torch.Generator().manual_seed(1_000 * seed + 21)
         hard = loop.truth(self.truth_per_bin, random)
@@ -126,14 +126,15 @@ class Estimators:
 
     @staticmethod
     def _spread(errors: Float[Tensor, "repeats objects"]) -> str:
-        """The standard deviation over repeats, pooled over objects."""
+        """Return the standard deviation over repeats, pooled over objects."""
         if len(errors) < 2:
             return "1 repeat"
         return f"± {float(errors.var(0).mean().sqrt()):.2g} over {len(errors)} repeats"
 
     def _pathwise(self, loop: FrozenLoop, name: str, timing: Timing, seed: int) -> Result:
-        """Equal seeds: variants that draw alike see the same images. Images are independent, so that estimates from
-        more of them are means of those from the fewest.
+        """Estimate by equal seeds, so that variants that draw alike see the same images.
+
+        Images are independent, so that estimates from more of them are means of those from the fewest.
         """
         variant, unit = PATHWISE[name], self.images[0]
         # Reverse mode's numbers are those of the row "linear", but for rounding: one repeat shows its seconds.
@@ -151,7 +152,7 @@ class Estimators:
         return result
 
     def _stratified(self, loop: FrozenLoop, timing: Timing, seed: int) -> dict[str, Result]:
-        """Disjoint parts of a pool of every bin; as it is, and shrunk by its noise as the psi update does it."""
+        """Estimate from disjoint parts of a pool of every bin; as it is, and shrunk as the psi update does it."""
         bins = loop.scene.distribution.size
         counts = sorted({*self.images, self.default})
         pool = self.repeats * max(2, counts[-1] // bins)
@@ -181,7 +182,7 @@ class Estimators:
         return {"stratified": plain, "stratified, shrunk": shrunk}
 
     def _reinforce(self, loop: FrozenLoop, timing: Timing, seed: int) -> Result:
-        """Disjoint parts of hard draws of every object."""
+        """Estimate from disjoint parts of hard draws of every object."""
         pool = self.repeats * self.images[-1]
         begun = timing.now()
         rendered = loop.scene.training_set(loop.psi, pool, torch.Generator().manual_seed(seed + 41))
@@ -205,7 +206,7 @@ class Estimators:
 def score(
     loop: FrozenLoop, estimator: Estimator, cached: CachedSet, drawn: Probes, label: int
 ) -> MixedDerivative:
-    """The estimate from the scores of some of the cached images, whose pixels it does not need."""
+    """Estimate from the scores of some of the cached images, whose pixels it does not need."""
     count = len(drawn.index)
     still = torch.zeros(count)
     images = ObjectImages(
@@ -221,17 +222,17 @@ def _unavailable(*_: object) -> Tensor:
 
 
 def cosine(a: Tensor, b: Tensor) -> Tensor:
-    """Along the last axis; 0 where an estimate is nothing at all."""
+    """Return the cosine along the last axis; 0 where an estimate is nothing at all."""
     return torch.nn.functional.cosine_similarity(a, b, dim=-1, eps=1e-30)
 
 
 def relative_error(a: Tensor, b: Tensor) -> Tensor:
-    """|a - b| / |b| along the last axis."""
+    """Return |a - b| / |b| along the last axis."""
     return (a - b).norm(dim=-1) / b.norm(dim=-1)
 
 
 def ceilings(value: Float[Tensor, "objects k"], standard_error: Float[Tensor, "objects k"]) -> list[float]:
-    """Cosine that the exact vector would be expected to have with each estimate of it."""
+    """Return the cosine that the exact vector would be expected to have with each estimate of it."""
     noise = standard_error.square().sum(-1)
     signal = (value.square().sum(-1) - noise).clamp_min(0.0)
     return (signal / (signal + noise).clamp_min(1e-30)).sqrt().tolist()

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 
 SCHEDULES = ("refine_steps", "prune_steps")
 """Arguments of a fitting that are steps of it, and move with their number."""
 
 
 def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
-    """The recipe with ``part`` times its steps, those at which its structure changes in proportion."""
+    """Return the recipe with ``part`` times its steps, those at which its structure changes in proportion."""
     fitting = recipe.fitting
     if isinstance(fitting, functools.partial):
         moved = {
@@ -54,7 +54,7 @@ class Fields:
             raise ValueError(f"work_precision.field.parts: want numbers above 0, got {dict(self.parts)}")
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Of the run's first object; seconds on the wall, of the training without the renders that score it."""
+        """Fit the run's first object; seconds on the wall, of the training without the renders that score it."""
         del timing, seed  # a fit notes its own time, and its recipe has its own seed
         views, points = world.views, []
         for name, recipe in self.recipes.items():

@@ -23,7 +23,7 @@ from neural_sim.outer.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 
 Slopes = Float[Tensor, "objects K"]
 DEFAULT = "unrolled, as configured"
@@ -39,7 +39,7 @@ class Way:
 
 
 def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
-    """Every adjoint by name, as changes of the loop's own settings."""
+    """Return every adjoint by name, as changes of the loop's own settings."""
 
     def unrolled(line: str, **changed: object) -> Way:
         how = replace(outer.unrolled, **changed)  # pyright: ignore[reportArgumentType]
@@ -115,7 +115,7 @@ class Hypergradients:
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
-    """The rise of an object's score by the part of its images that moves to each bin, by a derivative; its seconds.
+    """Return the rise of objects' scores by the part of their images that moves to each bin; the derivative's seconds.
 
     Images, training and probes are the same for all ways: the loop's common random numbers, and its generator anew.
     """
@@ -132,7 +132,7 @@ def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
 
 
 def correlation(found: Slopes, truth: Slopes) -> float:
-    """Over each object's bins, mean over objects; 0 for an object where either vanishes."""
+    """Return the correlation over each object's bins, mean over objects; 0 for an object where either vanishes."""
     each = [centred_cosine(a, b) for a, b in zip(found, truth, strict=True)]
     return fmean(0.0 if math.isnan(value) else value for value in each)
 

@@ -11,7 +11,7 @@ from typing import Any
 from neural_sim.report import tracking
 from neural_sim.report.runs import Runs, select
 from neural_sim.studies.work_precision.series import Clock, Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 
 Results = Mapping[str, Any]
 COMMAND = "python -m src.main -m +experiment={experiment} baseline=neural_sim,auto_sim,lts seed=0,1"
@@ -30,7 +30,7 @@ class Loops:
     reference: str = "neural_sim"
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """This run's own method on its objects, and every group of comparable finished runs."""
+        """Read this run's own method on its objects, and every group of comparable finished runs."""
         del seed
         groups = []
         if self.experiment in tracking.experiments(world.uri):
@@ -48,7 +48,7 @@ class Loops:
 def series(
     label: str, runs: Sequence[Results], reference: str, clock: Clock, more: str = ""
 ) -> Iterator[Series]:
-    """AP of the biased classes, validation loss by objective and distance to the target, means over seeds."""
+    """Yield AP of the biased classes, validation loss by objective and distance to the target, means over seeds."""
     methods = {run["method"]: [r for r in runs if r["method"] == run["method"]] for run in runs}
     seeds = sorted({run["seed"] for run in runs})
     note = f"{', '.join(runs[0]['biased'])}; seeds {', '.join(map(str, seeds))}; the warm start is included.{more}"
@@ -93,19 +93,19 @@ def series(
 
 
 def biased_ap(point: Mapping[str, Any], run: Results) -> float:
-    """Mean AP of the biased classes at a point of a run's curve; a class that the test set lacks has none."""
+    """Return the mean AP of the biased classes at a point of a run's curve, without those that the test set lacks."""
     known = [point["ap"]["per_class"].get(name) for name in run["biased"]]
     return fmean(value for value in known if value is not None)
 
 
 def distance(run: Results) -> float:
-    """Total variation of the learned distribution from the target's, mean over biased objects and factors."""
+    """Return the learned distribution's total variation to the target's, mean over biased objects and factors."""
     away = run["total_variation"]
     return fmean(factor["learned"] for name in run["biased"] for factor in away[name].values())
 
 
 def seconds_to_half(run: Results, clock: Clock) -> float:
-    """Seconds at the first scored point with half of the gap from ns to matched won back; infinite if none has."""
+    """Return seconds at the first scored point with half of the gap from ns to matched won back, or infinity."""
     ns, matched = (biased_ap({"ap": run["ap"][which]}, run) for which in ("ns", "matched"))
     wanted = 0.5 * (ns + matched)
     reached = [point[clock] for point in run["curve"] if biased_ap(point, run) >= wanted]
@@ -113,7 +113,7 @@ def seconds_to_half(run: Results, clock: Clock) -> float:
 
 
 def half(runs: Sequence[Results], clock: Clock) -> str:
-    """When half of the gap was won back: mean over the seeds that did, and how many."""
+    """Say when half of the gap was won back: mean over the seeds that did, and how many."""
     reached = [spent for run in runs if math.isfinite(spent := seconds_to_half(run, clock))]
     if not reached:
         return f"half the gap: never in {len(runs)}"

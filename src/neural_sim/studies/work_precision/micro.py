@@ -30,7 +30,7 @@ SIZE = 32
 
 
 def small_scene() -> Scene:
-    """Two textured blocks before clutter, 32 px."""
+    """Make two textured blocks before clutter, 32 px."""
 
     def block(seed: int) -> GridField:
         field = GridField().eval()
@@ -47,9 +47,10 @@ def small_scene() -> Scene:
 
 
 def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[InnerProblem, list[Term]]:
-    """The detector after a training on ``images`` of each object, on one image of every bin and object; and L_val.
+    """Train a detector on ``images`` of each object; return its inner problem and L_val.
 
-    Both are in float64. An image has its bin's probability as weight, shared by the objects.
+    The problem is of one image of every bin and object, which has its bin's probability as weight, shared by the
+    objects. Both are in float64.
     """
     generator, scene = torch.Generator().manual_seed(0), small_scene()
     detector = make(num_classes=2, image_size=SIZE)
@@ -70,5 +71,5 @@ def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[In
 
 
 def as_double(params: Params) -> Params:
-    """The parameters in float64."""
+    """Return the parameters in float64."""
     return {name: value.double() for name, value in params.items()}

@@ -47,17 +47,20 @@ class Density:
     resolved: float = SPAN
 
     def order(self, rule: str) -> float:
+        """Return the order of a rule."""
         return self.midpoint if rule == "midpoint" else self.jittered
 
 
 def _blob(distance: Along, offset: Along) -> Along:
-    """Gaussian, still dense at both ends of the ray: one that vanishes there is integrated far better than theory."""
+    """Return a Gaussian, still dense at both ends of the ray: one that vanishes there is integrated far too well."""
     return 3.0 * torch.exp(-(((distance - 0.9 - 0.2 * offset) / 0.7) ** 2))
 
 
 def box(thickness: float, offset: Along) -> tuple[Along, Along]:
-    """Where a box of about this thickness begins and ends on each ray. Both ends vary by themselves: with one
-    thickness for all rays the errors at its two jumps would cancel for some steps and add up for others.
+    """Return where a box of about this thickness begins and ends on each ray.
+
+    Both ends vary by themselves: with one thickness for all rays the errors at its two jumps would cancel for some
+    steps and add up for others.
     """
     begin = 0.6 + 0.2 * offset
     return begin, begin + thickness * (0.75 + 0.5 * torch.frac(37.0 * offset))
@@ -79,7 +82,7 @@ DENSITIES = {
 
 
 def colour(distance: Along, offset: Along) -> Float[Tensor, "rays samples 3"]:
-    """A smooth colour along the ray."""
+    """Return a smooth colour along the ray."""
     phases = torch.tensor([0.0, 1.0, 2.0]).to(distance)
     return 0.5 + 0.4 * torch.sin(3.0 * distance[..., None] + phases + offset[..., None])
 
@@ -87,8 +90,9 @@ def colour(distance: Along, offset: Along) -> Float[Tensor, "rays samples 3"]:
 def rendered(
     density: Density, offset: Float[Tensor, "rays"], samples: int, generator: torch.Generator | None
 ) -> Float[Tensor, "rays 4"]:
-    """Colour and opacity of the rays by the project's quadrature; samples at the middle of their intervals, or at
-    random in them with a generator.
+    """Return colour and opacity of the rays by the project's quadrature.
+
+    Samples are at the middle of their intervals, or at random in them with a generator.
     """
     rays, step = len(offset), SPAN / samples
     inside = offset.new_full((rays, samples), 0.5)
@@ -106,7 +110,7 @@ def rendered(
 
 
 def reference(density: Density, offset: Float[Tensor, "rays"], samples: int) -> Float[Tensor, "rays 4"]:
-    """``rendered`` at the middles of ``samples`` intervals, some rays at a time."""
+    """Return ``rendered`` at the middles of ``samples`` intervals, some rays at a time."""
     parts = offset.split(max(1, AT_ONCE // samples))
     return torch.cat([rendered(density, part, samples, None) for part in parts])
 
@@ -145,7 +149,7 @@ class Quadrature:
         return sorted({*self.samples, self.default})
 
     def measure(self, world: object, timing: Timing, seed: int) -> Iterator[Series]:
-        """Root mean square errors over rays, of opacity and of colour, in float64."""
+        """Measure root mean square errors over rays, of opacity and of colour, in float64."""
         del world  # the densities are its own
         for name, density in DENSITIES.items():
             offset = torch.rand(self.rays, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -181,7 +185,7 @@ class Quadrature:
         return rows
 
     def _order(self, density: Density, rule: str, errors: list[float]) -> Order:
-        """Over the finer half of the steps that resolve the density: the coarsest are not asymptotic yet."""
+        """Fit the order over the finer half of the steps that resolve the density; coarser ones are not asymptotic."""
         steps = [SPAN / count for count in self.counts]
         kept = [(h, error) for h, error in zip(steps, errors, strict=True) if h <= density.resolved]
         kept = kept[len(kept) // 2 :] if len(kept) > 4 else kept

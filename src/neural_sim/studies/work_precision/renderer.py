@@ -15,7 +15,7 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 from neural_sim.types import PinholeCamera, Rays
 
 SHOWN = 0.01
@@ -25,8 +25,11 @@ FIELD_OF_VIEW = math.radians(40.0)
 
 @dataclass(frozen=True)
 class Left:
-    """What a renderer left out of an image of one object, and what that changed: mean error of opacity over the pixels
-    that show the object, root mean square error of premultiplied colour over all.
+    """What a renderer left out of an image of one object, and what that changed.
+
+    ``opacity`` is the mean error over the pixels that show the object, ``colour`` the root mean square error of
+    premultiplied colour over all; ``cast`` is the part of the pixels whose rays were cast, ``samples`` those of a ray
+    that hits.
     """
 
     opacity: float
@@ -38,7 +41,7 @@ class Left:
 def variants(
     renderer: NerfRenderer, terminations: Sequence[float], steps: Sequence[float]
 ) -> dict[str, NerfRenderer]:
-    """Renderers by ``line, setting``: the qualities, the run's own with one omission undone, and with other values."""
+    """Make renderers by ``line, setting``: the qualities, the run's own with one omission undone or changed."""
     own: dict[str, object] = {"termination": renderer.termination, "step": renderer.step}
     own |= {"cull": renderer.cull, "skip_empty": renderer.skip_empty}
 
@@ -58,7 +61,7 @@ def variants(
 def left_out(
     field: RadianceField, renderer: NerfRenderer, camera: PinholeCamera, poses: Float[Tensor, "views 4 4"]
 ) -> Left:
-    """Against a render of the same field that leaves out nothing, at the field's own step."""
+    """Compare with a render of the same field that leaves out nothing, at the field's own step."""
     rgb, opacity = renderer.render(field, camera, poses)
     every_rgb, every_opacity = renderer.render(field, camera, poses, exact=True)
     shown = (opacity > SHOWN) | (every_opacity > SHOWN)
@@ -101,7 +104,7 @@ class Renderer:
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """Means over the run's objects; seconds an image."""
+        """Measure means over the run's objects; seconds an image."""
         del seed  # nothing is random
         poses = world.views.camera_to_world[-world.held_out :][: self.views]
         camera = PinholeCamera(self.size, self.size, FIELD_OF_VIEW)

@@ -1,10 +1,7 @@
-"""What ``+experiment=work_precision`` leaves: work_precision.json and .md, a figure a series, a run in MLflow, sections
-of a documentation page.
-"""
+"""What ``+experiment=work_precision`` leaves: a document, tables, figures, and sections of a documentation page."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +10,11 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from neural_sim.documents import replace_section
-from neural_sim.report import figures, tracking
-from neural_sim.studies.work_precision.series import Series
+from neural_sim.documents import finite, markdown_table, replace_section
+from neural_sim.report import figures
+from neural_sim.report.tracking import Run
+from neural_sim.studies.work_precision.series import Point, Series
+from neural_sim.tasks.context import Context
 
 INTRODUCTION = (
     "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. *Optimal*: no other setting "
@@ -25,44 +24,42 @@ CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
 Row = Mapping[str, Any]
 
 
-def document(series: Sequence[Series], machine: Mapping[str, Any], notes: Sequence[str]) -> dict[str, Any]:
-    """The content of work_precision.json: a row a setting under ``series``, the observed orders, what was measured, and
-    defaults that are not Pareto-optimal. Numbers that do not exist are null.
+def document(series: Sequence[Series], machine: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of work_precision.json; numbers that do not exist are null.
+
+    It has a row a setting under ``series``, the observed orders, what was measured, and defaults that are not
+    Pareto-optimal.
     """
     rows, orders, overtaken = [], [], []
     for each in series:
         for point, best in zip(each.points, each.pareto, strict=True):
             rows.append({
-                "name": each.name, "setting": point.setting, "error": _number(point.error),
-                "error_kind": each.error_kind, "seconds": _number(point.seconds), "memory_mb": point.memory_mb,
-                "default": point.default, "pareto": best, "line": point.line, "detail": point.detail,
+                "name": each.name, "setting": point.setting, "error": point.error, "error_kind": each.error_kind,
+                "seconds": point.seconds, "memory_mb": point.memory_mb, "default": point.default, "pareto": best,
+                "line": point.line, "detail": point.detail,
             })  # fmt: skip
         orders += [
-            {"name": each.name, "line": o.line, "observed": _number(o.observed), "theory": o.theory, "steps": o.steps}
+            {"name": each.name, "line": o.line, "observed": o.observed, "theory": o.theory, "steps": o.steps}
             for o in each.orders
-        ]  # fmt: skip
+        ]
         overtaken += [
             {"name": each.name, "default": mine.setting, "by": other.setting,
              "error_ratio": _ratio(mine.error, other.error), "seconds_ratio": _ratio(mine.seconds, other.seconds)}
             for mine, other in each.overtaken()
         ]  # fmt: skip
     measured = {each.name: {"clock": each.clock, "note": each.note} for each in series}
-    return {
-        "machine": dict(machine), "measured": measured, "series": rows, "orders": orders, "overtaken": overtaken,
-        "notes": list(notes),
-    }  # fmt: skip
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return finite({
+        "machine": machine, "measured": measured, "series": rows, "orders": orders, "overtaken": overtaken,
+        "notes": [],
+    })  # fmt: skip
 
 
 def _ratio(mine: float, other: float) -> float | None:
-    return _number(mine / other) if other > 0.0 else None
+    return mine / other if other > 0.0 else None
 
 
 def markdown(held: Mapping[str, Any], family: str) -> str:
-    """One family's tables and observed orders, from the JSON's content."""
+    """Return one family's tables and observed orders, from the JSON's content."""
     names = [name for name in held["measured"] if name.partition("/")[0] == family]
     clock = CLOCKS[held["measured"][names[0]]["clock"]]
     parts = [INTRODUCTION.format(clock=clock, **held["machine"])]
@@ -76,23 +73,19 @@ def markdown(held: Mapping[str, Any], family: str) -> str:
 
 def _table(rows: Sequence[Row]) -> str:
     detailed = any(row["detail"] for row in rows)
-    more = " |" if detailed else ""
-    lines = [
-        f"| setting | {rows[0]['error_kind']} | seconds | MB | optimal |{more}",
-        f"|---|---|---|---|---|{'---|' if detailed else ''}",
-    ]
-    for row in rows:
-        setting = f"**{row['setting']}** (default)" if row["default"] else row["setting"]
-        memory = "" if row["memory_mb"] is None else f"{row['memory_mb']:.3g}"
-        cells = [
-            setting,
+    cells = [
+        [
+            f"**{row['setting']}** (default)" if row["default"] else row["setting"],
             _shown(row["error"]),
             _shown(row["seconds"]),
-            memory,
+            "" if row["memory_mb"] is None else f"{row['memory_mb']:.3g}",
             "yes" if row["pareto"] else "",
+            *([row["detail"]] if detailed else []),
         ]
-        lines.append("| " + " | ".join([*cells, *([row["detail"]] if detailed else [])]) + " |")
-    return "\n".join(lines)
+        for row in rows
+    ]
+    head = ["setting", rows[0]["error_kind"], "seconds", "MB", "optimal", *([""] if detailed else [])]
+    return markdown_table(head, cells)
 
 
 def _shown(value: float | None) -> str:
@@ -123,30 +116,17 @@ def _overtaken(each: Row) -> str:
 
 
 def figure(series: Series) -> Figure:
-    """Error against run time, both logarithmic: a line joins settings that differ in one number, Pareto-optimal ones
-    are filled, a ring marks the default. Errors of 0 are at the lower edge.
+    """Draw error against run time, both logarithmic.
+
+    A line joins settings that differ in one number, Pareto-optimal ones are filled, a ring marks the default. Errors of
+    0 are at the lower edge.
     """
     made = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = made.add_subplot()
     shown = [p for p in series.points if math.isfinite(p.error) and p.seconds > 0.0]
-    positive = [point.error for point in shown if point.error > 0.0]
-    least = 0.3 * min(positive, default=1.0)
-    lines = list(dict.fromkeys(point.line for point in shown))
-    best = dict(zip((p.setting for p in series.points), series.pareto, strict=True))
-    for number, line in enumerate(lines):
-        colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
-        marker = "os^Dvp*X"[number // len(figures.CLASS_COLOURS) % 8]
-        mine = [point for point in shown if point.line == line]
-        x, y = [p.seconds for p in mine], [max(p.error, least) for p in mine]
-        axes.plot(x, y, "-", color=colour, linewidth=1, alpha=0.6)
-        for filled in (True, False):
-            chosen = [(a, b) for a, b, p in zip(x, y, mine, strict=True) if best[p.setting] is filled]
-            if chosen:
-                face = colour if filled else "white"
-                axes.plot(
-                    *zip(*chosen, strict=True), marker, color=colour, markerfacecolor=face, markersize=5
-                )
-        axes.plot([], [], f"{marker}-", color=colour, markersize=5, linewidth=1, label=line or "settings")
+    least = 0.3 * min((point.error for point in shown if point.error > 0.0), default=1.0)
+    for number, line in enumerate(dict.fromkeys(point.line for point in shown)):
+        _draw_line(axes, series, [point for point in shown if point.line == line], number, least)
     for point in shown:
         if point.default:
             at = (point.seconds, max(point.error, least))
@@ -169,37 +149,46 @@ def figure(series: Series) -> Figure:
     return made
 
 
+def _draw_line(axes: Any, series: Series, points: Sequence[Point], number: int, least: float) -> None:
+    """Draw one line's settings, the optimal ones filled."""
+    colour = figures.CLASS_COLOURS[number % len(figures.CLASS_COLOURS)]
+    marker = "os^Dvp*X"[number // len(figures.CLASS_COLOURS) % 8]
+    best = dict(zip((p.setting for p in series.points), series.pareto, strict=True))
+    x, y = [p.seconds for p in points], [max(p.error, least) for p in points]
+    axes.plot(x, y, "-", color=colour, linewidth=1, alpha=0.6)
+    for filled in (True, False):
+        chosen = [(a, b) for a, b, p in zip(x, y, points, strict=True) if best[p.setting] is filled]
+        if chosen:
+            face = colour if filled else "white"
+            axes.plot(*zip(*chosen, strict=True), marker, color=colour, markerfacecolor=face, markersize=5)
+    label = points[0].line or "settings"
+    axes.plot([], [], f"{marker}-", color=colour, markersize=5, linewidth=1, label=label)
+
+
 def slug(name: str) -> str:
-    """A series' name as a file's."""
+    """Return a series' name as a file's."""
     return "".join(letter if letter.isalnum() else "_" for letter in name).replace("__", "_").strip("_")
 
 
-def write(series: Sequence[Series], held: Mapping[str, Any], folder: Path) -> str:
-    """work_precision.json, work_precision.md and the figures in ``folder``; returns the Markdown."""
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    path = folder / "work_precision.json"
-    path.write_text(json.dumps(held, indent=1, allow_nan=False))
-    for each in series:
-        figures.save(figure(each), folder / "figures" / f"{slug(each.name)}.png")
-    families = dict.fromkeys(each.family for each in series)
-    parts = ["# Error against run time", *(f"## {name}\n\n{markdown(held, name)}" for name in families)]
-    text = "\n\n".join([*parts, *held["notes"]])
-    (folder / "work_precision.md").write_text(text + "\n")
-    return text
+def text_of(held: Mapping[str, Any]) -> str:
+    """Return every family's section, from the JSON's content."""
+    sections = [f"## {family}\n\n{markdown(held, family)}" for family in _families(held)]
+    return "\n\n".join(["# Error against run time", *sections])
+
+
+def _families(held: Mapping[str, Any]) -> list[str]:
+    return list(dict.fromkeys(name.partition("/")[0] for name in held["measured"]))
 
 
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
-    """A section of ``page`` for each family, see :func:`section.replace_section`."""
-    for family in dict.fromkeys(name.partition("/")[0] for name in held["measured"]):
-        replace_section(
-            page, f"Error against run time: {family}", f"    {command}\n\n{markdown(held, family)}"
-        )
+    """Rewrite a section of ``page`` for each family, see :func:`neural_sim.documents.replace_section`."""
+    for family in _families(held):
+        name = f"Error against run time: {family}"
+        replace_section(page, name, f"    {command}\n\n{markdown(held, family)}")
 
 
-def track(
-    series: Sequence[Series], config: Mapping[str, Any], uri: str, folder: Path, begun: float
-) -> tracking.Run:
-    """A run in MLflow that began at ``begun`` (seconds since 1970), with ``folder`` as its artifacts."""
+def publish(context: Context, series: Sequence[Series], held: Mapping[str, Any]) -> Run:
+    """Write work_precision.json, work_precision.md and a figure a series, and log the defaults to MLflow."""
     metrics = {}
     for each in series:
         for point in each.points:
@@ -208,6 +197,5 @@ def track(
                 metrics[f"{slug(each.name)}/default_seconds"] = point.seconds
         metrics[f"{slug(each.name)}/defaults_not_optimal"] = float(len(list(each.overtaken())))
         metrics |= {f"{slug(each.name)}/order_{slug(order.line)}": order.observed for order in each.orders}
-    parameters = tracking.flatten({"work_precision": config["work_precision"], "seed": config["seed"]})
-    name, tags = f"seed {config['seed']}", {"seed": str(config["seed"])}
-    return tracking.log_run(uri, config["name"], name, tags, parameters, metrics, {}, folder, begun)
+    drawn = {slug(each.name): figure(each) for each in series}
+    return context.publish("work_precision", held, text_of(held), drawn, metrics)

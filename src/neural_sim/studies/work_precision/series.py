@@ -26,11 +26,16 @@ SHORTEST = 0.05
 
 @dataclass(frozen=True)
 class Point:
-    """One setting. ``error`` is at least 0, of the kind that the series names; ``seconds`` are by the series' clock.
+    """One setting.
 
-    ``memory_mb`` is the most that tensors took at one time in MiB, None where it was not measured. ``line`` names the
-    settings that a line in the figure joins (those that differ in one number). ``detail`` is further text for the
-    table. ``default`` marks the project's own setting.
+    Attributes:
+        setting: its name.
+        error: at least 0, of the kind that the series names.
+        seconds: by the series' clock.
+        memory_mb: the most that tensors took at one time in MiB; None where it was not measured.
+        default: whether it is the project's own.
+        line: the settings that a line in the figure joins (those that differ in one number).
+        detail: further text for the table.
     """
 
     setting: str
@@ -82,6 +87,7 @@ class Series:
 
     @property
     def family(self) -> str:
+        """The part of the name before the slash."""
         return self.name.partition("/")[0]
 
     @property
@@ -90,8 +96,9 @@ class Series:
         return pareto([(point.error, point.seconds) for point in self.points])
 
     def overtaken(self) -> Iterator[tuple[Point, Point]]:
-        """Every default that another setting beats beyond the noise of timings, beside the fastest one of these: of at
-        most its error, in at most ``CLEARLY`` of its time.
+        """Yield every default that another setting beats beyond the noise of timings, with the fastest of these.
+
+        That is one of at most its error, in at most ``CLEARLY`` of its time.
         """
         for mine in self.points:
             ahead = [o for o in self.points if o.error <= mine.error and o.seconds <= CLEARLY * mine.seconds]
@@ -100,7 +107,7 @@ class Series:
 
 
 def pareto(costs: Sequence[tuple[float, float]]) -> tuple[bool, ...]:
-    """Which of the pairs no other dominates: is at most as large in both numbers and smaller in one.
+    """Return which of the pairs no other dominates: is at most as large in both numbers and smaller in one.
 
     Pairs with a number that is nan or infinite are never optimal and dominate nothing.
     """
@@ -119,7 +126,9 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def slope(steps: Sequence[float], errors: Sequence[float]) -> float:
-    """The least-squares slope of log ``errors`` over log ``steps``; nan where an error is 0 or fewer than two are.
+    """Return the least-squares slope of log ``errors`` over log ``steps``.
+
+    It is nan where an error is 0 or there are fewer than two.
 
     Raises:
         ValueError: sequences of different lengths, or a step that is not positive.
@@ -152,19 +161,19 @@ class Timing:
             raise ValueError(f"work_precision.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
     def now(self, device: torch.device | None = None) -> float:
-        """Seconds of the clock, after the device's work."""
+        """Return seconds of the clock, after the device's work."""
         if device is not None:
             synchronise(device)
         return time.process_time() if self.clock == "cpu_seconds" else time.perf_counter()
 
     def once(self, run: Callable[[], T], device: torch.device | None = None) -> tuple[float, T]:
-        """Seconds of one run, for what takes long; its result."""
+        """Return seconds of one run, for what takes long, and its result."""
         begun = self.now(device)
         value = run()
         return self.now(device) - begun, value
 
     def of(self, run: Callable[[], object], device: torch.device | None = None) -> tuple[float, float | None]:
-        """Seconds and memory (MiB) of ``run``; the run whose memory is measured does not count for the seconds.
+        """Return seconds and memory (MiB) of ``run``; the run whose memory is measured does not count for the seconds.
 
         One that takes less than ``SHORTEST`` is run as often as fills that, which gives its mean. Memory is None for
         one that takes longer than ``RECORDED``.

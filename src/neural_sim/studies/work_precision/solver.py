@@ -14,18 +14,17 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.hypergradient import InnerProblem
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.base import Solution
 from neural_sim.solver.damping import FixedDamping
 from neural_sim.solver.direct import Exact
 from neural_sim.solver.hvp import HessianOperator, Term, gradient
 from neural_sim.studies.work_precision.micro import as_double, trained_problem
 from neural_sim.studies.work_precision.series import Point, Series, Timing
-from neural_sim.studies.work_precision.suite import World
+from neural_sim.studies.work_precision.world import World
 from neural_sim.types import LabelledImages
 
 UNKNOWNS = 200
 """Of the linear systems of a given condition number."""
-Setting = tuple[str, str, AdjointSolver, bool]
-"""Its name, its line, the solver, whether it is the project's own."""
 TIGHT = 1e-12
 """Relative residual that a solve by steps is asked for, so that its steps end it."""
 
@@ -38,6 +37,7 @@ class Product:
     retain_graph: bool
 
     def of(self, solver: AdjointSolver) -> AdjointSolver:
+        """Return the solver with this kind of product."""
         return replace(solver, mode=self.mode, retain_graph=self.retain_graph)
 
 
@@ -46,6 +46,16 @@ PRODUCTS = {
     "graph built anew": Product("reverse_over_reverse", False),
     "central differences": Product("central_difference", False),
 }
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A solver of a table, the line of the figure that it is on, and whether it is the project's own."""
+
+    name: str
+    line: str
+    solver: AdjointSolver
+    default: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,13 +68,73 @@ class Oracle:
 
     @staticmethod
     def of(terms: Sequence[Term], params: Parameters, b: Float[Tensor, "n"]) -> Oracle:
+        """Decompose the dense Hessian of the terms."""
         matrix = HessianOperator(terms, params, retain_graph=True).dense()
         values, vectors = torch.linalg.eigh(0.5 * matrix + 0.5 * matrix.T)
         return Oracle(values, vectors, vectors.T @ b)
 
     def solve(self, damping: float) -> Float[Tensor, "n"]:
-        """(H + damping I)^-1 b. Its relative error is about n eps times the condition number."""
+        """Return (H + damping I)^-1 b; its relative error is about n eps times the condition number."""
         return self.vectors @ (self.coefficients / (self.values + damping))
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """(H + lambda I)^-1 dL_val/dtheta of a detector whose Hessian is dense enough for an oracle."""
+
+    terms: Sequence[Term]
+    params: Parameters
+    b: Float[Tensor, "n"]
+    oracle: Oracle
+    seconds: float
+    """Of the oracle's eigenvalues."""
+    timing: Timing
+    seed: int
+
+    @staticmethod
+    def of(problem: InnerProblem, validation: list[Term], timing: Timing, seed: int) -> Inverse:
+        """Decompose a problem's Hessian, for the slope of ``validation``."""
+        params, terms = problem.params, problem.terms()
+        b = gradient(validation, params)
+        spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
+        return Inverse(terms, params, b, oracle, spent, timing, seed)
+
+    def chosen(self, solver: AdjointSolver) -> float:
+        """Return the damping that a solver chooses itself."""
+        random = torch.Generator().manual_seed(self.seed)
+        return solver.damping.choose(solver.operator(self.terms, self.params), self.b, random).value
+
+    def series(self, name: str, settings: Sequence[Setting], damping: float, more: str) -> Series:
+        """Solve by every setting, and compare with the oracle of one damping."""
+        truth = self.oracle.solve(damping)
+        points = tuple(self._point(setting, truth) for setting in settings)
+        low, high = (float(self.oracle.values[place]) + damping for place in (0, -1))
+        condition = high / low if low > 0.0 else math.inf
+        note = (
+            f"(H + lambda I)^-1 dL_val/dtheta of a detector of {self.b.numel()} trained numbers after its training, "
+            f"float64, lambda = {damping:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); "
+            f"against the dense matrix, whose eigenvalues take {self.seconds:.3g} s.{more}"
+        )
+        return Series(f"solver/{name}", "relative error of the product", points, (), note, self.timing.clock)
+
+    def _point(self, setting: Setting, truth: Tensor) -> Point:
+        def solve():
+            generator = torch.Generator().manual_seed(self.seed)
+            return setting.solver.solve(self.terms, self.params, self.b, None, generator)
+
+        found = solve()
+        spectrum = found.damping.spectrum
+        products = found.solution.products + (spectrum.products if spectrum else 0)
+        seconds, memory = self.timing.of(solve)
+        detail = f"{products} products, {_words(found.solution)}"
+        if found.damping_raises:  # it solved another system than the oracle did
+            detail += f", lambda raised to {found.damping.value:.3g}"
+        error = relative(found.solution.value, truth)
+        return Point(setting.name, error, seconds, memory, setting.default, setting.line, detail)
+
+
+def _words(solution: Solution) -> str:
+    return solution.status.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -107,101 +177,51 @@ class Solver:
             raise ValueError(f"work_precision.solver: want numbers above 0, got {numbers}")
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """On the detector of ``micro``, linear systems, and products of the run's kind of detector."""
+        """Measure on the detector of ``micro``, on linear systems, and products of the run's kind of detector."""
         del world  # its problems are its own
         if self.detector is not None:
-            yield from self._inverse(*trained_problem(self.detector), timing, seed)
+            yield from self._inverse(Inverse.of(*trained_problem(self.detector), timing, seed))
         for condition in self.conditions:
             yield self._system(condition, timing, seed)
         if self.timed is not None:
             yield self._products(self.timed, timing, seed)
 
-    def _inverse(
-        self, problem: InnerProblem, validation: list[Term], timing: Timing, seed: int
-    ) -> Iterator[Series]:
-        params, terms, own = problem.params, problem.terms(), self.solvers[self.default]
-        b = gradient(validation, params)
-        random = torch.Generator().manual_seed(seed)
-        chosen = own.damping.choose(own.operator(terms, params), b, random).value
-        spent, oracle = timing.once(lambda: Oracle.of(terms, params, b))
-        problem_of = (terms, params, b)
-        yield self._solves(
-            "damping of its own", list(self._own()), *problem_of, oracle, chosen, spent, timing, seed,
-            " Each chooses its lambda itself, from products that count; a solve starts from these.",
-        )  # fmt: skip
+    def _inverse(self, problem: Inverse) -> Iterator[Series]:
+        chosen = problem.chosen(self.solvers[self.default])
+        more = " Each chooses its lambda itself, from products that count; a solve starts from these."
+        yield problem.series("damping of its own", list(self._own()), chosen, more)
         for factor in self.factors:
             value = factor * chosen
-            named = f"lambda {value:.3g} given"
             more = f" This lambda, {factor:g} times what the default chooses, is given; no product is spent on it."
-            yield self._solves(
-                named, list(self._given(value)), *problem_of, oracle, value, spent, timing, seed, more
-            )
-
-    def _solves(
-        self, name: str, settings: Sequence[Setting], terms: Sequence[Term], params: Parameters, b: Tensor,
-        oracle: Oracle, value: float, spent: float, timing: Timing, seed: int, more: str,
-    ) -> Series:  # fmt: skip
-        truth = oracle.solve(value)
-        points = [self._point(*each, terms, params, b, truth, timing, seed) for each in settings]
-        low, high = (float(oracle.values[place]) + value for place in (0, -1))
-        condition = high / low if low > 0.0 else math.inf
-        note = (
-            f"(H + lambda I)^-1 dL_val/dtheta of a detector of {b.numel()} trained numbers after its training, "
-            f"float64, lambda = {value:.3g} (eigenvalues {low:.2g} to {high:.3g}, condition {condition:.3g}); against "
-            f"the dense matrix, whose eigenvalues take {spent:.3g} s.{more}"
-        )
-        return Series(
-            f"solver/{name}", "relative error of the product", tuple(points), (), note, timing.clock
-        )
+            yield problem.series(f"lambda {value:.3g} given", list(self._given(value)), value, more)
 
     def _given(self, value: float) -> Iterator[Setting]:
-        """By steps, with a lambda that is given."""
+        """Yield solvers by steps, with a lambda that is given."""
         fixed = FixedDamping(value, 0)
         for name, solver in self.solvers.items():
             once = name == "identity"  # takes no steps
             for steps in self.steps[:1] if once else self.steps:
-                named = name if once else f"{name}, {steps} steps"
-                yield (
-                    named,
-                    name,
-                    replace(solver, damping=fixed, rtol=TIGHT, max_steps=steps, max_raises=0),
-                    False,
-                )
+                asked = replace(solver, damping=fixed, rtol=TIGHT, max_steps=steps, max_raises=0)
+                yield Setting(name if once else f"{name}, {steps} steps", name, asked)
 
     def _own(self) -> Iterator[Setting]:
-        """By tolerance, as configured, with the damping that each chooses; and the default by other products."""
+        """Yield solvers by tolerance, each with its own damping, and the default by other products."""
         own = self.solvers[self.default]
         others = {
-            f"{self.default}, {how}": PRODUCTS[how].of(own)
-            for how in PRODUCTS
-            if PRODUCTS[how].of(own) != own
+            f"{self.default}, {how}": product.of(own)
+            for how, product in PRODUCTS.items()
+            if product.of(own) != own
         }
         for name, solver in {**self.solvers, **others}.items():
-            for rtol in (
-                [solver.rtol] if name == "identity" else sorted({*self.rtols, solver.rtol}, reverse=True)
-            ):
+            if name == "identity":
+                yield Setting(name, name, solver)
+                continue
+            for rtol in sorted({*self.rtols, solver.rtol}, reverse=True):
                 default = name == self.default and rtol == solver.rtol
-                named = name if name == "identity" else f"{name}, rtol {rtol:g}"
-                yield named, name, replace(solver, rtol=rtol), default
-
-    def _point(
-        self, name: str, line: str, solver: AdjointSolver, default: bool, terms: Sequence[Term], params: Parameters,
-        b: Tensor, oracle: Tensor, timing: Timing, seed: int,
-    ) -> Point:  # fmt: skip
-        def solve():
-            return solver.solve(terms, params, b, None, torch.Generator().manual_seed(seed))
-
-        found = solve()
-        spectrum = found.damping.spectrum
-        products = found.solution.products + (spectrum.products if spectrum else 0)
-        seconds, memory = timing.of(solve)
-        detail = f"{products} products, {found.solution.status.name.lower().replace('_', ' ')}"
-        if found.damping_raises:  # it solved another system than the oracle did
-            detail += f", lambda raised to {found.damping.value:.3g}"
-        return Point(name, relative(found.solution.value, oracle), seconds, memory, default, line, detail)
+                yield Setting(f"{name}, rtol {rtol:g}", name, replace(solver, rtol=rtol), default)
 
     def _system(self, condition: float, timing: Timing, seed: int) -> Series:
-        """Every solver on eigenvalues spread evenly in log from 1 to 1 / condition; the truth is chosen first."""
+        """Solve for eigenvalues spread evenly in log from 1 to 1 / condition; the truth is chosen first."""
         generator = torch.Generator().manual_seed(seed)
         basis, _ = torch.linalg.qr(torch.randn(UNKNOWNS, UNKNOWNS, generator=generator, dtype=torch.float64))
         truth = torch.randn(UNKNOWNS, generator=generator, dtype=torch.float64)
@@ -217,7 +237,7 @@ class Solver:
 
                 found = solve()
                 seconds, memory = timing.of(solve)
-                detail = f"{found.products} products, {found.status.name.lower().replace('_', ' ')}"
+                detail = f"{found.products} products, {_words(found)}"
                 setting = name if name in ("dense", "identity") else f"{name}, rtol {rtol:g}"
                 points.append(
                     Point(setting, relative(found.value, truth), seconds, memory, False, name, detail)
@@ -230,7 +250,7 @@ class Solver:
         return Series(name, "relative error of the solution", tuple(points), (), note, timing.clock)
 
     def _products(self, make: Callable[..., Detector], timing: Timing, seed: int) -> Series:
-        """Hessian products on cached features in float32, against the exact one in float64."""
+        """Multiply by the Hessian on cached features in float32, against the exact product in float64."""
         terms, params, precise = product_problem(make, self.images, self.size, seed)
         vector = gradient(terms, params)
         truth = HessianOperator(precise, as_double(params))(vector.double())
@@ -254,14 +274,14 @@ class Solver:
 
 
 def relative(value: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> float:
-    """|value - truth| / |truth|."""
+    """Return |value - truth| / |truth|."""
     return float((value - truth).norm() / truth.norm())
 
 
 def product_problem(
     make: Callable[..., Detector], images: int, size: int, seed: int
 ) -> tuple[list[Term], Parameters, list[Term]]:
-    """Loss terms of an untrained detector on random pictures of one box each, its parameters; the terms in float64."""
+    """Return loss terms of an untrained detector on random pictures of a box, its parameters, the terms in float64."""
     generator, detector = torch.Generator().manual_seed(seed), make(num_classes=6, image_size=size)
     backbone, params = detector.split(detector.init(generator))
     corner = 0.5 * size * torch.rand(images, 1, 2, generator=generator)
