@@ -147,7 +147,8 @@ def test_runs_come_back_with_their_files_the_latest_first(uri, tmp_path):
         folder.mkdir()
         for name in names:
             (folder / name).write_text(f"{number}")
-        tracking.log_run(uri, "gap", f"run {number}", {}, {}, {}, {}, folder, begun=100.0 + number)
+        with tracking.opened(uri, "gap", f"run {number}", {}, {}, begun=100.0 + number) as run:
+            run.log_files(folder)
     with pytest.raises(KeyError), opened(uri, begun=1.0):
         {}["views"]
     found = tracking.logged_runs(uri, "gap")

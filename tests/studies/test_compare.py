@@ -52,6 +52,11 @@ def results(method, seed, ap, scoring="s", config=(), **changes):
     }  # fmt: skip
 
 
+def log_files(uri, name, folder):
+    with tracking.opened(uri, "gap", name, {}, {}) as run:
+        run.log_files(folder)
+
+
 @pytest.fixture(scope="module")
 def database(empty_store, tmp_path_factory):
     """Two methods on two seeds, a later smoke run of one of them, a run of an older version, and one not evaluated."""
@@ -73,7 +78,7 @@ def database(empty_store, tmp_path_factory):
         if "curve" in held:
             found = round(8 * held["curve"][-1]["ap"]["per_class"]["mug"])
             (run / "detections.json").write_text(json.dumps(detections(found)))
-        tracking.log_run(uri, "gap", f"{held['method']} seed {held['seed']}", {}, {}, {}, {}, run)
+        log_files(uri, f"{held['method']} seed {held['seed']}", run)
     return uri
 
 
@@ -129,7 +134,7 @@ def test_classifiers_are_compared_by_accuracy(context, tmp_path):
         for row in written["learned"]:
             row["bbox"] = [0.0, 0.0, 64.0, 64.0]
         (run / "detections.json").write_text(json.dumps(written))
-        tracking.log_run(context.uri, "gap", method, {}, {}, {}, {}, run)
+        log_files(context.uri, method, run)
     (comparison,) = compared(context.uri, tmp_path / "compare", draws=20)
     assert (comparison.ap["neural_sim"].value, comparison.ap["lts"].value) == (0.75, 0.5)
     ahead = comparison.ahead["lts"]
@@ -170,7 +175,7 @@ def test_seconds_of_several_kinds_of_device_are_called_so(context, tmp_path):
         held = results(method, 0, 0.5, config={"trainer": {"accelerator": kind}})
         (run / "results.json").write_text(json.dumps(held))
         (run / "detections.json").write_text(json.dumps(detections(4)))
-        tracking.log_run(context.uri, "gap", method, {}, {}, {}, {}, run)
+        log_files(context.uri, method, run)
     compared(context.uri, tmp_path / "compare", draws=5)
     text = (tmp_path / "compare" / "compare.md").read_text()
     assert "Seconds are not comparable" in text and "cpu: lts seed 0" in text

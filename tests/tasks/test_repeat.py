@@ -46,7 +46,7 @@ def test_the_biased_objects_come_first_then_all_and_each():
 
 
 def test_one_training_is_refused_before_anything_runs():
-    with pytest.raises(UserError, match=r"repeat\.trainings must be at least 2"):
+    with pytest.raises(UserError, match=r"repeat\.trainings: want at least 2, got 1"):
         context("stages=[repeat]", "repeat.trainings=1")
 
 

@@ -197,29 +197,6 @@ def opened(
     run.close("FINISHED")
 
 
-def log_run(
-    uri: str,
-    experiment: str,
-    name: str,
-    tags: Mapping[str, str],
-    parameters: Mapping[str, Any],
-    metrics: Mapping[str, float],
-    series: Mapping[str, Sequence[float] | Mapping[int, float]],
-    artifacts: Path,
-    begun: float | None = None,
-) -> Run:
-    """Write a run that is over, ``begun`` as in :func:`opened`.
-
-    ``series`` holds a value a step (``psi/pitcher/bin_3``), or values by their steps, ``metrics`` final numbers
-    (``evaluate/learned/ap``).
-    """
-    with opened(uri, experiment, name, tags, parameters, begun) as run:
-        run.log(metrics)
-        run.log_series(series)
-        run.log_files(artifacts)
-    return run
-
-
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested mappings with dotted keys, by which MLflow's parameters are filtered."""
     flat: dict[str, Any] = {}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Ge, MinLen
+from typing_extensions import override
 
 from neural_sim.detector.metrics import IN_FULL
 from neural_sim.documents import markdown_table
@@ -32,6 +33,8 @@ UNITS = {"images": "images", "seconds": "seconds", "cpu_seconds": "seconds of pr
 class Compare(Task):
     """Compare finished runs of MLflow experiments, each experiment by itself and at each gap.
 
+    Leaves compare.md, compare.json, figures and report.html in the run's folder, and a run in MLflow.
+
     Args:
         experiments: MLflow experiments whose runs are compared.
         reference: the method that the others are compared with.
@@ -46,12 +49,8 @@ class Compare(Task):
     clock: Clock = "seconds"
     methods: tuple[str, ...] | None = None
 
+    @override
     def run(self, context: Context) -> None:
-        """Write compare.md, compare.json, the figures and report.html to the run's folder, and a run to MLflow.
-
-        Raises:
-            ValueError: no such experiment, no run of a named method, or none that can be compared, with the reasons.
-        """
         groups, left_out = self.selected(Runs.read(context.uri, self.experiments))
         tables = [self.table(group, context.config["seed"]) for group in groups]
         page = write_page(tables, left_out, context.folder)

@@ -20,7 +20,7 @@ from neural_sim.outer.records import IterationRecord
 from neural_sim.report import figures as drawing
 from neural_sim.report.figures import Figure
 from neural_sim.report.run_tracking import LiveRun, live_run
-from neural_sim.report.tracking import Run, flatten, log_run, tracking_uri
+from neural_sim.report.tracking import Run, flatten, opened, tracking_uri
 from neural_sim.stages.account import Account
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.graph import Graph
@@ -176,9 +176,10 @@ class Context:
         numbers = {key: value for key, value in known.items() if not isinstance(value, Sequence)}
         whole = "experiment" in self.__dict__  # built, so that the task depends on all of it
         parameters = self.config if whole else {name: self.config.get(name, {}), "seed": self.config["seed"]}
-        run = log_run(
-            self.uri, self.config["name"], title or f"seed {seed}", {"seed": seed, **(tags or {})},
-            flatten(parameters), numbers, series, self.folder, self.begun,
-        )  # fmt: skip
+        tags, title = {"seed": seed, **(tags or {})}, title or f"seed {seed}"
+        with opened(self.uri, self.config["name"], title, tags, flatten(parameters), self.begun) as run:
+            run.log(numbers)
+            run.log_series(series)
+            run.log_files(self.folder)
         print(f"results: {self.folder}\n{run.where}")
         return run

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge
 from typing_extensions import override
 
-from neural_sim.checks import at_least
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import markdown_table, write_json
+from neural_sim.ranges import validated
 from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.intervals import points
 from neural_sim.report.page.verdict import Gain, verdict
@@ -26,8 +27,10 @@ APART = 1_000
 SHOWN = (("learned", "ns"), ("matched", "learned"))
 """Differences of a table, by which detector is ahead of which."""
 DIFFERENCES = (*SHOWN, ("matched", "ns"))
+Several = Annotated[int, Ge(2)]
 
 
+@validated
 @dataclass(frozen=True)
 class RepeatTask(Task):
     """Detectors of the initial, the learned and the target's distribution, each trained several times.
@@ -37,18 +40,12 @@ class RepeatTask(Task):
     own.
 
     Args:
-        trainings: of each distribution, at least 2.
+        trainings: of each distribution.
         draws: of the bootstrap over test images.
-
-    Raises:
-        ValueError: numbers below their least.
     """
 
-    trainings: int = 5
-    draws: int = 100
-
-    def __post_init__(self) -> None:
-        at_least("repeat", 2, trainings=self.trainings, draws=self.draws)
+    trainings: Several = 5
+    draws: Several = 100
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
+from matplotlib.colors import to_hex
 from torch import Tensor
 
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.outer.certificate import untrusted
+from neural_sim.report import figures
 from neural_sim.report.bootstrap import match
-from neural_sim.report.page import charts, pictures, render
+from neural_sim.report.figures import Figure
+from neural_sim.report.page import pictures, render
 from neural_sim.report.page.pictures import Picture
 from neural_sim.report.page.steps import step_rows
 from neural_sim.report.page.verdict import POINTS, Gain, listed, verdict
 from neural_sim.report.page.weak_bins import bin_scores, by_object, weakest
-from neural_sim.report.run import RunResults
+from neural_sim.report.run import Learned, RunResults
 from neural_sim.report.score_table import ScoreTable
 from neural_sim.types import LabelledImages
 
@@ -144,8 +148,8 @@ def _psi(results: RunResults) -> list[FactorCharts]:
     drawn = []
     for factor in results.factors if results.records else ():
         learned = sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased)
-        panels = [PsiChart(one.name, charts.psi_chart(one), one.distances) for one in learned]
-        colours = charts.bin_colours(factor, len(learned[0].p["learned"]))
+        panels = [PsiChart(one.name, psi_chart(one), one.distances) for one in learned]
+        colours = bin_colours(factor, len(learned[0].p["learned"]))
         drawn.append(FactorCharts(factor, tuple(colours), tuple(panels)))
     return drawn
 
@@ -169,7 +173,52 @@ def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
     if "matched" in results.ap:
         per_class = results.ap["matched"]["per_class"]
         bounds = {"matched": sum(per_class[name] for name in aim) / len(aim)}
-    return charts.curve_chart(results.curve, list(aim), bounds, results.score)
+    return curve_chart(results.curve, list(aim), bounds, results.score)
+
+
+def bin_colours(factor: str, bins: int) -> list[str]:
+    """Return the colours of a factor's bins in these charts, for a legend."""
+    return [to_hex(colour) for colour in figures.bin_colours(factor, bins)]
+
+
+def psi_chart(learned: Learned) -> str:
+    """Draw one object's probabilities over the iterations, with the target's next to them."""
+    figure = Figure(figsize=(3.4, 2.1), layout="constrained")
+    figures.psi_panel(figure.add_subplot(), learned)
+    return render.data_uri(figure)
+
+
+def curve_chart(
+    curve: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    bounds: Mapping[str, float],
+    score: Score = "AP",
+) -> str:
+    """Draw the mean score of some classes against the method's seconds.
+
+    Args:
+        curve: what was spent and scored, with scores as fractions.
+        names: of the classes.
+        bounds: scores of other detectors by name, drawn as lines.
+        score: what these are.
+    """
+    figure = Figure(figsize=(6.2, 2.9), layout="constrained")
+    axes = figure.add_subplot()
+    seconds = [point["seconds"] for point in curve]
+    ap = [100.0 * sum(point["ap"]["per_class"][name] for name in names) / len(names) for point in curve]
+    axes.plot(seconds, ap, "o-", color=figures.METHOD_COLOURS["learned"], linewidth=1.6, markersize=5)
+    for value, spent in zip(ap, seconds, strict=True):
+        axes.annotate(f"{value:.1f}", (spent, value), textcoords="offset points", xytext=(0, 6), ha="center",
+                      fontsize=8, color=figures.INK)  # fmt: skip
+    for name, value in bounds.items():
+        axes.axhline(100.0 * value, color=figures.MUTED, linestyle="--", linewidth=1)
+        axes.annotate(name, (1.0, 100.0 * value), xycoords=("axes fraction", "data"), ha="right", va="bottom",
+                      fontsize=8, color=figures.MUTED)  # fmt: skip
+    axes.set(xlabel="seconds of the method, its warm start included", ylabel=f"{score} (%)", xlim=(0, None))
+    axes.margins(y=0.2)
+    axes.grid(color=figures.GRID)
+    figures.style(axes)
+    return render.data_uri(figure)
 
 
 def _training(images: LabelledImages, results: RunResults) -> list[Picture]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Ge
+from typing_extensions import override
 
 from neural_sim.configuration import conf_directory
 from neural_sim.documents import markdown_table, write_json
@@ -83,8 +84,8 @@ class Row:
         return f"{NOT_YET}, needs {self.needs}" if self.needs else NOT_YET
 
     @property
-    def run(self) -> str:
-        """The command."""
+    def command_line(self) -> str:
+        """What runs it."""
         return self.command or f"python -m src.main +experiment={self.experiment}"
 
 
@@ -127,8 +128,8 @@ class Experiments(Task):
     def _tables(self) -> dict[str, Paper]:
         return {name: Paper(**table) for name, table in self.paper["tables"].items()}
 
+    @override
     def run(self, context: Context) -> None:
-        """Write the page, tables and figures to the run's folder."""
         print(self.write(context.uri, context.config, context.folder))
         print(f"results: {context.folder}")
 
@@ -161,7 +162,7 @@ class Experiments(Task):
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n", encoding="utf-8")
-        data = {name: {"command": row.run, "ours": made[name].summary if name in made else None}
+        data = {name: {"command": row.command_line, "ours": made[name].summary if name in made else None}
                 for name, row in asked.items()}  # fmt: skip
         write_json(folder / "experiments.json", {"rows": data, "left_out": [asdict(run) for run in lost]})
         if self.page is None:
@@ -205,7 +206,7 @@ class Experiments(Task):
         cells = [
             [
                 row.title,
-                f"`{row.run}`",
+                f"`{row.command_line}`",
                 made[name].cell if name in made else row.without_runs,
                 "<br>".join(self._claims(row)),
                 row.differs,
