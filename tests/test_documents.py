@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from neural_sim.documents import finite, markdown_table, write_json
+from neural_sim.documents import finite, markdown_table, read_json, write_json
 
 
 def test_numbers_that_are_not_finite_become_null_at_every_depth(tmp_path):
@@ -14,6 +14,16 @@ def test_numbers_that_are_not_finite_become_null_at_every_depth(tmp_path):
     read = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda name: pytest.fail(name))
     assert read == {"a": [1.0, None, [None, {"b": None}]], "c": "nan", "d": True, "e": 3}
     assert finite(math.nan) is None
+
+
+def test_what_is_no_json_is_refused_with_its_path(tmp_path):
+    assert read_json(write_json(tmp_path / "file.json", {"a": [1]})) == {"a": [1]}
+    for text in (b"{", b"\xff"):
+        (tmp_path / "broken.json").write_bytes(text)
+        with pytest.raises(ValueError, match=r"broken\.json: not readable as JSON \("):
+            read_json(tmp_path / "broken.json")
+    with pytest.raises(ValueError, match=r"none\.json: not readable as JSON \("):
+        read_json(tmp_path / "none.json")
 
 
 def test_what_json_cannot_hold_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""What studies, reports and exports write: JSON by the standard, Markdown tables and sections."""
+"""JSON by the standard, read and written, and Markdown tables and sections."""
 
 from __future__ import annotations
 
@@ -35,6 +35,18 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(finite(document), indent=indent, allow_nan=False), encoding="utf-8")
     return path
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file in UTF-8.
+
+    Raises:
+        ValueError: a file that is missing, cannot be read or is no JSON, with its path.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not readable as JSON ({error})") from error
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

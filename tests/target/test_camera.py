@@ -48,9 +48,6 @@ def test_a_camera_matrix_is_opencvs():
         ({"fy": 3.0}, "want fx"),
         ({"cx": 3.0}, "want fx"),
         ({"fx": 3.0, "field_of_view_deg": 40.0}, "fx or field_of_view_deg"),
-        ({"fx": -1.0}, "positive"),
-        ({"width": 0, "height": 8}, "at least 1"),
-        ({"field_of_view_deg": 180.0}, "field_of_view"),
     ],
 )
 def test_bad_cameras_are_refused(settings, message):
@@ -94,8 +91,6 @@ def test_targets_without_a_camera_are_refused(tmp_path):
         TargetCamera().camera(8, 40.0, CocoTarget(path))
     with pytest.raises(ValueError, match=r"from_target wants a target .* got RenderedTarget"):
         TargetCamera().camera(8, 40.0, RENDERED)
-    with pytest.raises(ValueError, match=r"camera\.width must be at least 1"):
-        TargetCamera(0)
 
 
 def test_an_entry_gives_the_rays_of_its_matrix():

@@ -5,7 +5,6 @@ import pytest
 from PIL import Image
 
 from neural_sim.target.frames import Frame, PosedObject, box_of_mask, camera_of_matrix
-from neural_sim.target.photographs import grid_of, image_size, opened
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(8, 6, 0.7)
@@ -53,19 +52,6 @@ def test_sizes_agree(tmp_path):
         Frame("s", 1, file, PinholeCamera(9, 6, 0.7), (item(),))
     with pytest.raises(ValueError, match=r"b\.png: not a readable image"):
         Frame("s", 1, tmp_path / "b.png", CAMERA, ())
-    with pytest.raises(ValueError, match=r"a\.png: want one channel, got 3"):
-        grid_of(file, (8, 6))
-
-
-def test_a_file_that_ends_early_is_named(tmp_path):
-    file = tmp_path / "a.png"
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)).save(file)
-    file.write_bytes(file.read_bytes()[:2000])
-    assert image_size(file) == (80, 60)  # by the header
-    with pytest.raises(ValueError, match=r"a\.png: not a readable image"):
-        grid_of(file, (80, 60))
-    with pytest.raises(ValueError, match=r"a\.png: not a readable image"), opened(file) as image:
-        image.convert("RGB")
 
 
 def test_boxes_run_along_pixel_edges():

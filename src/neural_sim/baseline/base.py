@@ -57,6 +57,7 @@ class RewardMethod(Protocol):
 class Fixed:
     """No optimisation: images from the initial distribution (``ns``, the paper's NS) or the target's (``oracle``)."""
 
+    explores: ClassVar[bool] = False
     name: str
     which: Literal["initial", "target"]
 
@@ -66,6 +67,7 @@ class Fixed:
 class HypergradientLoop:
     """Steps of psi by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
 
+    explores: ClassVar[bool] = False
     name: str
 
 
@@ -77,5 +79,6 @@ class Response:
     It takes a training for each bin, in which ``part`` of every object's images moves to it.
     """
 
+    explores: ClassVar[bool] = False
     name: str
     part: PositiveFraction = 0.15

@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.rebuild import described, rebuilt
 from neural_sim.devices import placed
+from neural_sim.documents import read_json
 from neural_sim.types import PinholeCamera
 
 FORMAT, VERSION = "neural-sim detector", 1
@@ -115,10 +116,7 @@ class SavedDetector:
 
 
 def _document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
+    document = read_json(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f"{path}: format: want {FORMAT!r}, as a run's report writes it")
     if document.get("version") != VERSION:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from PIL import Image, UnidentifiedImageError
 
+from neural_sim.documents import read_json
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 
 NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
@@ -51,10 +51,7 @@ def read_transforms(folder: Path, name: str) -> Capture:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
+    document = read_json(path)
     if (
         not isinstance(document, dict)
         or not isinstance(document.get("frames"), list)

@@ -81,7 +81,7 @@ class PsiStage(Stage[LearnedPsi]):
         """How the method wants its images drawn: as its estimator does, or as a method that sees rewards says."""
         if self.parts is not None:
             return self.parts.estimator.draws
-        return HardDraws(explore=getattr(self.method, "explores", False))
+        return HardDraws(explore=self.method.explores)
 
     def make(self, results: Results) -> LearnedPsi:
         if isinstance(self.method, Fixed):

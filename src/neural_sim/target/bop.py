@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from typing_extensions import override
 
+from neural_sim.documents import read_json
 from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
@@ -82,7 +82,7 @@ class BopTarget(PosedTarget):
 
 
 def _targets(path: Path) -> list[FrameName]:
-    entries = _json_of(path)
+    entries = read_json(path)
     if not isinstance(entries, list):
         raise ValueError(f"{path}: want a list of targets")
     for number, entry in enumerate(entries):
@@ -241,16 +241,9 @@ def _want(entry: Any, keys: Sequence[str], where: str) -> None:
         raise ValueError(f"{where}: lacks {lacking}")
 
 
-def _json_of(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable as JSON ({error})") from error
-
-
 def _mapping(path: Path) -> dict[str, Any]:
     """Read a JSON file of entries by number. Raises ``ValueError`` for another."""
-    data = _json_of(path)
+    data = read_json(path)
     if not isinstance(data, dict) or not all(key.isdigit() for key in data):
         raise ValueError(f"{path}: want entries by number")
     return {str(int(key)): value for key, value in data.items()}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
+from annotated_types import Gt, Lt
 from typing_extensions import override
 
 from neural_sim.cameras import opencv_camera, resized
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
 
@@ -27,6 +29,7 @@ class CameraSource(Protocol):
         ...
 
 
+@validated
 @dataclass(frozen=True)
 class GivenCamera(CameraSource):
     """A camera by its field of view or by its OpenCV camera matrix.
@@ -44,11 +47,11 @@ class GivenCamera(CameraSource):
             without ``fx``, a number out of its range.
     """
 
-    width: int | None = None
-    height: int | None = None
-    field_of_view_deg: float | None = None
-    fx: float | None = None
-    fy: float | None = None
+    width: PositiveInt | None = None
+    height: PositiveInt | None = None
+    field_of_view_deg: Annotated[float, Gt(0), Lt(180)] | None = None
+    fx: Positive | None = None
+    fy: Positive | None = None
     cx: float | None = None
     cy: float | None = None
 
@@ -61,13 +64,9 @@ class GivenCamera(CameraSource):
             raise ValueError(
                 f"camera: want fx or field_of_view_deg, got {self.fx} and {self.field_of_view_deg}"
             )
-        self._made(64, 40.0)  # numbers out of their range are refused here
 
     @override
     def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:
-        return self._made(image_size, field_of_view_deg)
-
-    def _made(self, image_size: int, field_of_view_deg: float) -> PinholeCamera:
         width = image_size if self.width is None else self.width
         height = image_size if self.height is None else self.height
         if self.fx is not None:
@@ -77,6 +76,7 @@ class GivenCamera(CameraSource):
         return PinholeCamera(width, height, math.radians(angle))
 
 
+@validated
 @dataclass(frozen=True)
 class TargetCamera(CameraSource):
     """The camera that took the target's photographs, with images scaled to the detector's size.
@@ -88,11 +88,7 @@ class TargetCamera(CameraSource):
         ValueError: a width below 1; from :meth:`camera`, a target that knows no camera.
     """
 
-    width: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.width is not None and self.width < 1:
-            raise ValueError(f"camera.width must be at least 1 or null, got {self.width}")
+    width: PositiveInt | None = None
 
     @override
     def camera(self, image_size: int, field_of_view_deg: float, target: Target) -> PinholeCamera:

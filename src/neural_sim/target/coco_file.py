@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,8 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from neural_sim.documents import read_json
 
 REQUIRED: dict[str, tuple[str, ...]] = {
     "images": ("id", "file_name"),
@@ -36,10 +37,7 @@ class CocoFile:
         Raises:
             ValueError: not JSON, or a section, an entry's key or a box's side that is missing.
         """
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path}: not readable as JSON ({error})") from error
+        document = read_json(path)
         for section, keys in REQUIRED.items():
             entries = document.get(section) if isinstance(document, dict) else None
             if not isinstance(entries, list):

@@ -249,31 +249,32 @@ def read(
         dropped += len(photograph.labels) - len(labelled.labels)
     if dropped:
         _log.warning("%s: %d boxes shorter than %g px dropped", source, dropped, minimum_side)
-    return _padded(torch.stack(images), kept), placings
+    return padded(torch.stack(images), kept), placings
 
 
 @dataclass(frozen=True, eq=False)
-class _Boxes:
-    """Boxes of a letterboxed photograph."""
+class Boxes:
+    """The labelled boxes of one image, in its pixels."""
 
     boxes: Float[Tensor, "b 4"]
     labels: Int[Tensor, "b"]
-    bins: Int[Tensor, "b"] | None
+    bins: Int[Tensor, "b"] | None = None
 
 
-def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> _Boxes:
+def _placed(photograph: Photograph, placing: Letterbox, minimum_side: float) -> Boxes:
     """Bring a photograph's boxes into the letterboxed image, without those that are too small there."""
     if photograph.boxes is None:
         whole = torch.tensor([[0.0, 0.0, placing.width, placing.height]])
-        return _Boxes(placing.boxes(whole), photograph.labels, photograph.bins)
+        return Boxes(placing.boxes(whole), photograph.labels, photograph.bins)
     boxes = placing.boxes(photograph.boxes)
     large = ((boxes[:, 2:] - boxes[:, :2]) >= minimum_side).all(-1)
     bins = None if photograph.bins is None else photograph.bins[large]
-    return _Boxes(boxes[large], photograph.labels[large], bins)
+    return Boxes(boxes[large], photograph.labels[large], bins)
 
 
-def _padded(images: Float[Tensor, "n 3 h w"], kept: Sequence[_Boxes]) -> LabelledImages:
-    most = max(1, *(len(one.labels) for one in kept))
+def padded(images: Float[Tensor, "n 3 h w"], kept: Sequence[Boxes]) -> LabelledImages:
+    """Label images; boxes are padded to the longest list among them, bins are by box where some image has any."""
+    most = max([1, *(len(one.labels) for one in kept)])
     boxes = torch.zeros(len(kept), most, 4)
     labels, bins = (torch.full((len(kept), most), -1) for _ in range(2))
     for row, one in enumerate(kept):

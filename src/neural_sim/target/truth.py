@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.coco_file import COCO_KIND, CocoFile
-from neural_sim.target.photographs import PhotoFiles
+from neural_sim.target.photographs import Boxes, PhotoFiles, padded
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -130,11 +130,7 @@ class Truth:
 
 def without_pixels(truths: Sequence[tuple[Tensor, Tensor]]) -> LabelledImages:
     """Return boxes and labels of several photographs as a set to score detections on, which needs no pixels."""
-    most = max(1, *(len(labels) for _, labels in truths)) if truths else 1
-    boxes, labels = torch.zeros(len(truths), most, 4), torch.full((len(truths), most), -1)
-    for row, (box, label) in enumerate(truths):
-        boxes[row, : len(label)], labels[row, : len(label)] = box, label
-    return LabelledImages(torch.zeros(len(truths), 3, 1, 1), boxes, labels, torch.full((len(truths),), -1))
+    return padded(torch.zeros(len(truths), 3, 1, 1), [Boxes(*truth) for truth in truths])
 
 
 def _below(path: Path, folder: Path) -> str:
