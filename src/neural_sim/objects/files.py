@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import trimesh
@@ -107,6 +107,8 @@ class MeshFiles:
     Raises:
         ValueError: no files, or what :func:`choose` raises.
     """
+
+    metric: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 from neural_sim.field.base import RadianceField
 from neural_sim.objects.mesh import ObjectMesh
@@ -25,7 +25,9 @@ class Source(Protocol):
 
 
 class ObjectSource(Source, Protocol):
-    """A source of meshes."""
+    """A source of meshes; ``metric``: they are in metres, otherwise they have no unit of length."""
+
+    metric: ClassVar[bool]
 
     def load(self) -> list[ObjectMesh]: ...
 
@@ -67,9 +69,7 @@ class Meshes(Objects):
 
     @cached_property
     def radii(self) -> dict[str, float | None]:
-        """None for all objects of a source without a unit (its ``metric`` is False)."""
-        metric = getattr(self.source, "metric", True)
-        return {name: item.radius if metric else None for name, item in self.items.items()}
+        return {name: item.radius if self.source.metric else None for name, item in self.items.items()}
 
     def subject(self, name: str, field: RadianceField | None = None) -> MeshSubject:
         """The object by its mesh, with or without a field."""
