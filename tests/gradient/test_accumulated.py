@@ -15,10 +15,8 @@ from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.base import ObjectImages, Probes
-from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator, reinforce, stratified
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.stratified import stratified
 from neural_sim.gradient.unrolled import Examples, reversed_steps
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution

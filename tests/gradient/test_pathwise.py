@@ -9,7 +9,6 @@ import torch
 
 from neural_sim.gradient.base import from_contributions
 from neural_sim.gradient.pathwise import (
-    PathwiseEstimator,
     contract,
     draw_cotangents,
     map_cotangents,
@@ -113,19 +112,6 @@ def test_standard_error_is_that_of_a_sum():
     torch.testing.assert_close(derivative.standard_error[0], rows[:, 0].var().mul(4).sqrt())
     assert derivative.standard_error[1] == 0.0
     assert from_contributions(rows[:1]).standard_error.tolist() == [torch.inf, torch.inf]
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"patch_size": 0},
-        {"chunk_size": 0},
-        {"mode": "sideways"},
-    ],
-)
-def test_bad_settings_name_their_key(bad):
-    with pytest.raises(ValueError, match=f"gradient.{next(iter(bad))}"):
-        PathwiseEstimator(**bad)
 
 
 def test_images_without_a_path_are_refused(problem, pathwise):

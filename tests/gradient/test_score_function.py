@@ -7,8 +7,7 @@ import itertools
 import pytest
 import torch
 
-from neural_sim.gradient.reinforce import reinforce
-from neural_sim.gradient.stratified import importance_weights, stratified
+from neural_sim.gradient.estimators import importance_weights, reinforce, stratified
 
 DOUBLE = torch.float64
 PSI = torch.tensor([0.3, -1.0, 0.8], dtype=DOUBLE)

@@ -22,7 +22,9 @@ Params = dict[str, Tensor]
 class IndexedLoss(Protocol):
     """Losses of training images by row, from cached features of a frozen backbone."""
 
-    def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]: ...
+    def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]:
+        """Compute the losses of these rows."""
+        ...
 
 
 class ImageLoss(Protocol):
@@ -30,7 +32,9 @@ class ImageLoss(Protocol):
 
     def __call__(
         self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
-    ) -> Float[Tensor, "n"]: ...
+    ) -> Float[Tensor, "n"]:
+        """Compute the losses of these images."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ class MixedDerivative:
 
     value: Float[Tensor, "K"]
     standard_error: Float[Tensor, "K"]
-    p_values: Mapping[str, float] = field(default_factory=dict)
+    p_values: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 def from_contributions(contributions: Float[Tensor, "n K"]) -> MixedDerivative:

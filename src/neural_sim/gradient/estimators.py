@@ -1,37 +1,51 @@
-"""Estimators of the derivative by psi: the images that each draws, and its estimate from them."""
+"""Estimators of the derivative by psi from scores of images: stratified, which is the default, and REINFORCE."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, get_args
+from typing import ClassVar, Protocol
 
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.gradient.accumulated import Accumulated
-from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Params, Probes
+from neural_sim.gradient.base import (
+    Losses,
+    MixedDerivative,
+    ObjectImages,
+    Params,
+    Probes,
+    from_contributions,
+)
 from neural_sim.gradient.mixed import ThetaMode, scores
-from neural_sim.gradient.reinforce import reinforce
 from neural_sim.gradient.significance import no_association, no_difference
-from neural_sim.gradient.stratified import by_strata
 from neural_sim.gradient.unrolled import Wanted
+from neural_sim.parameter.factor import BinnedFactor, Factor
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.synthesis.draws import Draws, HardDraws
+
+LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 
 
 class Estimator(Protocol):
     """An estimator of the derivative by psi from images.
 
-    ``draws`` is how an iteration's images are drawn, ``probes_per_bin`` the number of further images of every stratum
-    of every factor (0: none), ``wanted`` what :meth:`accumulated` reads of the sums over a training's steps.
+    ``wanted`` is what :meth:`accumulated` reads of the sums over a training's steps.
     """
 
     wanted: ClassVar[Wanted]
 
     @property
-    def draws(self) -> Draws: ...
+    def draws(self) -> Draws:
+        """How an iteration's images are drawn."""
+        ...
 
     @property
-    def probes_per_bin(self) -> int: ...
+    def probes_per_bin(self) -> int:
+        """Number of further images of every stratum of every factor; 0: none."""
+        ...
 
     def estimate(
         self,
@@ -41,41 +55,43 @@ class Estimator(Protocol):
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign of Eq. 2.
+        """Estimate ``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign of Eq. 2.
 
-        ``losses`` are those of ``images`` and ``probes``, as functions of ``params``; ``vector`` is v; ``probes`` are
-        by factor.
+        Args:
+            losses: of ``images`` and ``probes``, as functions of ``params``.
+            params: the trained parameters.
+            vector: v.
+            images: the object's training images.
+            probes: its probes, by factor.
         """
         ...
 
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        """Estimate ``dL_val/dpsi`` of one object through the training that was run, sign included."""
         ...
 
 
+@validated
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Stratified sampling: mean scores of every bin of every factor, and under every anchor light, from probes of each
-    (:mod:`gradient.stratified`).
+    """Stratified sampling: the derivative over hard bins, from mean scores of probes of every bin of every factor.
 
-    An outer iteration costs one Jacobian-vector product over the predictor for its probes, computed by ``theta_mode``
-    (see :func:`gradient.mixed.scores`).
+    With ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is ``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits
+    without a floor ``p_i (s_i - sum_j p_j s_j)``. For lights, differences of mean scores take its place, see
+    :func:`across_lights`.
+
+    Only mean scores are estimated: every bin is sampled by itself, whatever p, and the renderer is never
+    differentiated. All bins show the same scenes, with the same random numbers for all that is not the bin, so that
+    differences between bins owe nothing to backgrounds and distances. An outer iteration costs one Jacobian-vector
+    product over the predictor for its probes, computed by ``theta_mode`` (see :func:`gradient.mixed.scores`).
     """
 
     wanted: ClassVar[Wanted] = "probes"
-    probes_per_bin: int = 48
-    chunk_size: int = 64
+    probes_per_bin: PositiveInt = 48
+    chunk_size: PositiveInt = 64
     theta_mode: ThetaMode = "central_difference"
-
-    def __post_init__(self) -> None:
-        if self.probes_per_bin < 1:
-            raise ValueError(f"gradient.probes_per_bin must be at least 1, got {self.probes_per_bin}")
-        if self.theta_mode not in get_args(ThetaMode):
-            raise ValueError(
-                f"gradient.theta_mode must be one of {get_args(ThetaMode)}, got {self.theta_mode!r}"
-            )
 
     @property
     def draws(self) -> HardDraws:
@@ -90,8 +106,10 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`Estimator`. Null hypothesis of its p-values: a factor's bins, or lights, have equal mean scores,
-        so that the derivative is zero.
+        """See :class:`Estimator`.
+
+        Null hypothesis of the p-values: a factor's bins, or lights, have equal mean scores, so that the derivative is
+        zero.
         """
         scored = losses.probes
         if scored is None:
@@ -105,6 +123,7 @@ class StratifiedEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
+        """See :class:`Estimator`."""
         return self._over_strata(lambda index: sums.probes[index.to(sums.probes.device)], images, probes)
 
     def _over_strata(
@@ -115,7 +134,9 @@ class StratifiedEstimator:
             raise ValueError(
                 f"stratified: wants probes of {list(distribution.names)}, which it scores, got {list(probes)}"
             )
-        weight, psi, parts, p_values = float(images.weights.sum()), distribution.split(images.psi), {}, {}
+        weight, psi = float(images.weights.sum()), distribution.split(images.psi)
+        parts: dict[str, MixedDerivative] = {}
+        p_values: dict[str, float] = {}
         for factor in distribution.factors:
             strata = probes[factor.name]
             along = scored(strata.index).to(images.psi)
@@ -128,12 +149,97 @@ class StratifiedEstimator:
         )
 
 
+def stratified(
+    table: Float[Tensor, "k n"],
+    psi: Float[Tensor, "k"],
+    log_probabilities: LogProbabilities,
+    weight: float = 1.0,
+) -> MixedDerivative:
+    """Estimate ``weight * dE/dpsi`` from the scores of ``n`` scenes, each with the object in every bin.
+
+    Scenes are independent, so that the standard error is that of the mean over scenes of each one's derivative. What a
+    scene adds to its scores in all bins alike adds nothing to it. Infinite for one scene.
+
+    Raises:
+        ValueError: another shape, or no scene.
+    """
+    if table.ndim != 2 or table.shape[0] != psi.numel() or table.shape[1] == 0:
+        raise ValueError(
+            f"stratified: want scores [{psi.numel()} bins, at least one scene], got shape {tuple(table.shape)}"
+        )
+    # An offset common to all bins moves nothing. Subtracted first, equal scores give exactly 0 instead of a rounding
+    # error.
+    return _mean((table - table[:1]).T @ _jacobian(log_probabilities, psi), weight)
+
+
+def by_strata(
+    scores: Float[Tensor, "n"], factor: Factor, psi: Float[Tensor, "k"], weight: float = 1.0
+) -> MixedDerivative:
+    """Estimate the derivative by one factor's psi from the scores of its probes, stratum after stratum.
+
+    For bins it is that of :func:`stratified`, for lights of :func:`across_lights`.
+    """
+    table = scores.view(factor.size, -1)
+    if isinstance(factor, BinnedFactor):
+        return stratified(table, psi, factor.log_probabilities, weight)
+    return across_lights(table, weight)
+
+
+def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDerivative:
+    """Estimate ``weight * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights.
+
+    What is common to all lights is subtracted, since the projection onto the constraint removes it.
+
+    This is not the derivative of the training loss by psi, whose weights blend the lights in every image
+    (``gradient=pathwise`` computes that one). It is the derivative for another training set: images under single
+    lights, a fraction w_i of them under light i. It replaces the derivative by the blend, which says little about a
+    large change of light: a detector that never saw a light gains nothing from a trace of it (docs/numerics.md, Lights,
+    compares both with the truth). ``table`` has the scores of ``n`` scenes under each light.
+
+    Raises:
+        ValueError: no scene.
+    """
+    if table.numel() == 0:
+        raise ValueError(
+            f"stratified: want scores [lights, at least one scene], got shape {tuple(table.shape)}"
+        )
+    return _mean((table - table.mean(0)).T, weight)
+
+
+def importance_weights(
+    probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], weight: float = 1.0
+) -> Float[Tensor, "n"]:
+    """Compute weights ``weight p_b / n_b`` under which images of prescribed bins train as if drawn from p.
+
+    ``weight`` is the object's fraction of the training set. The weights sum to it when every bin of positive p was
+    drawn; the mass of other bins is missing, not redistributed.
+    """
+    counts = torch.bincount(bins, minlength=probabilities.numel())
+    return weight * (probabilities / counts.clamp_min(1))[bins]
+
+
+def _mean(by_scene: Float[Tensor, "n k"], weight: float) -> MixedDerivative:
+    """Take the mean over independent scenes; of one scene the standard error is infinite."""
+    count = len(by_scene)
+    error = by_scene.std(0) / count**0.5 if count > 1 else torch.full_like(by_scene[0], torch.inf)
+    return MixedDerivative(weight * by_scene.mean(0), weight * error)
+
+
+def _jacobian(log_probabilities: LogProbabilities, psi: Tensor) -> Float[Tensor, "k k"]:
+    """Compute ``dp_b/dpsi_i`` at row b, column i."""
+    leaf = psi.detach().requires_grad_()
+    with torch.enable_grad():
+        p = log_probabilities(leaf).exp()
+    return torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in p])
+
+
+@validated
 @dataclass(frozen=True)
 class ReinforceEstimator:
-    """The score function on hard draws with a leave-one-out baseline, see :mod:`gradient.reinforce`."""
+    """The score function (Williams 1992) on hard draws, with a leave-one-out baseline (Kool et al. 2019)."""
 
     wanted: ClassVar[Wanted] = "weights"
-    chunk_size: int = 64
+    chunk_size: PositiveInt = 64
 
     @property
     def draws(self) -> HardDraws:
@@ -153,8 +259,9 @@ class ReinforceEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`Estimator`. Null hypothesis of its p-values: scores do not depend on the bins, or lights, that a
-        factor drew.
+        """See :class:`Estimator`.
+
+        Null hypothesis of the p-values: scores do not depend on the bins, or lights, that a factor drew.
         """
         return self._by_score_function(
             scores(losses.cached, params, vector, images.index, self.chunk_size), images
@@ -163,6 +270,7 @@ class ReinforceEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
+        """See :class:`Estimator`."""
         by_weight = sums.images[images.index.to(sums.images.device)]
         return self._by_score_function(by_weight / images.weights.to(by_weight), images)
 
@@ -176,3 +284,37 @@ class ReinforceEstimator:
         drawn = images.distribution.statistics(images.draw)
         p_values = {name: no_association(along, values) for name, values in drawn.items()}
         return replace(reinforce(along, log_prob, images.psi, weight), p_values=p_values)
+
+
+def reinforce(
+    scores: Float[Tensor, "n"],
+    log_prob: Callable[[Float[Tensor, "K"]], Float[Tensor, "n"]],
+    psi: Float[Tensor, "K"],
+    weight: float = 1.0,
+) -> MixedDerivative:
+    """Estimate ``weight * d/dpsi E[s]`` by the mean of ``weight (s_i - b_i) dlog p(V_i)/dpsi`` over independent draws.
+
+    ``b_i`` is the mean of the other draws' scores, hence independent of draw i: the estimate stays unbiased.
+    ``log_prob`` maps psi to the draws' log-probabilities.
+
+    Raises:
+        ValueError: fewer than 2 draws.
+    """
+    count = scores.numel()
+    if scores.ndim != 1 or count < 2:
+        raise ValueError(
+            f"reinforce: a leave-one-out baseline wants at least 2 scores, got shape {tuple(scores.shape)}"
+        )
+    advantage = (scores - scores.mean()) * (count / (count - 1))
+    leaf = psi.detach().requires_grad_()
+    with torch.enable_grad():
+        log_probabilities = log_prob(leaf)
+    if log_probabilities.shape != scores.shape:
+        raise ValueError(
+            f"reinforce: got log-probabilities of shape {tuple(log_probabilities.shape)} for {count} scores"
+        )
+    slopes = [
+        torch.autograd.grad(entry, leaf, retain_graph=True, materialize_grads=True)[0]
+        for entry in log_probabilities
+    ]
+    return from_contributions(weight / count * advantage[:, None] * torch.stack(slopes))

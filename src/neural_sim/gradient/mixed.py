@@ -1,12 +1,13 @@
 """The mixed second derivative of the training loss, contracted with v first (paper, Tool 2).
 
-That leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one
-image-sized array, ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
+That leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one image-sized array,
+``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from collections.abc import Callable
+from typing import Literal, cast, get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +18,8 @@ from neural_sim.solver.hvp import difference_length
 from neural_sim.solver.operator import flatten
 
 ThetaMode = Literal["forward", "central_difference"]
+LossesOf = Callable[[Params], Tensor]
+"""Losses of fixed images as a function of the parameters."""
 
 
 def scores(
@@ -27,8 +30,7 @@ def scores(
     chunk_size: int = 32,
     mode: ThetaMode = "forward",
 ) -> Float[Tensor, "n"]:
-    """``s_i = <dl_i/dtheta, v>`` of the images in ``index``, at most ``chunk_size`` of them in memory at a
-    time.
+    """Compute ``s_i = <dl_i/dtheta, v>`` of the images in ``index``, ``chunk_size`` of them in memory at a time.
 
     ``forward``: one Jacobian-vector product gives a chunk's scores. ``central_difference``: the losses at
     ``theta +- h v``, two plain passes instead of forward mode's four, with an error of relative order eps^(2/3).
@@ -41,7 +43,7 @@ def scores(
     if not len(index):
         return next(iter(params.values())).new_zeros(0)
     index = index.to(_device(params))
-    parts = [along(lambda p, rows=rows: losses(p, rows), params, vector) for rows in index.split(chunk_size)]
+    parts = [along(_at_rows(losses, rows), params, vector) for rows in torch.split(index, chunk_size)]
     return torch.cat(parts).detach()
 
 
@@ -54,7 +56,7 @@ def image_cotangents(
     weights: Float[Tensor, "n"],
     chunk_size: int = 16,
 ) -> Float[Tensor, "n 3 h w"]:
-    """``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (left factor of Eq. 3 times v).
+    """Compute ``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (left factor of Eq. 3 times v).
 
     The inner derivative, in theta, is taken in forward mode, the outer one, in the images, in reverse mode.
 
@@ -65,22 +67,32 @@ def image_cotangents(
     if not len(index):
         return torch.zeros_like(images)
     index, weights = index.to(_device(params)), weights.to(_device(params))
-    parts = []
-    chunks = zip(*(values.split(chunk_size) for values in (index, weights, images)), strict=True)
+    parts: list[Tensor] = []
+    chunks = zip(*(torch.split(values, chunk_size) for values in (index, weights, images)), strict=True)
     for rows, weight, chunk in chunks:
         leaf = chunk.detach().requires_grad_()
+
+        def losses(at: Params, leaf: Tensor = leaf, rows: Tensor = rows) -> Tensor:
+            return loss_of(at, leaf, rows)
+
         with torch.enable_grad():
-            score = _forward_scores(lambda p, x=leaf, rows=rows: loss_of(p, x, rows), params, vector)
-            parts.append(torch.autograd.grad(score @ weight.to(score), leaf, materialize_grads=True)[0])
+            score = _forward_scores(losses, params, vector)
+            (part,) = torch.autograd.grad(score @ weight.to(score), (leaf,), materialize_grads=True)
+        parts.append(part)
     return torch.cat(parts).detach()
 
 
-def _forward_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
+def _at_rows(losses: IndexedLoss, rows: Int[Tensor, "n"]) -> LossesOf:
+    return lambda params: losses(params, rows)
+
+
+def _forward_scores(losses: LossesOf, params: Params, vector: Params) -> Float[Tensor, "n"]:
     fixed = {name: tensor.detach() for name, tensor in params.items()}
-    return torch.func.jvp(losses, (fixed,), ({name: vector[name].detach() for name in fixed},))[1]
+    ahead = {name: vector[name].detach() for name in fixed}
+    return cast(Tensor, torch.func.jvp(losses, (fixed,), (ahead,))[1])
 
 
-def _differenced_scores(losses, params: Params, vector: Params) -> Float[Tensor, "n"]:
+def _differenced_scores(losses: LossesOf, params: Params, vector: Params) -> Float[Tensor, "n"]:
     fixed = {name: tensor.detach() for name, tensor in params.items()}
     ahead = {name: vector[name].detach() for name in fixed}
     length = difference_length(flatten(fixed), flatten(ahead))
@@ -96,7 +108,7 @@ _ALONG = {"forward": _forward_scores, "central_difference": _differenced_scores}
 
 
 def _device(params: Params) -> torch.device:
-    """Where losses are computed: rows and weights, which are on the CPU, are moved there once."""
+    """Say where losses are computed: rows and weights, which are on the CPU, are moved there once."""
     return next(iter(params.values())).device
 
 

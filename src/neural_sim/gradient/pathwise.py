@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -34,6 +34,7 @@ from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.significance import zero_mean
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import COORDINATES
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
@@ -42,6 +43,7 @@ Mode = Literal["forward", "reverse"]
 RenderRays = Callable[[Rays], tuple[Tensor, Tensor]]
 
 
+@validated
 @dataclass(frozen=True)
 class PathwiseEstimator:
     """Relaxed draws, differentiated through the renderer.
@@ -58,15 +60,8 @@ class PathwiseEstimator:
 
     wanted: ClassVar[Wanted] = "inputs"
     mode: Mode = "forward"
-    patch_size: int = 4096
-    chunk_size: int = 16
-
-    def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise ValueError(f"gradient.mode must be one of {get_args(Mode)}, got {self.mode!r}")
-        for key in ("patch_size", "chunk_size"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"gradient.{key} must be at least 1, got {getattr(self, key)}")
+    patch_size: PositiveInt = 4096
+    chunk_size: PositiveInt = 16
 
     @property
     def probes_per_bin(self) -> int:
@@ -86,8 +81,10 @@ class PathwiseEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`~neural_sim.gradient.estimators.Estimator`. Tangents of the first render are used in either mode;
-        p-values are those of :func:`significance.zero_mean` for the images' contributions.
+        """See :class:`~neural_sim.gradient.estimators.Estimator`.
+
+        Tangents of the first render are used in either mode. p-values are those of :func:`significance.zero_mean` for
+        the images' contributions.
 
         Raises:
             ValueError: images without a path.
@@ -107,6 +104,7 @@ class PathwiseEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
+        """See :class:`~neural_sim.gradient.estimators.Estimator`."""
         path = _path(images)
         cotangents = sums.cotangents(_pixels(images), images.index, self.chunk_size)
         return self._through_images(path, cotangents, images)
@@ -160,7 +158,7 @@ def draw_cotangents(
     on_device = moved([number.detach() for number in drawn.values()], rgb.device)
     numbers = dict(zip(drawn, on_device, strict=True))
     total = {name: torch.zeros_like(number) for name, number in numbers.items()}
-    for pixels in live.split(patch_size) if len(live) else ():
+    for pixels in torch.split(live, patch_size) if len(live) else ():
         leaves = {name: number.detach().requires_grad_() for name, number in numbers.items()}
         with torch.enable_grad():
             poses = cameras.orbit(*(leaves[name] for name in RIGID), radius=draw.radius)

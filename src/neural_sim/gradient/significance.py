@@ -25,7 +25,7 @@ _TIE = 1.0 - 1e-9
 
 
 def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
-    """p-value of the null that independent ``rows`` have mean zero, by random changes of their signs.
+    """Compute the p-value of the null that independent ``rows`` have mean zero, by random changes of their signs.
 
     Exact for rows symmetric about zero, whatever their tails, their variances and the dependence between their
     components. Rows of zeros add nothing: with m others the p-value is at least about 2^(1 - m). 1 for rows that are
@@ -44,8 +44,10 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
 
 
 def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
-    """p-value of the null that the images' ``scores`` have the same mean whatever was ``drawn`` for them (the bin as a
-    row of zeros and a one, or numbers), by random changes of the contributions ``(s_i - mean s)(d_i - mean d)``.
+    """Compute the p-value of the null that images' ``scores`` have the same mean whatever was ``drawn`` for them.
+
+    What was drawn is the bin, as a row of zeros and a one, or numbers. The contributions ``(s_i - mean s)(d_i - mean
+    d)`` are changed at random.
 
     The larger of two p-values, so that the level holds where either does. Scores permuted over the images: exact where
     scores do not depend on what was drawn, for any law of the scores, any skewness and any number of images. Signs
@@ -69,8 +71,9 @@ def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draw
 
 
 def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) -> float:
-    """p-value of the null that the same scenes have the same mean score under every light, by random changes of each
-    scene's scores apart from their mean.
+    """Compute the p-value of the null that the same scenes have the same mean score under every light.
+
+    Each scene's scores are changed at random, apart from their mean.
 
     The larger of two p-values, as in :func:`no_association`: each scene's scores permuted among the lights, exact where
     a scene's scores differ by chance alone, for any law; signs changed, for lights under which scores scatter
@@ -98,22 +101,24 @@ def _p_value(observed: Tensor, changed: Callable[[int, torch.Generator], Tensor]
 
 
 def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "*d k"]) -> Float[Tensor, "*d"]:
-    """Q; a component to which nothing contributes adds 0."""
+    """Compute Q; a component to which nothing contributes adds 0."""
     ratio = sums.square() / torch.where(squares > 0.0, squares, 1.0)
     return torch.where(squares > 0.0, ratio, 0.0).sum(-1)
 
 
 def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
-    """Values without their mean, in a unit of their own. The first value is subtracted beforehand: equal values give
-    exactly 0, not a rounding error.
+    """Subtract the mean of values and put them in a unit of their own.
+
+    The first value is subtracted beforehand: equal values give exactly 0, not a rounding error.
     """
     apart = values - values[:1]
     return _scaled(apart - apart.mean(0))
 
 
 def _scaled(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
-    """Each component over its largest absolute value, so that no square over- or underflows; zeros where a value is not
-    finite.
+    """Divide each component by its largest absolute value, so that no square over- or underflows.
+
+    Zeros where a value is not finite.
     """
     if not bool(values.isfinite().all()):
         return torch.zeros_like(values)

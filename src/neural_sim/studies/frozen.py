@@ -12,10 +12,10 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Losses, MixedDerivative
+from neural_sim.gradient.estimators import by_strata
 from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.stratified import by_strata
 from neural_sim.outer.binding import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor, Factor

@@ -7,9 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from neural_sim.gradient.reinforce import reinforce
+from neural_sim.gradient.estimators import reinforce, stratified
 from neural_sim.gradient.significance import no_association, no_difference, zero_mean
-from neural_sim.gradient.stratified import stratified
 from neural_sim.parameter import bins as binned
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, worst
 
