@@ -69,7 +69,9 @@ def test_types_cameras_and_solvers_know_only_torch():
     for path, package, module in _imports():
         top = module.split(".")[0]
         if package in TORCH_ONLY and top != "neural_sim":
-            assert top in {"torch", "jaxtyping", "typing_extensions"} | standard, f"{path} imports {module}"
+            assert top in {"torch", "jaxtyping", "typing_extensions", "annotated_types"} | standard, (
+                f"{path} imports {module}"
+            )
 
 
 def test_no_file_grows_over_400_lines():

@@ -193,10 +193,19 @@ def _instantiate(node: Any, where: str) -> Any:
     except Exception as error:  # Hydra wraps whatever the constructor raised
         cause = error.__cause__ or error
         inner = re.search(r"^full_key: (\S+)", str(error), re.MULTILINE)
-        where = f"{where}.{inner[1]}" if inner else where
         if isinstance(cause, (ValueError, TypeError, FileNotFoundError, InstantiationException)):
-            raise UserError(f"{where}: {first_line(cause)}") from error
+            raise UserError(_told(first_line(cause), node, where, inner[1] if inner else "")) from error
         raise
+
+
+def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
+    """Name a constructor's complaint, which may begin with ``Class.argument``, by the whole key."""
+    made: Any = node
+    for key in filter(None, inner.split(".")):
+        made, where = made.get(key) if isinstance(made, Mapping) else None, f"{where}.{key}"
+    made = made["_target_"].rpartition(".")[2] if isinstance(made, Mapping) else ""
+    rest = message.removeprefix(f"{made}.")
+    return f"{where}: {message}" if rest == message else f"{where}.{rest}"
 
 
 def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:

@@ -9,11 +9,11 @@ from torchvision.models import resnet18
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.classifier import Classifier
+from neural_sim.detector.losses import IGNORED
 from neural_sim.detector.module import Optimisation
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.settings import Backbone
-from neural_sim.detector.targets import IGNORED
 from neural_sim.detector.training import train_detector
 from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
@@ -130,8 +130,6 @@ def test_it_learns_colours(tools):
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda: make(1), r"detector\.num_classes: want at least 2, for a classifier, got 1"),
-        (lambda: make(activation="tanh"), r"detector\.activation"),
         (lambda: make(backbone=Backbone("tiny", "DEFAULT")), r"detector\.backbone\.weights: tiny has no"),
         (
             lambda: make().assign(torch.zeros(2, 2, 4), torch.tensor([[1, -1], [0, 2]])),

@@ -3,8 +3,7 @@
 import torch
 from PIL import Image
 
-from neural_sim.detector.photographs import detect
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved import SavedDetector, detect
 from neural_sim.target.photographs import letterbox
 
 

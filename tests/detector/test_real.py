@@ -8,7 +8,7 @@ import torch
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Optimisation
 from neural_sim.detector.real import Real, Sampling, shuffled_passes
-from neural_sim.detector.training import Batches, Training, train_detector
+from neural_sim.detector.training import Batches, train_detector
 from neural_sim.types import LabelledImages
 
 
@@ -50,29 +50,9 @@ def test_fewer_photographs_than_asked_for_are_all_taken_where_that_is_allowed(to
         Real("combined", count=5, fewer="all").chosen(None, 0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"mode": "both"}, r"real\.mode must be one of none, combined, pretrain, got 'both'"),
-        ({"fewer": "most"}, r"real\.fewer must be one of refuse, all, got 'most'"),
-        ({"count": -1}, r"real\.count must be at least 0, got -1"),
-        ({"count": 3, "fraction": 0.5}, "want count or fraction, got both"),
-        ({"fraction": 1.5}, r"real\.fraction must lie in \(0, 1\], got 1.5"),
-        ({"batch_fraction": 1.0}, r"real\.batch_fraction must lie in \(0, 1\) or be null, got 1.0"),
-        ({"finetune": 0.0}, r"real\.finetune must be positive and finite, got 0.0"),
-        ({"finetune_learning_rate": float("inf")}, r"finetune_learning_rate must be positive and finite"),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Real(**settings)
-
-
 def test_no_photographs_are_no_mode():
     assert not Real().used and not Real("combined", count=0).used and not Real("pretrain").combined
     assert Real("combined").combined and Real("pretrain").used
-    with pytest.raises(ValueError, match=r"training\.batch_size must be at least 2, got 1"):
-        Training(batch_size=1, real=Real("combined"))
 
 
 def test_every_batch_has_its_fraction_and_every_image_its_turn():

@@ -162,25 +162,12 @@ def test_default_tiny_is_small(generator):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"backbone": {"architecture": "vgg"}}, "detector.backbone.architecture"),
-        ({"activation": "tanh"}, "detector.activation"),
-        ({"losses": {"box": "huber"}}, "detector.losses.box"),
         ({"anchors": {"strides": (8, 32)}}, "detector.anchors.strides"),
         ({"anchors": {"strides": (16, 8)}}, "detector.anchors.strides"),
         ({"anchors": {"strides": (8, 16, 64), "sizes": ((8,),) * 3}}, "detector.anchors.strides"),
         ({"anchors": {"strides": (32, 64)}}, "detector.anchors.strides"),
-        ({"backbone": {"freeze": True}}, "detector.backbone.freeze"),
-        ({"head": {"normalisation": "batch"}}, "detector.head.normalisation"),
-        ({"anchors": {"reference": 0}}, "detector.anchors.reference"),
-        ({"anchors": {"sizes": ((8,),)}}, "detector.anchors.sizes"),
-        ({"anchors": {"sizes": ((8,), (16, 24))}}, "detector.anchors.sizes"),
         ({"backbone": {"weights": "DEFAULT"}}, "detector.backbone.weights"),
         ({"backbone": {"architecture": "resnet18", "weights": "nowhere.pth"}}, "detector.backbone.weights"),
-        ({"anchors": {"foreground_iou": 0.3}}, "detector.anchors.foreground_iou"),
-        ({"head": {"channels": 12}}, "detector.head.channels"),
-        ({"head": {"convs": 5}}, "detector.head.convs"),
-        ({"head": {"prior": 1.0}}, "detector.head.prior"),
-        ({"num_classes": 0}, "detector.num_classes"),
     ],
 )
 def test_bad_settings_are_named(tools, changes, message):

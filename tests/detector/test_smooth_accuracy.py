@@ -7,7 +7,7 @@ from torchmetrics.classification import MulticlassAccuracy
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.metrics import AveragePrecision, evaluate, mean_of, of_document
 from neural_sim.detector.settings import Backbone
-from neural_sim.detector.smooth_accuracy import SmoothAccuracy
+from neural_sim.detector.smooth_scores import SmoothAccuracy
 from neural_sim.types import LabelledImages
 
 NAMES = ("a", "b", "c")
@@ -96,9 +96,3 @@ def test_its_derivative_is_that_of_central_differences(case, generator):
     difference = float(value(at + 1e-5 * along) - value(at - 1e-5 * along)) / 2e-5
     assert bool(slope.isfinite().all())
     assert float((slope * along).sum()) == pytest.approx(difference, rel=1e-8)
-
-
-@pytest.mark.parametrize("settings", [{"temperature": 0.0}, {"loss": -0.1}])
-def test_settings_out_of_range_are_refused(settings):
-    with pytest.raises(ValueError, match=rf"smooth_accuracy\.{next(iter(settings))}"):
-        SmoothAccuracy(**settings)

@@ -6,7 +6,7 @@ from torchvision.ops import box_iou
 
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.protocol import Best
-from neural_sim.detector.smooth_ap import THRESHOLDS, Ranked, SmoothAP, overlap, ranked
+from neural_sim.detector.smooth_scores import THRESHOLDS, Ranked, SmoothAP, overlap, ranked
 from neural_sim.types import LabelledImages
 
 SHARP = SmoothAP(temperature=1e-6, width=1e-6)
@@ -80,12 +80,6 @@ def test_no_boxes_is_refused_and_no_detections_is_zero():
     assert float(SmoothAP().of_class(none).sum()) == 0.0
     with pytest.raises(ValueError, match="at least one box"):
         SmoothAP().of_class(Ranked(none.logits, none.overlaps, none.image, none.box, 0))
-
-
-@pytest.mark.parametrize("bad", [{"temperature": 0.0}, {"width": -1.0}, {"per_class": 0}, {"loss": -0.1}])
-def test_settings_out_of_range_are_refused(bad):
-    with pytest.raises(ValueError, match=rf"smooth_ap.*{next(iter(bad))}"):
-        SmoothAP(**bad)
 
 
 def test_overlap_is_torchvisions():

@@ -3,7 +3,7 @@ import torch
 from torchvision.models.detection._utils import BoxCoder, Matcher
 from torchvision.ops import box_iou
 
-from neural_sim.detector.targets import BACKGROUND
+from neural_sim.detector.losses import BACKGROUND
 
 
 def test_assign_is_torchvisions_matcher_image_by_image(tools):

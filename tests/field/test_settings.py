@@ -25,7 +25,7 @@ CASES = [
     (GRID, {"batch_rays": 0}, "GridFitting.batch_rays: want at least 1"),
     (GRID, {"prune_weight": 1.0}, "GridFitting.prune_weight: want at least 0 and less than 1"),
     (GRID, {"resolution": 100}, "GridFitting.resolution: want a power of two from 32, got 100"),
-    (GRID, {"resolution": 64}, "resolution: want at least 32 after halving it 2 times, got 64"),
+    (GRID, {"resolution": 64}, "GridFitting.resolution: want at least 32 after halving it 2 times, got 64"),
     (GRID, {"refine_steps": (0,)}, "GridFitting.refine_steps[0]: want at least 1"),
     (partial(AppearanceFitting, AppearanceField(), GridFitting), {"anchors": 0}, "AppearanceFitting.anchors: want"),
     (
@@ -37,6 +37,8 @@ CASES = [
     (RECIPE, {"final_rate": 0.0}, "FieldRecipe.final_rate: want more than 0 and at most 1"),
     (RECIPE, {"score_every": -1}, "FieldRecipe.score_every: want at least 0"),
     (SceneMasks, {"resolution": 98}, "SceneMasks.resolution: want at least 16 and a multiple of 4, got 98"),
+    (SceneMasks, {"batch_rays": 0}, "SceneMasks.batch_rays: want at least 1"),
+    (SceneMasks, {"seed": -1}, "SceneMasks.seed: want at least 0"),
     (SceneMasks, {"steps": 0}, "SceneMasks.steps: want at least 1"),
     (SceneMasks, {"image_size": 15}, "SceneMasks.image_size: want at least 16"),
 ]  # fmt: skip

@@ -9,9 +9,9 @@ import pytest
 import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.optimiser import AdamW
 from neural_sim.detector.real import shuffled_passes
-from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import train
 from neural_sim.gradient.accumulated import Accumulated, ProbeGroups, Unrolled, step_weights
 from neural_sim.gradient.base import ObjectImages, Probes

@@ -7,8 +7,7 @@ from small_loop import TINY
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.smooth_accuracy import SmoothAccuracy
-from neural_sim.detector.smooth_ap import SmoothAP
+from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.outer.objective import Objective
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.operator import flatten, unflatten

@@ -9,9 +9,9 @@ import torch
 from small_loop import FREE
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
-from neural_sim.detector.targets import Targets
 from neural_sim.detector.training import Training
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Probes

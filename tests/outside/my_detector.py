@@ -3,9 +3,8 @@
 import torch
 from torch.nn import functional as F
 
-from neural_sim.detector.losses import box_loss, focal_loss
+from neural_sim.detector.losses import IGNORED, assign_anchors, box_loss, focal_loss
 from neural_sim.detector.protocol import Detector
-from neural_sim.detector.targets import IGNORED, assign_anchors
 
 
 class Cells(Detector):

@@ -60,11 +60,11 @@ def test_masks_are_stored_and_keyed_by_what_makes_them(root, tmp_path):
     ("override", "message"),
     [
         ("objects.masks=sceen", r"objects\.masks: want .*scene.*got 'sceen'"),
-        ("objects.scene.steps=0", r"objects.*scene\.steps must be at least 1, got 0"),
+        ("objects.scene.steps=0", r"objects\.scene\.steps: want at least 1, got 0"),
         ("objects.scene=null", r"objects\.masks=scene: want objects\.scene"),
         (
             "objects.box=[[0,0,0],[1,0,1]]",
-            r"objects\.box: want \[\[x0, y0, z0\], \[x1, y1, z1\]\].* for can, got",
+            r"objects\.box: want \[\[x0, y0, z0\], \[x1, y1, z1\]\] with .* or a mapping or null, got",
         ),
     ],
 )

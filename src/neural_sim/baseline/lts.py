@@ -36,9 +36,6 @@ class LearningToSimulate:
         decay: of the moving averages of the reward and of its square.
         max_step: largest change of a logit a step.
         rounds: training sets for each outer iteration of the budget; two take about as long as one hypergradient.
-
-    Raises:
-        ValueError: any of these out of its range.
     """
 
     explores: ClassVar[bool] = True

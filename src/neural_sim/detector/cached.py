@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Outputs, Parameters
-from neural_sim.detector.targets import Targets
 from neural_sim.types import LabelledImages
 
 

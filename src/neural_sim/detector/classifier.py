@@ -8,19 +8,22 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from neural_sim.detector.on_backbone import BackboneDetector, check_common
+from neural_sim.detector.losses import IGNORED, Targets
+from neural_sim.detector.on_backbone import BackboneDetector, ImageSize
 from neural_sim.detector.protocol import Outputs, Parameters, Score
-from neural_sim.detector.settings import ARCHITECTURES, Backbone, Detections, check
-from neural_sim.detector.targets import IGNORED, Targets
+from neural_sim.detector.settings import ARCHITECTURES, Activation, Backbone, Detections
+from neural_sim.ranges import NonNegative, validated
 
 
+@validated
 class Classifier(BackboneDetector):
     """Classifies images of one size, each of which shows one object. An image without an object (label -1) has no
     loss.
@@ -33,14 +36,12 @@ class Classifier(BackboneDetector):
 
     def __init__(
         self,
-        num_classes: int,
-        image_size: int | tuple[int, int] = 96,
+        num_classes: Annotated[int, Ge(2)],
+        image_size: ImageSize = 96,
         backbone: Backbone = Backbone(),
-        activation: str = "silu",
-        proximal: float = 0.0,
+        activation: Activation = "silu",
+        proximal: NonNegative = 0.0,
     ) -> None:
-        check_common(num_classes, activation, proximal)
-        check("detector", num_classes=(num_classes, num_classes >= 2, "at least 2, for a classifier"))
         last = ARCHITECTURES[backbone.architecture][-1]
         super().__init__(num_classes, image_size, backbone, (last,), activation, proximal)
         self._predictor = nn.Sequential(OrderedDict(head=nn.Linear(self._widths[0], num_classes)))

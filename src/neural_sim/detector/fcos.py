@@ -12,13 +12,20 @@ from torchvision.models.detection.fcos import FCOSClassificationHead, FCOSRegres
 from torchvision.ops import clip_boxes_to_image
 
 from neural_sim.detector.backbones import group_norm
-from neural_sim.detector.losses import focal_loss
+from neural_sim.detector.losses import Targets, assign_points, focal_loss
 from neural_sim.detector.network import fixed_anchors
-from neural_sim.detector.on_backbone import check_common
+from neural_sim.detector.on_backbone import ImageSize, PyramidDetector
 from neural_sim.detector.protocol import Outputs
-from neural_sim.detector.pyramid import PyramidDetector
-from neural_sim.detector.settings import Anchors, Backbone, Detections, Head, Points, check
-from neural_sim.detector.targets import Targets, assign_points
+from neural_sim.detector.settings import (
+    Activation,
+    Anchors,
+    Backbone,
+    BetweenZeroAndOne,
+    Detections,
+    Head,
+    Points,
+)
+from neural_sim.ranges import NonNegative, PositiveInt, validated
 
 
 class FcosHead(nn.Module):
@@ -52,6 +59,7 @@ class FcosHead(nn.Module):
         return {"cls_logits": self.classification_head(levels), "bbox_regression": torch.cat(codes, 1)}
 
 
+@validated
 class Fcos(PyramidDetector):
     """An FCOS for images of one size; holds its shape, its points and its loss, never its parameters.
 
@@ -64,20 +72,17 @@ class Fcos(PyramidDetector):
 
     def __init__(
         self,
-        num_classes: int,
-        image_size: int | tuple[int, int] = 96,
+        num_classes: PositiveInt,
+        image_size: ImageSize = 96,
         backbone: Backbone = Backbone(),
         head: Head = Head(),
         points: Points = Points(),
-        focal_alpha: float = 0.25,
-        focal_gamma: float = 2.0,
+        focal_alpha: BetweenZeroAndOne = 0.25,
+        focal_gamma: NonNegative = 2.0,
         detections: Detections = Detections(),
-        activation: str = "silu",
-        proximal: float = 0.0,
+        activation: Activation = "silu",
+        proximal: NonNegative = 0.0,
     ) -> None:
-        check_common(num_classes, activation, proximal)
-        check("detector", focal_alpha=(focal_alpha, 0.0 < focal_alpha < 1.0, "inside (0, 1)"),
-              focal_gamma=(focal_gamma, focal_gamma >= 0.0, "at least 0"))  # fmt: skip
         super().__init__(
             num_classes, image_size, backbone, head, points.strides, "detector.points",
             FcosHead(head, num_classes, activation), detections, activation, proximal,
@@ -90,7 +95,7 @@ class Fcos(PyramidDetector):
         self.ranges = _of_points(points.ranges(min(self.image_size)), self.anchors_per_level)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Targets of every point, see :func:`targets.assign_points`.
+        """Targets of every point, see :func:`losses.assign_points`.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.

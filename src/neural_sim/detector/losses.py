@@ -1,13 +1,133 @@
-"""RetinaNet's two losses, elementwise and smooth, so that their Hessians say what a finite step sees."""
+"""What each anchor or point should predict, and the losses of what it does predict.
+
+Losses are elementwise and smooth, so that their Hessians say what a finite step sees.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
+from torchvision.models.detection._utils import encode_boxes
+from torchvision.ops import box_iou
+
+BACKGROUND = -1
+IGNORED = -2
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What each anchor of each image should predict; the anchors of an anchor-free detector are its points.
+
+    ``labels`` is the class index of the anchor's box, ``BACKGROUND`` or ``IGNORED`` (overlap between the two
+    thresholds). ``deltas`` is the box in the detector's code (of an anchor: centre shift in anchor sizes, log size
+    ratio; of a point: distances to the sides in strides), any finite value where there is none; it carries gradients
+    with respect to the boxes.
+    """
+
+    labels: Int[Tensor, "images anchors"]
+    deltas: Float[Tensor, "images anchors 4"]
+
+    def __len__(self) -> int:
+        return self.labels.shape[0]
+
+    def select(self, index: Tensor | slice) -> Targets:
+        """Return the targets of some images."""
+        return Targets(self.labels[index], self.deltas[index])
+
+
+def assign_anchors(
+    anchors: Float[Tensor, "anchors 4"],
+    boxes: Float[Tensor, "images boxes 4"],
+    labels: Int[Tensor, "images boxes"],
+    foreground_iou: float,
+    background_iou: float,
+) -> Targets:
+    """Match anchors to boxes as torchvision's ``Matcher`` with low-quality matches does, without its loop.
+
+    Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding. An anchor takes the box it overlaps
+    most when that overlap reaches ``foreground_iou``, or when no anchor overlaps that box more; it is ignored
+    between the thresholds.
+
+    Raises:
+        ValueError: where a box that is no padding has no area.
+    """
+    present = _present(boxes, labels)
+    images, count = labels.shape
+    if count == 0:
+        shape = (images, anchors.shape[0])
+        return Targets(labels.new_full(shape, BACKGROUND), boxes.new_zeros((*shape, 4)))
+    with torch.no_grad():
+        overlap = box_iou(boxes.reshape(-1, 4), anchors).view(images, count, -1)
+        overlap = torch.where(present[..., None], overlap, -1.0)
+        best, match = overlap.max(dim=1)
+        most = overlap.amax(dim=2, keepdim=True)
+        # A box that no anchor touches would otherwise be claimed by every anchor at overlap 0.
+        rescued = ((overlap == most) & (most > 0)).any(dim=1)
+        foreground = (best >= foreground_iou) | rescued
+        ignored = (best >= background_iou) & ~foreground
+    anchor_labels = torch.where(foreground, labels.gather(1, match), BACKGROUND)
+    anchor_labels = torch.where(ignored, IGNORED, anchor_labels)
+    matched = boxes.gather(1, match[..., None].expand(-1, -1, 4))
+    # Background anchors are given themselves: padding rows have no logarithm, and zero times NaN is NaN.
+    matched = torch.where(foreground[..., None], matched, anchors)
+    tiled = anchors.expand(images, -1, 4).reshape(-1, 4)
+    deltas = encode_boxes(matched.reshape(-1, 4), tiled, boxes.new_ones(4)).view(images, -1, 4)
+    return Targets(anchor_labels, deltas)
+
+
+def assign_points(
+    points: Float[Tensor, "points 2"],
+    strides: Float[Tensor, "points"],
+    ranges: Float[Tensor, "points 2"],
+    boxes: Float[Tensor, "images boxes 4"],
+    labels: Int[Tensor, "images boxes"],
+    radius: float,
+) -> Targets:
+    """Match points to boxes as torchvision's FCOS does.
+
+    A point takes the smallest box that it is inside of, whose centre is within ``radius`` strides of it along both
+    axes, and whose farthest side is at a distance within the point's range (low, high), in pixels.
+
+    Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding.
+
+    Raises:
+        ValueError: where a box that is no padding has no area.
+    """
+    present = _present(boxes, labels)
+    images, count = labels.shape
+    if count == 0:
+        shape = (images, len(points))
+        return Targets(labels.new_full(shape, BACKGROUND), boxes.new_ones((*shape, 4)))
+    with torch.no_grad():
+        corners = boxes[:, :, None]
+        distances = torch.cat([points - corners[..., :2], corners[..., 2:] - points], -1)
+        centres = 0.5 * (corners[..., :2] + corners[..., 2:])
+        near = (points - centres).abs().amax(-1) < radius * strides
+        farthest = distances.amax(-1)
+        found = near & (distances.amin(-1) > 0) & (farthest > ranges[:, 0]) & (farthest < ranges[:, 1])
+        areas = (corners[..., 2:] - corners[..., :2]).prod(-1)
+        smallest, match = torch.where(found & present[..., None], areas, torch.inf).min(1)
+        foreground = smallest < torch.inf
+    matched = boxes.gather(1, match[..., None].expand(-1, -1, 4))
+    reach = torch.cat([points - matched[..., :2], matched[..., 2:] - points], -1) / strides[:, None]
+    return Targets(
+        torch.where(foreground, labels.gather(1, match), BACKGROUND),
+        torch.where(foreground[..., None], reach, 1.0),
+    )
+
+
+def _present(boxes: Tensor, labels: Tensor) -> Tensor:
+    """Which rows are no padding. Raises ``ValueError`` where one of these has no area."""
+    present = labels >= 0
+    empty = present & (boxes[..., 2:] - boxes[..., :2] <= 0).any(-1)
+    if bool(empty.any()):
+        raise ValueError(f"assign: boxes want x0 < x1 and y0 < y1, got {boxes[empty][0].tolist()}")
+    return present
 
 
 def focal_loss(

@@ -11,38 +11,32 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from neural_sim.checks import at_least
-from neural_sim.detector.losses import proximal_loss
+from neural_sim.detector.losses import Targets, proximal_loss
 from neural_sim.detector.optimiser import AdamW, State
 from neural_sim.detector.protocol import Detector, Parameters
-from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import Recorder, Recording, Trajectory
+from neural_sim.ranges import Fraction, NonNegative, PositiveInt, validated
 
 Batch = tuple[tuple[Tensor, ...], Targets]
 
 
+@validated
 @dataclass(frozen=True)
 class Optimisation:
     """How a detector is trained: AdamW with linear warm-up and cosine decay to zero.
 
     Args:
         epochs, batch_size: the budget of steps.
-        learning_rate: the peak of the schedule.
+        learning_rate: the peak of the schedule; 0: parameters stay as they are.
         weight_decay: decoupled weight decay of convolution weights (not of biases and normalisations).
         warmup_fraction: part of the steps over which the learning rate rises.
-
-    Raises:
-        ValueError: no epochs or no batch size.
     """
 
-    epochs: int
-    batch_size: int = 32
-    learning_rate: float = 3e-3
-    weight_decay: float = 1e-4
-    warmup_fraction: float = 0.1
-
-    def __post_init__(self) -> None:
-        at_least("training", 1, epochs=self.epochs, batch_size=self.batch_size)
+    epochs: PositiveInt
+    batch_size: PositiveInt = 32
+    learning_rate: NonNegative = 3e-3
+    weight_decay: NonNegative = 1e-4
+    warmup_fraction: Fraction = 0.1
 
 
 class DetectorModule(pl.LightningModule):

@@ -1,13 +1,13 @@
 """What detectors on a backbone have in common: initial values, which of them are trained, features of images.
 
 The modules here are only the network's shape. Their values always come in as an argument, so that training losses can
-be differentiated any number of times.
+be differentiated any number of times. Most detectors have torchvision's feature pyramid on the backbone, and a head
+that all its levels have in common.
 """
 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -17,19 +17,22 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from neural_sim.detector.backbones import (
-    ACTIVATIONS,
     IMAGENET_MEAN,
     IMAGENET_STD,
     PLANS,
     LastStages,
     build_backbone,
 )
-from neural_sim.detector.initialise import initialise
-from neural_sim.detector.network import NormalisedBackbone
-from neural_sim.detector.protocol import Detector, Parameters
-from neural_sim.detector.settings import SAVED, Backbone, check
+from neural_sim.detector.network import NormalisedBackbone, build_predictor, initialise
+from neural_sim.detector.protocol import Detector, Outputs, Parameters
+from neural_sim.detector.settings import ARCHITECTURES, SAVED, Activation, Backbone, Detections, Head
+from neural_sim.ranges import NonNegative, PositiveInt, validated
+
+ImageSize = PositiveInt | tuple[PositiveInt, PositiveInt]
+"""(height, width) in pixels, or one number for a square."""
 
 
+@validated
 class BackboneDetector(Detector):
     """A detector whose images go through a backbone. A subclass sets ``_predictor``, the network on its features.
 
@@ -50,12 +53,12 @@ class BackboneDetector(Detector):
 
     def __init__(
         self,
-        num_classes: int,
-        image_size: int | tuple[int, int],
+        num_classes: PositiveInt,
+        image_size: ImageSize,
         backbone: Backbone,
         strides: Sequence[int],
-        activation: str,
-        proximal: float,
+        activation: Activation,
+        proximal: NonNegative,
         prior: float | None = None,
     ) -> None:
         self.num_classes = num_classes
@@ -157,11 +160,55 @@ class BackboneDetector(Detector):
             raise ValueError(f"assign: labels want to be below {self.num_classes}, got {int(labels.max())}")
 
 
-def check_common(num_classes: int, activation: str, proximal: float) -> None:
-    """Raises ``ValueError`` for one of these that is out of its range."""
-    check(
-        "detector",
-        num_classes=(num_classes, num_classes >= 1, "at least 1"),
-        activation=(activation, activation in ACTIVATIONS, f"one of {tuple(ACTIVATIONS)}"),
-        proximal=(proximal, 0 <= proximal < math.inf, "finite and at least 0"),
-    )
+class PyramidDetector(BackboneDetector):
+    """A backbone, a feature pyramid and a head; a subclass makes the head, and its targets and losses.
+
+    Args:
+        head: its settings, and the pyramid's.
+        strides: of the pyramid's levels; ``where`` is their key.
+        network: the head's module, of :attr:`Head.channels` channels; it returns ``cls_logits`` [n, anchors, classes]
+            and ``bbox_regression`` [n, anchors, code].
+        activation: ``silu`` or ``relu`` (torchvision's own), of backbone, pyramid and head.
+        detections: see :class:`Detector`.
+
+    See :class:`BackboneDetector` for the others.
+
+    Raises:
+        ValueError: strides that the backbone does not have, with the key and value.
+    """
+
+    def __init__(
+        self,
+        num_classes: PositiveInt,
+        image_size: ImageSize,
+        backbone: Backbone,
+        head: Head,
+        strides: Sequence[int],
+        where: str,
+        network: nn.Module,
+        detections: Detections,
+        activation: Activation,
+        proximal: NonNegative,
+    ) -> None:
+        strides, available = tuple(strides), ARCHITECTURES[backbone.architecture]
+        own = tuple(stride for stride in strides if stride in available)
+        rising = len(own) > 0 and own == tuple(sorted(set(own)))
+        if not rising or strides[len(own) :] != _coarser(own, strides, available):
+            raise ValueError(
+                f"{where}.strides: want an ascending choice of {available} for {backbone.architecture}, and from its "
+                f"last on coarser ones, each twice the one before, got {strides}"
+            )
+        super().__init__(num_classes, image_size, backbone, own, activation, proximal, head.prior)
+        self.detections = detections
+        self._predictor = build_predictor(self._widths, len(strides), network, head, activation)
+
+    def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
+        predictor, maps = self.completed(trainable, features)
+        out = functional_call(self._predictor, predictor, (maps,), strict=True)
+        return out["cls_logits"], out["bbox_regression"]
+
+
+def _coarser(own: tuple[int, ...], strides: tuple[int, ...], available: tuple[int, ...]) -> tuple[int, ...]:
+    """Strides of the levels past the backbone's last, where as many as there are may follow it."""
+    last, count = available[-1], len(strides) - len(own)
+    return tuple(last * 2**n for n in range(1, count + 1)) if last in own else ()

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torchvision.ops import batched_nms
 
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.settings import Detections
-from neural_sim.detector.targets import Targets
 
 Parameters = dict[str, Tensor]
 Score = Literal["AP", "accuracy"]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Gt, Lt
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.randomness import stream
+from neural_sim.ranges import NonNegativeInt, Positive, PositiveFraction, validated
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -21,6 +22,7 @@ Mode = Literal["none", "combined", "pretrain"]
 Fewer = Literal["refuse", "all"]
 
 
+@validated
 @dataclass(frozen=True)
 class Real:
     """How labelled photographs, of the target's part ``train``, are used in training.
@@ -39,38 +41,20 @@ class Real:
             a warning.
 
     Raises:
-        ValueError: any of these out of its range, or both numbers of photographs.
+        ValueError: both numbers of photographs.
     """
 
     mode: Mode = "none"
-    count: int | None = None
-    fraction: float | None = None
-    batch_fraction: float | None = 0.5
-    finetune: float = 0.3
-    finetune_learning_rate: float = 1e-3
+    count: NonNegativeInt | None = None
+    fraction: PositiveFraction | None = None
+    batch_fraction: Annotated[float, Gt(0), Lt(1)] | None = 0.5
+    finetune: Positive = 0.3
+    finetune_learning_rate: Positive = 1e-3
     fewer: Fewer = "refuse"
 
     def __post_init__(self) -> None:
-        for key, choices in (("mode", get_args(Mode)), ("fewer", get_args(Fewer))):
-            if getattr(self, key) not in choices:
-                raise ValueError(
-                    f"training.real.{key} must be one of {', '.join(choices)}, got {getattr(self, key)!r}"
-                )
         if self.count is not None and self.fraction is not None:
-            raise ValueError(
-                f"training.real: want count or fraction, got both, {self.count} and {self.fraction}"
-            )
-        if self.count is not None and self.count < 0:
-            raise ValueError(f"training.real.count must be at least 0, got {self.count}")
-        if self.fraction is not None and not 0.0 < self.fraction <= 1.0:
-            raise ValueError(f"training.real.fraction must lie in (0, 1], got {self.fraction}")
-        if self.batch_fraction is not None and not 0.0 < self.batch_fraction < 1.0:
-            raise ValueError(
-                f"training.real.batch_fraction must lie in (0, 1) or be null, got {self.batch_fraction}"
-            )
-        for key in ("finetune", "finetune_learning_rate"):
-            if not 0.0 < getattr(self, key) < math.inf:
-                raise ValueError(f"training.real.{key} must be positive and finite, got {getattr(self, key)}")
+            raise ValueError(f"want count or fraction, got both, {self.count} and {self.fraction}")
 
     @property
     def used(self) -> bool:

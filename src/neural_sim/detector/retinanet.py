@@ -10,15 +10,15 @@ from torchvision.models.detection.retinanet import RetinaNetHead
 from torchvision.ops import clip_boxes_to_image
 
 from neural_sim.detector.backbones import group_norm
-from neural_sim.detector.losses import box_loss, focal_loss
+from neural_sim.detector.losses import IGNORED, Targets, assign_anchors, box_loss, focal_loss
 from neural_sim.detector.network import fixed_anchors
-from neural_sim.detector.on_backbone import check_common
+from neural_sim.detector.on_backbone import ImageSize, PyramidDetector
 from neural_sim.detector.protocol import Outputs
-from neural_sim.detector.pyramid import PyramidDetector
-from neural_sim.detector.settings import Anchors, Backbone, Detections, Head, Losses
-from neural_sim.detector.targets import IGNORED, Targets, assign_anchors
+from neural_sim.detector.settings import Activation, Anchors, Backbone, Detections, Head, Losses
+from neural_sim.ranges import NonNegative, PositiveInt, validated
 
 
+@validated
 class RetinaNet(PyramidDetector):
     """A RetinaNet for images of one size; holds its shape, its anchors and its loss, never its parameters.
 
@@ -27,17 +27,16 @@ class RetinaNet(PyramidDetector):
 
     def __init__(
         self,
-        num_classes: int,
-        image_size: int | tuple[int, int] = 96,
+        num_classes: PositiveInt,
+        image_size: ImageSize = 96,
         backbone: Backbone = Backbone(),
         head: Head = Head(),
         anchors: Anchors = Anchors(),
         losses: Losses = Losses(),
         detections: Detections = Detections(),
-        activation: str = "silu",
-        proximal: float = 0.0,
+        activation: Activation = "silu",
+        proximal: NonNegative = 0.0,
     ) -> None:
-        check_common(num_classes, activation, proximal)
         norm = group_norm if head.normalisation == "group" else None
         per_location = len(anchors.sizes[0]) * len(anchors.ratios)
         network = RetinaNetHead(head.channels, per_location, num_classes, norm_layer=norm)
@@ -51,7 +50,7 @@ class RetinaNet(PyramidDetector):
         self.anchors, self.anchors_per_level = fixed_anchors(anchors, self.image_size)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Targets of every anchor, see :func:`targets.assign_anchors`.
+        """Targets of every anchor, see :func:`losses.assign_anchors`.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.

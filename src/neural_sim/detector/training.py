@@ -7,23 +7,25 @@ import logging
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Int
 from torch import Tensor
 
-from neural_sim.checks import at_least
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.module import Batch, DetectorModule, Optimisation
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.real import Real, Sampling
-from neural_sim.detector.targets import Targets
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import trainer_on
+from neural_sim.ranges import NonNegative, Positive, PositiveInt, validated
 from neural_sim.types import LabelledImages
 
 
+@validated
 @dataclass(frozen=True)
 class Training:
     """Training settings of every detector, whatever the method that chose its images.
@@ -34,28 +36,24 @@ class Training:
     :class:`Optimisation`.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: batches of one image that should have photographs and synthetic images.
     """
 
-    image_size: int = 96
-    images_per_object: int = 100
+    image_size: Annotated[int, Ge(16)] = 96
+    images_per_object: PositiveInt = 100
     warm_start: Literal["uniform", "initial"] = "uniform"
-    warm_epochs: int = 30
-    cold_epochs: int = 30
-    batch_size: int = 32
-    learning_rate: float = 3e-3
-    weight_decay: float = 1e-4
+    warm_epochs: PositiveInt = 30
+    cold_epochs: PositiveInt = 30
+    batch_size: PositiveInt = 32
+    learning_rate: Positive = 3e-3
+    weight_decay: NonNegative = 1e-4
     real: Real = field(default_factory=Real)
 
     def __post_init__(self) -> None:
-        if self.warm_start not in ("uniform", "initial"):
-            raise ValueError(f"training.warm_start must be uniform or initial, got {self.warm_start!r}")
-        at_least("training", 1, images_per_object=self.images_per_object, batch_size=self.batch_size)
-        at_least("training", 1, warm_epochs=self.warm_epochs, cold_epochs=self.cold_epochs)
-        at_least("training", 16, image_size=self.image_size)
-        at_least("training", 0, learning_rate=self.learning_rate, weight_decay=self.weight_decay)
-        if self.real.combined and self.real.batch_fraction is not None:
-            at_least("training", 2, batch_size=self.batch_size)  # a photograph and a synthetic image
+        if self.real.combined and self.real.batch_fraction is not None and self.batch_size < 2:
+            raise ValueError(
+                f"Training.batch_size: want at least 2, a photograph and a synthetic image, got {self.batch_size}"
+            )
 
     def of(self, epochs: int) -> Optimisation:
         """A training of this many epochs."""

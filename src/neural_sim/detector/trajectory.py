@@ -11,12 +11,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neural_sim.detector.optimiser import AdamW, State
+from neural_sim.ranges import Positive, PositiveFraction, validated
 
 logger = logging.getLogger(__name__)
 GradientAt = Callable[[Tensor, Tensor], Tensor]
 MEGABYTE = 2**20
 
 
+@validated
 @dataclass(frozen=True)
 class Recording:
     """How much of a training is recorded.
@@ -26,19 +28,10 @@ class Recording:
         max_memory_mb: limit in MB. The record has the states of every sqrt(steps)-th step and all gradients; the states
             in between are recomputed elementwise. If the gradients do not fit, they are recomputed, at the cost of one
             more training.
-
-    Raises:
-        ValueError: either of these out of its range.
     """
 
-    part: float = 1.0
-    max_memory_mb: float = 2048.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.part <= 1.0:
-            raise ValueError(f"unrolled.part must lie in (0, 1], got {self.part}")
-        if not self.max_memory_mb > 0.0:
-            raise ValueError(f"unrolled.max_memory_mb must be above 0, got {self.max_memory_mb}")
+    part: PositiveFraction = 1.0
+    max_memory_mb: Positive = 2048.0
 
     def first(self, steps: int) -> int:
         """The first of the recorded steps."""

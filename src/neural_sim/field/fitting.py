@@ -54,7 +54,8 @@ class GridFitting(Fitting):
         super().__init__(field, batch_rays)
         if resolution >> len(refine_steps) < COARSEST:
             raise ValueError(
-                f"resolution: want at least {COARSEST} after halving it {len(refine_steps)} times, got {resolution}"
+                f"GridFitting.resolution: want at least {COARSEST} after halving it {len(refine_steps)} times, "
+                f"got {resolution}"
             )
         self.resolution = resolution
         self.refine_steps, self.prune_steps = tuple(refine_steps), tuple(prune_steps)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Parameters
-from neural_sim.detector.targets import Targets
 from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
 from neural_sim.synthesis.assembly import Compose, RenderedImages, RenderedObject
 from neural_sim.synthesis.scene import Scene

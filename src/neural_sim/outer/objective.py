@@ -11,8 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Outputs, Parameters
-from neural_sim.detector.smooth_accuracy import SmoothAccuracy
-from neural_sim.detector.smooth_ap import SmoothAP
+from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.outer.settings import ObjectiveKind
 from neural_sim.solver.hvp import Term
 from neural_sim.types import LabelledImages

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from neural_sim.checks import at_least
-from neural_sim.detector.smooth_accuracy import SmoothAccuracy
-from neural_sim.detector.smooth_ap import SmoothAP
+from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.significance import SMALLEST
 from neural_sim.parameter.update import Mirror, Update

@@ -47,8 +47,8 @@ class LightRig:
     def __post_init__(self) -> None:
         if self.ambient + self.intensity_range[1] > 1.0 + 1e-9:
             raise ValueError(
-                "lights: ambient and the largest intensity must add up to at most 1, or white surfaces saturate; got "
-                f"{self.ambient} and {self.intensity_range[1]}"
+                f"LightRig.ambient: want at most 1 with the largest intensity, {self.intensity_range[1]}, or white "
+                f"surfaces saturate; got {self.ambient}"
             )
 
     def lights(self) -> tuple[Light, ...]:

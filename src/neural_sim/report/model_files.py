@@ -14,6 +14,7 @@ from torch import Tensor
 from neural_sim.detector.onnx_export import TOLERANCE, export, largest_difference
 from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector
 from neural_sim.extras import require
+from neural_sim.ranges import validated
 from neural_sim.report.tracking import Run
 
 _log = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ REQUIRED = (
 """What the model's code imports; the code of this package travels with it."""
 
 
+@validated
 @dataclass(frozen=True)
 class ModelFiles:
     """What the report writes of the final detector besides ``model.safetensors`` and ``model.json``.

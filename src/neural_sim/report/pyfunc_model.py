@@ -12,8 +12,7 @@ from mlflow.pyfunc import PythonModel  # pyright: ignore[reportPrivateImportUsag
 from PIL import Image
 from typing_extensions import override
 
-from neural_sim.detector.photographs import detect
-from neural_sim.detector.saved import SavedDetector
+from neural_sim.detector.saved import SavedDetector, detect
 
 COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")
 

@@ -6,11 +6,14 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 from neural_sim.solver.base import LinearSolver, Solution, Status
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import Damped, Damping, LanczosDamping
@@ -40,6 +43,7 @@ class Adjoint:
         return self.solution.value
 
 
+@validated
 @dataclass(frozen=True)
 class AdjointSolver:
     """Solves ``(H + lambda I) v = b`` for H the Hessian of a sum of loss terms.
@@ -57,10 +61,10 @@ class AdjointSolver:
     linear: LinearSolver = field(default_factory=ConjugateGradient)
     damping: Damping = field(default_factory=LanczosDamping)
     mode: Mode = "reverse_over_reverse"
-    rtol: float = 3e-2
-    max_steps: int = 40
+    rtol: Annotated[float, Ge(0), Lt(1)] = 3e-2
+    max_steps: PositiveInt = 40
     retain_graph: bool = True
-    max_raises: int = 3
+    max_raises: NonNegativeInt = 3
     sensitivity: bool = False
 
     def solve(

@@ -7,12 +7,17 @@ import enum
 import logging
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.solver.operator import Matvec, NonFiniteProduct, Watched, norm
+
+RestartGain = Annotated[float, Gt(0), Lt(1)]
+"""The factor by which a restart must shrink the residual."""
 
 logger = logging.getLogger(__name__)
 
@@ -215,16 +220,6 @@ def _started(
         "warm start dropped: its relative residual is %.3g, that of zero is 1", norm(residual) / norm(rhs)
     )
     return cold
-
-
-def check_restart_gain(solver: str, restart_gain: float) -> None:
-    """Check the factor by which a restart must shrink the residual.
-
-    Raises:
-        ValueError: it does not lie in (0, 1).
-    """
-    if not 0.0 < restart_gain < 1.0:
-        raise ValueError(f"{solver}: restart_gain must lie in (0, 1), got {restart_gain}")
 
 
 def _check(b: Tensor, x0: Tensor | None, rtol: float, max_steps: int) -> None:

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import torch
 from typing_extensions import override
 
-from neural_sim.solver.base import Iterate, LinearSolver, Status, System, check_restart_gain
+from neural_sim.ranges import validated
+from neural_sim.solver.base import Iterate, LinearSolver, RestartGain, Status, System
 from neural_sim.solver.operator import dot, in_range, norm, numbers, plain_dot, plain_norm
 
 
+@validated
 @dataclass(frozen=True)
 class ConjugateGradient(LinearSolver):
     """Conjugate gradients, for positive definite operators.
@@ -19,10 +21,7 @@ class ConjugateGradient(LinearSolver):
     the latter, as long as each restart shrinks it by this factor.
     """
 
-    restart_gain: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_restart_gain("cg", self.restart_gain)
+    restart_gain: RestartGain = 0.5
 
     @override
     def iterate(self, system: System) -> Iterate:

@@ -6,12 +6,15 @@ import abc
 import logging
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Gt
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from neural_sim.ranges import NonNegative, NonNegativeInt, Positive, PositiveInt, validated
 from neural_sim.solver.base import Search
 from neural_sim.solver.lanczos import Krylov, Spectrum, lanczos, random_start
 from neural_sim.solver.operator import Matvec
@@ -52,6 +55,7 @@ class Damping(abc.ABC):
         return None
 
 
+@validated
 @dataclass(frozen=True)
 class FixedDamping(Damping):
     """A given lambda, for instance 0 where the inner problem's own proximal term bounds its curvature.
@@ -59,17 +63,15 @@ class FixedDamping(Damping):
     ``lanczos_steps`` > 0 estimates the spectrum all the same, for the log.
     """
 
-    value: float
-    lanczos_steps: int = 12
-
-    def __post_init__(self) -> None:
-        _check("fixed", self.value, self.lanczos_steps)
+    value: NonNegative
+    lanczos_steps: NonNegativeInt = 12
 
     @override
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
         return Damped(self.value, _estimate(matvec, b, self.lanczos_steps, generator))
 
 
+@validated
 @dataclass(frozen=True)
 class LanczosDamping(Damping):
     """A lambda past the most negative curvature, and large enough for a wanted condition number.
@@ -84,18 +86,10 @@ class LanczosDamping(Damping):
     solve still meets negative curvature, lambda is raised past it.
     """
 
-    margin: float = 0.25
-    max_condition: float = 100.0
-    minimum: float = 1e-6
-    lanczos_steps: int = 14
-
-    def __post_init__(self) -> None:
-        _check("lanczos", self.minimum, self.lanczos_steps)
-        if self.lanczos_steps < 1 or self.margin <= 0.0 or not self.max_condition > 1.0:
-            raise ValueError(
-                "solver.damping (lanczos): want lanczos_steps >= 1, margin > 0, max_condition > 1, got "
-                f"{self.lanczos_steps}, {self.margin}, {self.max_condition}"
-            )
+    margin: Positive = 0.25
+    max_condition: Annotated[float, Gt(1)] = 100.0
+    minimum: NonNegative = 1e-6
+    lanczos_steps: PositiveInt = 14
 
     @override
     def choose(self, matvec: Matvec, b: Float[Tensor, "n"], generator: torch.Generator) -> Damped:
@@ -127,10 +121,3 @@ def _estimate(matvec: Matvec, like: Tensor, steps: int, generator: torch.Generat
     if steps == 0:
         return None
     return lanczos(matvec, random_start(like.numel(), generator, dtype=like.dtype, device=like.device), steps)
-
-
-def _check(name: str, value: float, steps: int) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise ValueError(f"solver.damping ({name}): lambda must be finite and at least 0, got {value}")
-    if steps < 0:
-        raise ValueError(f"solver.damping ({name}): lanczos_steps must be at least 0, got {steps}")

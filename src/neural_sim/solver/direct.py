@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from neural_sim.ranges import Matching, PositiveInt, validated
 from neural_sim.solver.base import Iterate, LinearSolver, Status, System
 from neural_sim.solver.operator import eigenpairs, norm
 
 
+@validated
 @dataclass(frozen=True)
 class Exact(LinearSolver):
     """The dense solve by eigenvalues, an oracle for small problems: every column of the matrix costs one product.
@@ -23,7 +25,7 @@ class Exact(LinearSolver):
     curvature. ``max_steps`` does not bind. Systems above ``max_size`` raise ``ValueError``.
     """
 
-    max_size: int = 5000
+    max_size: PositiveInt = 5000
 
     @override
     def iterate(self, system: System) -> Iterate:
@@ -64,15 +66,12 @@ def _refined(
     return better if norm(rhs - matrix @ better) < norm(rhs - matrix @ value) else value
 
 
+@validated
 @dataclass(frozen=True)
 class Identity(LinearSolver):
     """``x = scale b``, the one-step choice T1-T2 (Luketina et al. 2016). One product is spent on the residual."""
 
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.scale) and self.scale != 0.0):
-            raise ValueError(f"identity: scale must be finite and not 0, got {self.scale}")
+    scale: Annotated[float, Matching(bool, "a number other than 0")] = 1.0
 
     @override
     def iterate(self, system: System) -> Iterate:

@@ -7,12 +7,13 @@ is that of one chunk. Cost in gradients of the same chunk: about 2 to 3 in every
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.ranges import check
 from neural_sim.solver.operator import columns, flatten, norm, unflatten
 
 Term = Callable[[dict[str, Tensor]], Tensor]
@@ -43,8 +44,7 @@ class HessianOperator:
     ) -> None:
         if not terms:
             raise ValueError("HessianOperator: got no loss terms, want at least one")
-        if mode not in get_args(Mode):
-            raise ValueError(f"HessianOperator: mode must be one of {get_args(Mode)}, got {mode!r}")
+        check(mode, Mode, "HessianOperator.mode")
         self._terms = list(terms)
         self._params = {name: tensor.detach() for name, tensor in params.items()}
         self._point = flatten(self._params)

@@ -10,10 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.solver.base import Iterate, LinearSolver, Status, System, check_restart_gain
+from neural_sim.ranges import validated
+from neural_sim.solver.base import Iterate, LinearSolver, RestartGain, Status, System
 from neural_sim.solver.operator import Watched, dot, norm
 
 
+@validated
 @dataclass(frozen=True)
 class MinimumResidual(LinearSolver):
     """Minimum residuals, for any symmetric operator.
@@ -22,10 +24,7 @@ class MinimumResidual(LinearSolver):
     so. ``restart_gain`` as in ``ConjugateGradient``.
     """
 
-    restart_gain: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_restart_gain("minres", self.restart_gain)
+    restart_gain: RestartGain = 0.5
 
     @override
     def iterate(self, system: System) -> Iterate:

@@ -13,12 +13,12 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 from torchvision.ops import box_iou
 
-from neural_sim.checks import at_least
 from neural_sim.detector.metrics import AveragePrecision
 from neural_sim.documents import markdown_table
+from neural_sim.ranges import Fraction, PositiveInt, validated
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
-from neural_sim.studies.graphs import check_methods, graphs_of_methods
+from neural_sim.studies.graphs import Methods, graphs_of_methods
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
@@ -56,6 +56,7 @@ class Found:
     ap: AveragePrecision
 
 
+@validated
 @dataclass(frozen=True)
 class DetectionGallery(Task):
     """``+experiment=detection_gallery``.
@@ -65,22 +66,12 @@ class DetectionGallery(Task):
         count: photographs, evenly spaced over the test images.
         draw_above: smallest score of a detection that is drawn and counted.
         overlap: smallest intersection over union of a right detection with a box of its class.
-
-    Raises:
-        ValueError: no method, or a number out of its range.
     """
 
-    methods: Sequence[str] = ("ns", "neural_sim")
-    count: int = 6
-    draw_above: float = 0.3
-    overlap: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_methods(self.methods, "detection_gallery.methods")
-        at_least("detection_gallery", 1, count=self.count)
-        for key in ("draw_above", "overlap"):
-            if not 0.0 <= getattr(self, key) <= 1.0:
-                raise ValueError(f"detection_gallery.{key} must lie in [0, 1], got {getattr(self, key)}")
+    methods: Methods = ("ns", "neural_sim")
+    count: PositiveInt = 6
+    draw_above: Fraction = 0.3
+    overlap: Fraction = 0.5
 
     def run(self, context: Context) -> None:
         """Train a detector on what every method learned, and publish the figure, counts and AP."""

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Annotated
 
+from annotated_types import MinLen
+
+from neural_sim.ranges import Distinct
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.tasks.context import Context
 
-
-def check_methods(methods: Sequence[str], key: str) -> None:
-    """Refuse a list of methods, the setting ``key``, that is empty or names one twice.
-
-    Raises:
-        ValueError: for such a list.
-    """
-    if not methods or len(set(methods)) < len(methods):
-        raise ValueError(f"{key}: want different names of baselines, got {list(methods)}")
+Methods = Annotated[Sequence[str], MinLen(1), Distinct()]
+"""Names of baselines."""
 
 
 def graphs_of_methods(context: Context, methods: Sequence[str], key: str) -> dict[str, Graph]:

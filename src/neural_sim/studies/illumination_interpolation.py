@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -15,6 +17,7 @@ from torch import Tensor
 from neural_sim.cameras import orbit
 from neural_sim.documents import markdown_table
 from neural_sim.field.base import RadianceField
+from neural_sim.ranges import Distinct, PositiveInt, validated
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.report.figures import INK, MUTED
 from neural_sim.report.tracking import Run
@@ -33,6 +36,7 @@ class InterpolatedViews:
     opacity_change: float
 
 
+@validated
 @dataclass(frozen=True)
 class Interpolation(Task):
     """``+experiment=illumination_interpolation``: every object from one camera, from one anchor light to another.
@@ -44,25 +48,14 @@ class Interpolation(Task):
         phi_deg: the camera's first angle in degrees, see :func:`neural_sim.cameras.orbit`.
         rho_deg: its second angle in degrees.
         distance: its distance in object radii.
-
-    Raises:
-        ValueError: ends that are not two different lights, fewer than two steps or one pixel.
     """
 
-    ends: tuple[int, int] = (1, 5)
-    steps: int = 7
-    image_size: int = 128
+    ends: Annotated[tuple[PositiveInt, PositiveInt], Distinct()] = (1, 5)
+    steps: Annotated[int, Ge(2)] = 7
+    image_size: PositiveInt = 128
     phi_deg: float = 75.0
     rho_deg: float = 30.0
-    distance: float = 3.0
-
-    def __post_init__(self) -> None:
-        if len(self.ends) != 2 or self.ends[0] == self.ends[1] or min(self.ends) < 1:
-            raise ValueError(f"interpolation.ends: want two different lights from 1, got {list(self.ends)}")
-        if self.steps < 2 or self.image_size < 1:
-            raise ValueError(
-                f"interpolation: want 2 steps and a pixel or more, got {self.steps} and {self.image_size}"
-            )
+    distance: Annotated[float, Gt(1)] = 3.0
 
     def run(self, context: Context) -> None:
         """Render every object between the two lights, and publish the figure and how little opacity changed.

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from neural_sim.checks import at_least
 from neural_sim.documents import markdown_table
 from neural_sim.parameter.distributions import total_variation
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
 from neural_sim.stages.stage import Results
-from neural_sim.studies.graphs import check_methods, graphs_of_methods
+from neural_sim.studies.graphs import Methods, graphs_of_methods
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
 
@@ -35,6 +35,7 @@ class Samples:
     distances: Mapping[str, Mapping[str, float] | None]
 
 
+@validated
 @dataclass(frozen=True)
 class SamplesGallery(Task):
     """``+experiment=samples_gallery``.
@@ -44,19 +45,12 @@ class SamplesGallery(Task):
         count: images of each object.
         columns: images in a row.
         objects: names of the objects that are shown; None: those with a biased start.
-
-    Raises:
-        ValueError: no method, or a number below 1.
     """
 
-    methods: Sequence[str] = ("neural_sim", "auto_sim")
-    count: int = 18
-    columns: int = 9
+    methods: Methods = ("neural_sim", "auto_sim")
+    count: PositiveInt = 18
+    columns: PositiveInt = 9
     objects: Sequence[str] | None = None
-
-    def __post_init__(self) -> None:
-        check_methods(self.methods, "samples_gallery.methods")
-        at_least("samples_gallery", 1, count=self.count, columns=self.columns)
 
     def run(self, context: Context) -> None:
         """Draw from what every method learned, and publish a figure for each object and the distances.

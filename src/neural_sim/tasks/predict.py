@@ -12,10 +12,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.detector.metrics import evaluate
-from neural_sim.detector.photographs import detect
-from neural_sim.detector.saved import DOCUMENT, SavedDetector
+from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
+from neural_sim.ranges import Fraction, PositiveInt, validated
 from neural_sim.report.coco import result_rows
 from neural_sim.report.predictions import draw, save_picture, scores_table
 from neural_sim.target.photographs import PhotoFiles
@@ -23,6 +23,7 @@ from neural_sim.target.truth import Truth, without_pixels
 from neural_sim.tasks.context import Context, Task
 
 
+@validated
 @dataclass(frozen=True)
 class PredictTask(Task):
     """Detections on photographs of any size, drawn and in COCO's format, and their scores where there are annotations.
@@ -37,23 +38,19 @@ class PredictTask(Task):
         batch_size: pictures that are read at once.
 
     Raises:
-        ValueError: no pictures, or a number out of its range.
+        ValueError: no pictures.
     """
 
     model: str | None = None
     images: str | None = None
     annotations: str | None = None
     categories: Mapping[str, str | None] | None = None
-    draw_above: float = 0.3
-    batch_size: int = 16
+    draw_above: Fraction = 0.3
+    batch_size: PositiveInt = 16
 
     def __post_init__(self) -> None:
         if not self.images:
             raise ValueError("predict.images: want a folder of pictures, a glob or a picture, got null")
-        if not 0.0 <= self.draw_above <= 1.0:
-            raise ValueError(f"predict.draw_above must lie in [0, 1], got {self.draw_above}")
-        if self.batch_size < 1:
-            raise ValueError(f"predict.batch_size must be at least 1, got {self.batch_size}")
         _ = PhotoFiles(self.images, "predict.images")
 
     @override

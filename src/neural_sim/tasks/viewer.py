@@ -6,10 +6,12 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge, Le
 from typing_extensions import override
 
+from neural_sim.ranges import NonNegative, validated
 from neural_sim.report.viewer import Shots, Viewer
 from neural_sim.stages.graph import Psi
 from neural_sim.stages.psi_file import psi_of_file
@@ -17,6 +19,7 @@ from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
 
 
+@validated
 @dataclass(frozen=True)
 class ViewerTask(Task):
     """A page on this machine's own address, until Ctrl-C. Fields and the detector are read from the store, or computed.
@@ -26,20 +29,11 @@ class ViewerTask(Task):
             the same configuration), or a file: a run's folder, its ``results.json``, or an export's ``psi.json``.
         port: of the page; the next free one where it is taken.
         seconds: how long it is open; null: until it is interrupted.
-
-    Raises:
-        ValueError: a port or a time out of range.
     """
 
     psi: str = "initial"
-    port: int = 8080
-    seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.port < 65536:
-            raise ValueError(f"viewer.port must lie in 1 to 65535, got {self.port}")
-        if self.seconds is not None and not self.seconds >= 0.0:
-            raise ValueError(f"viewer.seconds must not be negative, got {self.seconds}")
+    port: Annotated[int, Ge(1), Le(65535)] = 8080
+    seconds: NonNegative | None = None
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

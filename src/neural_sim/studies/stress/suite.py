@@ -9,33 +9,28 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal, get_args
 
+from annotated_types import MinLen
 from tqdm import tqdm
 
 from neural_sim.documents import markdown_table
+from neural_sim.ranges import validated
 from neural_sim.studies.stress.cases import CASES, Check, Checks, Scope
 from neural_sim.tasks.context import Context, Task, TaskFailure
 
-FAMILIES = ("linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer")
+Family = Literal["linear", "inner", "estimators", "sampling", "simplex", "rendering", "imaging", "outer"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
 """One file each, in the order of the loop: its cases are the functions marked ``@case``."""
 
 
+@validated
 @dataclass(frozen=True)
 class Stress(Task):
-    """Runs every case of ``families``; ``full`` False takes smaller versions of the heavy ones.
+    """Run every case of ``families``; ``full`` False takes smaller versions of the heavy ones."""
 
-    Raises:
-        ValueError: an unknown family, or none.
-    """
-
-    families: Sequence[str] = FAMILIES
+    families: Annotated[Sequence[Family], MinLen(1)] = FAMILIES
     full: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.families or not set(self.families) <= set(FAMILIES):
-            raise ValueError(
-                f"stress.families wants some of {', '.join(FAMILIES)}, got {list(self.families)}"
-            )
 
     def run(self, context: Context) -> None:
         """Run and publish every check.

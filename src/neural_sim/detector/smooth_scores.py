@@ -1,8 +1,9 @@
-"""A smooth average precision, which the psi loop differentiates in the place of the validation loss.
+"""Smooth scores, which the psi loop differentiates in the place of the validation loss.
 
-The detections are those of the forward pass, after non-maximum suppression. Their anchors are fixed; their scores and
-boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true positive (of its
-overlap), and whether it ranks below another one (of the difference of logits; Brown et al. 2020, Smooth-AP, Eq. 6).
+Of the average precision the detections are those of the forward pass, after non-maximum suppression. Their anchors are
+fixed; their scores and boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is
+a true positive (of its overlap), and whether it ranks below another one (of the difference of logits; Brown et al.
+2020, Smooth-AP, Eq. 6). Of the top-1 accuracy the step of the right class being the best becomes its probability.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from neural_sim.detector.classifier import class_of
 from neural_sim.detector.protocol import Detector, Outputs
+from neural_sim.ranges import NonNegative, Positive, PositiveInt, validated
 from neural_sim.types import LabelledImages
 
 THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
@@ -36,6 +39,7 @@ class Ranked:
     boxes: int
 
 
+@validated
 @dataclass(frozen=True)
 class SmoothAP:
     """Settings of the smooth AP.
@@ -46,24 +50,12 @@ class SmoothAP:
         per_class: number of an image's best detections that count for each class.
         loss: weight of the training loss that is added. The AP of a class without true positives has no gradient; its
             loss has.
-
-    Raises:
-        ValueError: any of these out of its range, with the key and the value.
     """
 
-    temperature: float = 0.2
-    width: float = 0.1
-    per_class: int = 5
-    loss: float = 0.1
-
-    def __post_init__(self) -> None:
-        for key in ("temperature", "width"):
-            if not getattr(self, key) > 0.0:
-                raise ValueError(f"smooth_ap.{key} must be above 0, got {getattr(self, key)}")
-        if self.per_class < 1 or not self.loss >= 0.0:
-            raise ValueError(
-                f"smooth_ap: want per_class of at least 1 and loss of at least 0, got {self.per_class} and {self.loss}"
-            )
+    temperature: Positive = 0.2
+    width: Positive = 0.1
+    per_class: PositiveInt = 5
+    loss: NonNegative = 0.1
 
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
@@ -144,3 +136,30 @@ def overlap(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor,
     shared = sides.prod(-1)
     areas = [(box[..., 2:] - box[..., :2]).clamp_min(0.0).prod(-1) for box in (a, b)]
     return shared / (areas[0] + areas[1] - shared).clamp_min(torch.finfo(shared.dtype).tiny)
+
+
+@validated
+@dataclass(frozen=True)
+class SmoothAccuracy:
+    """Settings of the smooth accuracy: the step of the right class being the best one becomes its softmax probability.
+
+    Args:
+        temperature: of the softmax, in logits; accuracy is the limit at 0.
+        loss: weight of the training loss that is added. An image whose class is far from the best has hardly a
+            gradient of its own; its loss has.
+    """
+
+    temperature: Positive = 0.5
+    loss: NonNegative = 0.1
+
+    def __call__(
+        self, detector: Detector, outputs: Outputs, images: LabelledImages
+    ) -> Float[Tensor, "classes images"]:
+        """Each image's contribution to the accuracy of its class, the sum of a row; nan for a class without images."""
+        logits = outputs[0][:, 0]
+        labels = class_of(images.labels).to(logits.device)
+        probabilities = (logits / self.temperature).softmax(-1)
+        right = probabilities.gather(1, labels.clamp(min=0)[:, None])[:, 0]
+        own = labels == torch.arange(detector.num_classes, device=labels.device)[:, None]
+        counts = own.sum(1, keepdim=True)
+        return torch.where(counts > 0, own * right / counts.clamp(min=1), torch.nan)
