@@ -19,7 +19,15 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import LanczosDamping
 from neural_sim.solver.operator import flatten
 from neural_sim.studies.work_precision import hypergradient as family
-from neural_sim.studies.work_precision.hypergradient import DEFAULT, Hypergradients, correlation, slopes, ways
+from neural_sim.studies.work_precision.hypergradient import (
+    DEFAULT,
+    EXACT,
+    Hypergradients,
+    correlation,
+    relative_error,
+    slopes,
+    ways,
+)
 from neural_sim.studies.work_precision.micro import PSI, small_scene
 from neural_sim.studies.work_precision.series import Timing
 
@@ -27,25 +35,31 @@ SOLVER = AdjointSolver(damping=LanczosDamping(lanczos_steps=4), max_steps=4)
 OUTER = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, curvature_images=6, pool_per_bin=2)
 
 
-def simulator(outer, solver, seed):
+def simulator(outer, solver, seed, psi=None):
+    psi = PSI if psi is None else psi
     generator, scene = torch.Generator().manual_seed(seed), small_scene()
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = scene.training_set(PSI, 3, generator).images
     inner = InnerLoop(
         scene, detector, detector.init(generator), validation, outer, Training(batch_size=4), generator
     )
-    return SimulatorModule(inner, PSI, StratifiedEstimator(probes_per_bin=2), solver)
+    return SimulatorModule(inner, psi, StratifiedEstimator(probes_per_bin=2), solver)
 
 
-WORLD = SimpleNamespace(names=("a", "b"), outer=OUTER, simulator=simulator)
+WORLD = SimpleNamespace(names=("a", "b"), outer=OUTER, simulator=simulator, visited={"end": PSI.flip(0)})
 
 
 def test_every_way_has_an_error_and_the_default_is_the_loops_own():
-    (series,) = Hypergradients(2, SOLVER).measure(WORLD, Timing(1), 0)
+    series, unrolled = Hypergradients(2, SOLVER).measure(WORLD, Timing(1), 0)
     assert [point.setting for point in series.points] == list(ways(OUTER, SOLVER))
     assert [point.setting for point in series.points if point.default] == [DEFAULT]
     assert all(0.0 <= point.error <= 2.0 and point.seconds > 0.0 for point in series.points)
     assert "two trainings correlate by" in series.note
+    error = {point.setting: point.error for point in unrolled.points}
+    assert unrolled.name == "hypergradient/unrolled" and all(name.startswith("unrolled") for name in error)
+    assert error[EXACT] == 0.0
+    # Of two steps of a new network, whose differences of gradients in float32 have few digits.
+    assert error["unrolled, all probes every step"] < 0.5 < error["unrolled, last quarter"]
     own = ways(OUTER, SOLVER)[DEFAULT].outer
     assert own.adjoint == OUTER.adjoint == "unrolled" and own.unrolled == OUTER.unrolled == Unrolled()
 
@@ -55,10 +69,35 @@ def test_a_derivative_that_is_the_response_has_no_error(monkeypatch):
     named = ways(OUTER, SOLVER)["unrolled, exact products"]
     found = torch.randn(2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     monkeypatch.setattr(family, "response", lambda inner, psi: Response(3.0 * found + 1.0, 1))
-    monkeypatch.setattr(family, "ways", lambda outer, solver: {DEFAULT: named})
+    monkeypatch.setattr(family, "ways", lambda outer, solver: {DEFAULT: named, EXACT: named})
     monkeypatch.setattr(family, "slopes", lambda loop, way: (found, 0.5))
-    (series,) = Hypergradients(1, SOLVER).measure(WORLD, Timing(1), 0)
+    series, unrolled = Hypergradients(1, SOLVER).measure(WORLD, Timing(1), 0)
     assert series.points[0].error == pytest.approx(0.0, abs=1e-12)
+    assert unrolled.points[0].error == 0.0
+
+
+def test_places_are_those_that_the_loop_came_to(monkeypatch):
+    """A loop that a world without its first step has run; the derivative is taken at the end's psi."""
+    seen = []
+
+    def watched(loop, way):
+        seen.append(loop.psi.detach().clone())
+        return torch.eye(2, 4), 0.5
+
+    monkeypatch.setattr(family, "slopes", watched)
+    monkeypatch.setattr(family, "response", lambda inner, psi: Response(torch.eye(2, 4), 1))
+    found = Hypergradients(1, SOLVER, places=("first_step", "end")).measure(WORLD, Timing(1), 0)
+    assert [series.name for series in found] == [
+        "hypergradient/of a training, end",
+        "hypergradient/unrolled, end",
+    ]
+    assert all(torch.equal(psi, PSI.flip(0)) for psi in seen)
+
+
+def test_relative_error_leaves_means_out():
+    truth = torch.tensor([[3.0, -3.0], [0.0, 0.0]])
+    assert relative_error(truth + 7.0, truth) == 0.0
+    assert relative_error(2.0 * truth, truth) == pytest.approx(1.0)
 
 
 def test_ways_see_the_same_images_probes_and_training(monkeypatch):
@@ -89,3 +128,5 @@ def test_correlation_of_known_vectors():
 def test_bad_settings_name_their_key():
     with pytest.raises(ValueError, match=r"work_precision\.hypergradient\.trainings"):
         Hypergradients(0)
+    with pytest.raises(ValueError, match=r"work_precision\.hypergradient\.places"):
+        Hypergradients(places=("middle",))

@@ -7,11 +7,13 @@ random numbers, and takes no derivative. Derivatives are compared with it as vec
 from __future__ import annotations
 
 import copy
+import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from statistics import fmean
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -25,8 +27,12 @@ from neural_sim.solver.direct import Identity
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
 
+_log = logging.getLogger(__name__)
 Slopes = Float[Tensor, "objects K"]
+Place = Literal["start", "first_step", "end"]
+"""Of a psi loop: where it starts, where its first step that moved psi led, where it ends."""
 DEFAULT = "unrolled, as configured"
+EXACT = "unrolled, exact products, all probes every step"
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,7 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
         "unrolled, exact products": unrolled("product", product="reverse_over_reverse"),
         "unrolled, 1 probe every step": unrolled("probes", probes_per_step=1, scored_steps=0),
         "unrolled, all probes every step": unrolled("probes", **everything),
+        EXACT: unrolled("exact", product="reverse_over_reverse", **everything),
         "unrolled, exact: no floor": unrolled("floor", floor=0.0),
         "unrolled, last half of the steps": unrolled("part", part=0.5),
         "unrolled, last quarter": unrolled("part", part=0.25),
@@ -71,13 +78,15 @@ class Hypergradients:
     Args:
         trainings: seeds of the training whose derivative is taken.
         solver: of the implicit ways, the project's own.
+        places: where on the loop's way; all but its start run the loop first.
 
     Raises:
-        ValueError: fewer than one training.
+        ValueError: fewer than one training, or no place.
     """
 
     trainings: int = 2
     solver: AdjointSolver = field(default_factory=AdjointSolver)
+    places: Sequence[Place] = ("start",)
 
     def __post_init__(self) -> None:
         if self.trainings < 1:
@@ -85,33 +94,65 @@ class Hypergradients:
                 f"work_precision.hypergradient.trainings must be at least 1, got {self.trainings}"
             )
 
+        if not self.places or not set(self.places) <= set(get_args(Place)):
+            raise ValueError(
+                f"work_precision.hypergradient.places wants some of {', '.join(get_args(Place))}, got "
+                f"{list(self.places)}"
+            )
+
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
-        """At the loop's first psi; 1 - correlation over an object's bins, mean over objects and trainings."""
+        """Measure at every place that the loop has come to."""
         del timing  # a hypergradient notes its own time
+        for place in self.places:
+            psi = None if place == "start" else world.visited.get(place)
+            if psi is None and place != "start":
+                _log.warning("work_precision.hypergradient: no step moved psi, there is no %s", place)
+                continue
+            yield from self._at(place, psi, world, seed)
+
+    def _at(self, place: Place, psi: Slopes | None, world: World, seed: int) -> Iterator[Series]:
+        """Compare every way with the response of the same training, and unrolled ones with the exact derivative."""
         named, truths = ways(world.outer, self.solver), []
-        rows: dict[str, list[tuple[float, float]]] = {name: [] for name in named}
+        responses: dict[str, list[tuple[float, float]]] = {name: [] for name in named}
+        exact: dict[str, list[tuple[float, float]]] = {
+            name: [] for name in named if name.startswith("unrolled")
+        }
         for repeat in range(self.trainings):
-            loop = world.simulator(world.outer, self.solver, 1_000 * seed + repeat)
+            loop = world.simulator(world.outer, self.solver, 1_000 * seed + repeat, psi)
             truth = response(loop.inner, loop.psi.detach()).value
             truths.append(truth)
-            for name, way in named.items():
-                found, seconds = slopes(loop, way)
+            found = {name: slopes(loop, way) for name, way in named.items()}
+            for name, (value, seconds) in found.items():
                 # A correlation of 1 may be rounded beyond it.
-                rows[name].append((max(0.0, 1.0 - correlation(found, truth)), seconds))
+                responses[name].append((max(0.0, 1.0 - correlation(value, truth)), seconds))
+                if name in exact:
+                    exact[name].append((relative_error(value, found[EXACT][0]), seconds))
         both = [correlation(a, b) for a, b in combinations(truths, 2)]
         again = f"; the responses of two trainings correlate by {fmean(both):.2f}" if both else ""
-        points = tuple(
-            Point(name, fmean(error for error, _ in found), fmean(spent for _, spent in found), None, name == DEFAULT,
-                  named[name].line, _spread([error for error, _ in found]))
-            for name, found in rows.items()
-        )  # fmt: skip
-        note = (
-            f"{', '.join(world.names)} at the loop's start, {self.trainings} training(s); against the response of "
-            f"training, by bins{again}. Seconds on the wall, without the training itself."
+        where = (
+            f"{', '.join(world.names)} at the loop's {place.replace('_', ' ')}, {self.trainings} training(s)"
         )
+        seconds = "Seconds on the wall, without the training itself."
+        more = "" if place == "start" else f", {place.replace('_', ' ')}"
         yield Series(
-            "hypergradient/of a training", "1 - correlation with the response", points, (), note, "seconds"
-        )
+            f"hypergradient/of a training{more}", "1 - correlation with the response", _points(responses, named), (),
+            f"{where}; against the response of training, by bins{again}. {seconds}", "seconds",
+        )  # fmt: skip
+        yield Series(
+            f"hypergradient/unrolled{more}", "relative error of the derivative", _points(exact, named), (),
+            f"{where}; against exact Hessian products of all probes in every step. {seconds}", "seconds",
+        )  # fmt: skip
+
+
+def _points(
+    found: Mapping[str, Sequence[tuple[float, float]]], named: Mapping[str, Way]
+) -> tuple[Point, ...]:
+    """Return the mean error and seconds of every way."""
+    return tuple(
+        Point(name, fmean(error for error, _ in rows), fmean(spent for _, spent in rows), None, name == DEFAULT,
+              named[name].line, _spread([error for error, _ in rows]))
+        for name, rows in found.items()
+    )  # fmt: skip
 
 
 def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
@@ -129,6 +170,12 @@ def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
     p = torch.cat([*loop.scene.distribution.probabilities(loop.psi.detach()).values()], -1)
     slope = torch.stack([found.psi_gradients[name] for name in loop.scene.names])
     return -slope / p, sum(found.seconds.values())
+
+
+def relative_error(found: Slopes, truth: Slopes) -> float:
+    """Return |found - truth| / |truth| of slopes without their means over an object's bins."""
+    value, wanted = (each - each.mean(-1, keepdim=True) for each in (found, truth))
+    return float((value - wanted).norm() / wanted.norm())
 
 
 def correlation(found: Slopes, truth: Slopes) -> float:

@@ -7,11 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
+
 from neural_sim.field.base import RadianceField
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.stages.graph import Psi
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.studies.work_precision.series import Series, Timing
 from neural_sim.tasks.context import Context
@@ -72,8 +75,17 @@ class World:
         scores = {name: results(stage) for name, stage in graph.compared(results(graph.learned)).items()}
         return run_results(self.context, scores, symmetric=False).document()
 
-    def simulator(self, outer: Outer, solver: AdjointSolver, seed: int) -> SimulatorModule:
-        """Return the psi loop, not yet run, with other settings.
+    @property
+    def visited(self) -> Mapping[str, Psi]:
+        """Where the psi loop came after its first step that moved psi, and where it ended; empty if none did."""
+        trajectory = self.context.results(self.context.graph.learned).trajectory
+        moved = [psi for psi in trajectory if not torch.equal(psi, trajectory[0])]
+        return {"first_step": moved[0], "end": trajectory[-1]} if moved else {}
+
+    def simulator(
+        self, outer: Outer, solver: AdjointSolver, seed: int, psi: Psi | None = None
+    ) -> SimulatorModule:
+        """Return the psi loop, not yet run, with other settings and at another ``psi`` than its first.
 
         Raises:
             ValueError: a method that does not follow the hypergradient.
@@ -84,7 +96,9 @@ class World:
                 f"work_precision: want a method that follows the hypergradient, got {stage.method.name}"
             )
         parts = dataclasses.replace(stage.parts, solver=solver)
-        loop = dataclasses.replace(stage, outer=outer, parts=parts, seed=seed).loop(self.context.results)
+        initial = stage.initial if psi is None else psi
+        other = dataclasses.replace(stage, outer=outer, parts=parts, seed=seed, initial=initial)
+        loop = other.loop(self.context.results)
         if not isinstance(loop, SimulatorModule):
             raise ValueError(f"work_precision: want a loop with a derivative, got {type(loop).__name__}")
         return loop
