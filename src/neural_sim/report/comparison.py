@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from neural_sim.detector.protocol import Score
 from neural_sim.report.intervals import Estimate, over_seeds
-from neural_sim.report.runs import BOUNDS, FIXED, FinishedRun, common_seeds, score_table
+from neural_sim.report.runs import BOUNDS, FinishedRun, common_seeds, methods_of, score_table
 
 BUDGETS = 6
 """Seconds at which the methods are compared, evenly spaced in their logarithm."""
@@ -103,7 +103,7 @@ def compare(
         ValueError: the reference has no run, or no seed is common to all methods.
     """
     table = score_table(runs, reference, draws, seed)
-    methods = (reference, *sorted({run.method for run in runs} - {reference, *FIXED}))
+    methods = methods_of(runs, reference)
     seeds = common_seeds(runs, methods)
     chosen = {(run.method, run.seed): run for run in runs if run.seed in seeds and run.method in methods}
     curves = Curves({key: biased_ap(run, clock) for key, run in chosen.items()}, methods, seeds)

@@ -101,6 +101,11 @@ class LeftOut:
     experiment: str
     reason: str
 
+    @staticmethod
+    def of(run: FinishedRun, reason: str) -> LeftOut:
+        """Leave out a run for a reason."""
+        return LeftOut(run.name, run.run_id, run.experiment, reason)
+
     @property
     def label(self) -> str:
         """Its name and the first digits of its id."""
@@ -131,14 +136,10 @@ class Runs:
 
     def without(self, reason: Callable[[FinishedRun], str | None]) -> Runs:
         """Leave out the runs that a rule gives a reason for."""
-        kept, left = [], list(self.left_out)
-        for run in self.rows:
-            why = reason(run)
-            if why is None:
-                kept.append(run)
-            else:
-                left.append(LeftOut(run.name, run.run_id, run.experiment, why))
-        return Runs(tuple(kept), tuple(left))
+        reasons = [(run, reason(run)) for run in self.rows]
+        kept = tuple(run for run, why in reasons if why is None)
+        left = tuple(LeftOut.of(run, why) for run, why in reasons if why is not None)
+        return Runs(kept, self.left_out + left)
 
     def groupby(self, key: Callable[[FinishedRun], Key]) -> dict[Key, Runs]:
         """Group the rows, in the order of the groups' first rows; what was left out before is in none of them."""
@@ -191,7 +192,7 @@ def score_table(runs: Sequence[FinishedRun], reference: str, draws: int, seed: i
     table = {(run.method, run.seed): run for run in runs}
     if not any(method == reference for method, _ in table):
         raise ValueError(f"compare.reference: no run of {reference!r}, got {sorted({m for m, _ in table})}")
-    methods = [reference, *sorted({method for method, _ in table} - {reference, *FIXED})]
+    methods = methods_of(runs, reference)
     seeds = common_seeds(runs, methods)
     if not seeds:
         raise ValueError(f"compare: no seed is common to {', '.join(methods)} in {runs[0].setting}")
@@ -202,10 +203,14 @@ def score_table(runs: Sequence[FinishedRun], reference: str, draws: int, seed: i
     return ScoreTable.of(outcomes, runs[0].results["biased"], draws, seed)
 
 
-def common_seeds(runs: Iterable[FinishedRun], methods: Iterable[str]) -> tuple[int, ...]:
+def methods_of(runs: Iterable[FinishedRun], reference: str) -> tuple[str, ...]:
+    """Return the methods that are compared, the reference first."""
+    return (reference, *sorted({run.method for run in runs} - {reference, *FIXED}))
+
+
+def common_seeds(runs: Iterable[FinishedRun], methods: Sequence[str]) -> tuple[int, ...]:
     """Return the seeds that all methods have, in order."""
     known = {(run.method, run.seed) for run in runs}
-    methods = list(methods)
     return tuple(sorted({seed for _, seed in known if all((method, seed) in known for method in methods)}))
 
 
@@ -227,7 +232,7 @@ def select(
         reference: the method that the others are compared with.
         methods: the others; None: all.
     """
-    usable = runs.without(lambda run: _useless(run, reference, methods))
+    usable = runs.without(lambda run: _why_unusable(run, reference, methods))
     keyed = usable.groupby(lambda run: (run.setting, run.results["scoring"]))
     anchors = {key: own.of(reference)[:1] for key, own in keyed.items()}
     kept, left = {}, list(usable.left_out)
@@ -237,7 +242,7 @@ def select(
             kept[setting, scoring] = chosen.rows
         else:
             others = [run for (name, _), found in anchors.items() if name == setting for run in found]
-            chosen = own.without(lambda run, others=others: _no_reference(run, reference, others))
+            chosen = own.without(lambda run, others=others: _why_no_reference(run, reference, others))
         left += chosen.left_out
     return [group for group in _grouped(kept) if group.runs], tuple(left)
 
@@ -267,7 +272,7 @@ def read_outcomes(results: Mapping[str, Any], file: Path) -> dict[str, list[Outc
     return {which: [match(own, truth, label, score) for label in labels] for which, own in detections.items()}
 
 
-def _useless(run: FinishedRun, reference: str, methods: Sequence[str] | None) -> str | None:
+def _why_unusable(run: FinishedRun, reference: str, methods: Sequence[str] | None) -> str | None:
     """Why a run is compared with no other, None if it may be."""
     if run.unusable is not None:
         return run.unusable
@@ -282,7 +287,7 @@ def _useless(run: FinishedRun, reference: str, methods: Sequence[str] | None) ->
     return None
 
 
-def _no_reference(run: FinishedRun, reference: str, anchors: Sequence[FinishedRun]) -> str:
+def _why_no_reference(run: FinishedRun, reference: str, anchors: Sequence[FinishedRun]) -> str:
     """``anchors``: the reference's newest runs of the same setting, scored in other ways."""
     if not anchors:
         return f"{reference} has no run of this setting"
@@ -357,15 +362,12 @@ def _at_common_seeds(runs: Mapping[str, Sequence[FinishedRun]], reference: str) 
             chosen.append(method)
             seeds &= set(of[method])
         else:
-            what = f"it shares no seed with all of {', '.join(chosen)}"
-            left += Runs(tuple(of[method].values())).without(lambda _, what=what: what).left_out
+            reason = f"it shares no seed with all of {', '.join(chosen)}"
+            left += [LeftOut.of(run, reason) for run in of[method].values()]
 
-    def lacking(run: FinishedRun) -> str | None:
-        others = [method for method in chosen if run.seed not in of[method]]
-        return None if run.seed in seeds else f"there is no run of seed {run.seed} of {', '.join(others)}"
-
-    for method in chosen:
-        left += Runs(tuple(of[method].values())).without(lacking).left_out
+    for run in (run for method in chosen for run in of[method].values() if run.seed not in seeds):
+        lacking = [method for method in chosen if run.seed not in of[method]]
+        left.append(LeftOut.of(run, f"there is no run of seed {run.seed} of {', '.join(lacking)}"))
     order = [reference, *sorted(chosen[1:])]
     return Runs(tuple(of[method][seed] for method in order for seed in sorted(seeds)), tuple(left))
 

@@ -159,9 +159,9 @@ class Settings:
             if run.unusable is None and run.method == self.reference and run.results.get("scoring"):
                 newest.setdefault(run.experiment, _way(run))
         groups = [group for group in found if _way(group.runs[0]) == newest[group.runs[0].experiment]]
-        older = Runs(tuple(run for group in found if group not in groups for run in group.runs))
+        older = [run for group in found if group not in groups for run in group.runs]
         reason = "newer runs of the experiment are scored in another way"
-        return groups, [*left_out, *older.without(lambda run: reason).left_out]
+        return groups, [*left_out, *(LeftOut.of(run, reason) for run in older)]
 
     def _at_scale(self, run: FinishedRun) -> bool:
         if run.unusable is not None:
