@@ -13,7 +13,6 @@ from neural_sim.cameras import focal_length
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.views import Views
-from neural_sim.stages.captures import Captures
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.graph import Graph
 from neural_sim.types import PinholeCamera
@@ -63,7 +62,7 @@ def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[Fie
     at most ``largest`` pixels a side. The log says what the views hold.
     """
     views, recipe = graph.experiment.imaging.views, graph.experiment.imaging.field
-    if isinstance(graph.objects, Captures):
+    if not graph.objects.has_meshes:
         _log.info(
             "export: fields are fitted to photographs at views.image_size=%d, as in the run", views.image_size
         )

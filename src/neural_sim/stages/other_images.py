@@ -12,9 +12,8 @@ from typing import Any
 import torch
 
 from neural_sim.stages.detector import DetectorStage
-from neural_sim.stages.meshes import Objects
 from neural_sim.stages.stage import UNKEYED, Results
-from neural_sim.stages.views import ViewsStage
+from neural_sim.stages.views import Objects, ViewsStage
 from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.pictures import PictureScene
 from neural_sim.synthesis.scene import Scene

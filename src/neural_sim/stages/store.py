@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
+from torch import Tensor
 
 _log = logging.getLogger(__name__)
 
@@ -107,3 +108,13 @@ def _write(path: Path, write: Callable[[str], object]) -> None:
     finally:
         if os.path.exists(name):
             os.unlink(name)
+
+
+def to_bytes(images: Tensor) -> Tensor:
+    """Return images in [0, 1] as 0 to 255, as they are stored; on the CPU."""
+    return (images.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def from_bytes(images: Tensor) -> Tensor:
+    """Return what :func:`to_bytes` stored, as float32."""
+    return images.to(torch.float32) / 255

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.stages.field import FieldStage
-from neural_sim.stages.meshes import Objects
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.views import Objects
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import PinholeCamera
 

@@ -12,9 +12,9 @@ from typing_extensions import override
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.rig import LightRig
 from neural_sim.stages.field import FieldStage
-from neural_sim.stages.meshes import Objects
-from neural_sim.stages.pixels import from_bytes, to_bytes
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.store import from_bytes, to_bytes
+from neural_sim.stages.views import Objects
 from neural_sim.synthesis.training_set import Synthesizer
 from neural_sim.target.base import Target
 from neural_sim.types import LabelledImages, PinholeCamera

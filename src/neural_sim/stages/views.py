@@ -1,24 +1,88 @@
-"""Stage ``views``: the posed views of an object that train its field."""
+"""The objects of a run, of meshes or of photographs, and stages ``masks`` and ``views``: what fields are fitted to."""
 
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.renderer.views import Views
-from neural_sim.stages.meshes import Meshes, Objects
-from neural_sim.stages.pixels import from_bytes, to_bytes
+from neural_sim.field.appearance import AppearanceField
+from neural_sim.field.base import RadianceField
+from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.objects.photos import Photos, PoseCorrector
+from neural_sim.objects.pictures import SceneMaskMaker
+from neural_sim.renderer.base import MeshRenderer
+from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.nerf_w import NerfWRenderer
+from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
+from neural_sim.renderer.views import Views, choose_mesh_renderer
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.store import from_bytes, to_bytes
 from neural_sim.types import PinholeCamera, PosedViews
+
+MasksOfFrames = tuple[Float[Tensor, "_ _"], ...]
+
+
+@dataclass(frozen=True)
+class MasksStage(Stage[MasksOfFrames]):
+    """Masks of an object's photographs from the geometry of their scene, one a photograph.
+
+    The run's seed has no part in them, so that runs share masks.
+
+    Args:
+        object: its name.
+        content: digest of the capture's files and options.
+        scene: the source's, with its budget.
+        source: the captures.
+    """
+
+    phase: ClassVar[str] = "views"
+    kind: ClassVar[str] = "masks"
+    keep: ClassVar[bool] = False  # read once, by the views
+
+    object: str
+    content: str
+    scene: SceneMaskMaker
+    source: Photos = field(metadata=UNKEYED)
+
+    @property
+    @override
+    def title(self) -> str:
+        return f"masks of {self.object}"
+
+    @override
+    def make(self, results: Results) -> MasksOfFrames:
+        return self.source.computed_masks(self.object)
+
+    @override
+    def pack(self, value: MasksOfFrames) -> list[Tensor]:
+        return [to_bytes(mask) for mask in value]
+
+    @override
+    def unpack(self, stored: list[Tensor]) -> MasksOfFrames:
+        return tuple(from_bytes(mask) for mask in stored)
 
 
 @dataclass(frozen=True)
 class ViewsStage(Stage[PosedViews]):
-    """Views of one object; ``content`` is the digest of its mesh. Not the run's seed, so that runs share them."""
+    """Views of one object. The run's seed has no part in them, so that runs share views and fields.
+
+    Args:
+        object: its name.
+        content: digest of its mesh, or of its capture's files and options.
+        settings: of the views; where they are photographs, only the counts and the image size apply.
+        objects: all of the run.
+        masks: of photographs, where they are computed.
+        poses: what corrects the poses of photographs.
+    """
 
     phase: ClassVar[str] = "views"
     kind: ClassVar[str] = "views"
@@ -28,26 +92,30 @@ class ViewsStage(Stage[PosedViews]):
     content: str
     settings: Views
     objects: Objects = field(metadata=UNKEYED)
+    masks: MasksStage | None = None
+    poses: PoseCorrector | None = None
 
     @property
+    @override
     def title(self) -> str:
         return f"views of {self.object}"
 
     @property
     def held_out(self) -> int:
         """How many of the views, the last, only score the field."""
-        return self.settings.held_out
+        return self.objects.held_out(self.object, self.settings)
 
     def fitted(self, results: Results) -> PosedViews:
-        """The views that a field is fitted to, without those held out."""
+        """Return the views that a field is fitted to, without those held out."""
         views = results(self)
         return views.select(torch.arange(len(views) - self.held_out))
 
+    @override
     def make(self, results: Results) -> PosedViews:
-        if not isinstance(self.objects, Meshes):
-            raise TypeError(f"ViewsStage: want Meshes, got {type(self.objects).__name__}")
-        return self.settings.render(self.objects.renderer, self.objects.items[self.object])
+        masks = () if self.masks is None else results(self.masks)
+        return self.objects.views(self.object, self.settings, masks)
 
+    @override
     def pack(self, value: PosedViews) -> dict[str, Any]:
         camera, weights = value.camera, value.light_weights
         return {
@@ -58,7 +126,146 @@ class ViewsStage(Stage[PosedViews]):
             "known": None if value.known is None else value.known.cpu(),
         }
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> PosedViews:
         camera = PinholeCamera(*stored["camera"])
         images = from_bytes(stored["images"])
         return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"], stored["known"])
+
+
+class Source(Protocol):
+    """A source of objects, such as a folder."""
+
+    def names(self) -> list[str]:
+        """Return the objects' names."""
+        ...
+
+    def digests(self) -> dict[str, str]:
+        """Return the SHA-256 of each object's content, by name."""
+        ...
+
+
+class ObjectSource(Source, Protocol):
+    """A source of meshes; ``metric``: they are in metres, otherwise they have no unit of length."""
+
+    metric: ClassVar[bool]
+
+    def load(self) -> list[ObjectMesh]:
+        """Read the objects."""
+        ...
+
+
+@dataclass(frozen=True)
+class Objects(ABC):
+    """The objects of a run by name. What they are made of is known here alone."""
+
+    source: Source
+    has_meshes: ClassVar[bool]
+    """Whether objects can be rendered without their fields."""
+
+    @staticmethod
+    def of(source: ObjectSource | Photos, views: Views) -> Objects:
+        """Return the objects of a configured source; meshes are rendered as ``views`` says."""
+        if isinstance(source, Photos):
+            return Captures(source)
+        return Meshes(source, views.backend, views.supersample)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names, in the order of class labels."""
+        return tuple(self.source.names())
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """Digests of the objects' contents by name."""
+        return self.source.digests()
+
+    @cached_property
+    @abstractmethod
+    def radii(self) -> dict[str, float | None]:
+        """Radii of the bounding spheres in metres by name, None where unknown."""
+
+    @abstractmethod
+    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
+        """Return an object as target sets render it; ``field`` is its radiance field where there is one."""
+
+    @abstractmethod
+    def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
+        """Return an object's views, those held out last."""
+
+    def held_out(self, name: str, settings: Views) -> int:
+        """Return how many of an object's views are held out."""
+        return settings.held_out
+
+    def stage(self, name: str, settings: Views) -> ViewsStage:
+        """Return the stage of an object's views."""
+        return ViewsStage(name, self.digests[name], settings, self)
+
+
+@dataclass(frozen=True)
+class Meshes(Objects):
+    """Objects of meshes, loaded when one is first rendered, and their renderer."""
+
+    has_meshes: ClassVar[bool] = True
+
+    source: ObjectSource
+    backend: Literal["auto", "pyrender", "raycast"] = "auto"
+    supersample: int = 2
+
+    @cached_property
+    def items(self) -> dict[str, ObjectMesh]:
+        """The meshes by name."""
+        return {item.name: item for item in self.source.load()}
+
+    @cached_property
+    @override
+    def radii(self) -> dict[str, float | None]:
+        return {name: item.radius if self.source.metric else None for name, item in self.items.items()}
+
+    @override
+    def subject(self, name: str, field: RadianceField | None = None) -> MeshSubject:
+        return MeshSubject(self.items[name], self.renderer, self.radii[name])
+
+    @override
+    def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
+        return settings.render(self.renderer, self.items[name])
+
+    @cached_property
+    def renderer(self) -> MeshRenderer:
+        """The renderer of meshes."""
+        return choose_mesh_renderer(self.backend, self.supersample)
+
+
+@dataclass(frozen=True)
+class Captures(Objects):
+    """Objects of photographs: they are rendered by their fields."""
+
+    has_meshes: ClassVar[bool] = False
+
+    source: Photos
+
+    @cached_property
+    @override
+    def radii(self) -> dict[str, float | None]:
+        return {name: self.source.radius(name) for name in self.names}
+
+    @override
+    def subject(self, name: str, field: RadianceField | None = None) -> FieldSubject:
+        renderer = NerfWRenderer() if isinstance(field, AppearanceField) else NerfRenderer()
+        return FieldSubject(name, field, self.radii[name], renderer)
+
+    @override
+    def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
+        pictures = self.source.pictures(name, masks)
+        return self.source.views(name, settings.count, settings.held_out, settings.image_size, pictures)
+
+    @override
+    def held_out(self, name: str, settings: Views) -> int:
+        return len(self.source.split(name, settings.count, settings.held_out)[1])
+
+    @override
+    def stage(self, name: str, settings: Views) -> ViewsStage:
+        content, source = self.digests[name], self.source
+        computed = source.masks == "scene" and source.scene is not None
+        masks = MasksStage(name, content, source.scene, source) if computed else None
+        return ViewsStage(name, content, settings, self, masks, source.poses)

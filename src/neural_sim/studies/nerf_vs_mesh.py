@@ -11,7 +11,6 @@ from neural_sim.checks import at_least
 from neural_sim.report.coco import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.meshes import Meshes
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
 from neural_sim.studies.sources import compare_sources, publish, training_images
@@ -82,7 +81,7 @@ class NerfVsMesh(Task):
             ValueError: objects without meshes, or a target of photographs.
         """
         x = context.experiment
-        if not isinstance(context.graph.objects, Meshes):
+        if not context.graph.objects.has_meshes:
             raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
         if not x.imaging.target.renders:
             raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")

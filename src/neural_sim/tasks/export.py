@@ -19,11 +19,11 @@ from neural_sim.checks import at_least
 from neural_sim.renderer.nerf import Quality
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
-from neural_sim.stages.meshes import Meshes, Objects
 from neural_sim.stages.psi_file import psi_of_file
 from neural_sim.stages.stage import Stage
 from neural_sim.stages.store import locked
 from neural_sim.stages.version import code_version
+from neural_sim.stages.views import Meshes, Objects
 from neural_sim.synthesis.export.bop import Model
 from neural_sim.synthesis.export.dataset import FORMATS, DataSet, Format, ImageFormat
 from neural_sim.synthesis.export.files import write_json, write_whole

@@ -1,0 +1,148 @@
+"""The stages of an experiment's images: views, fields, the scene, target sets; and the psi that they are drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.devices import device_of
+from neural_sim.stages.experiment import Experiment
+from neural_sim.stages.field import FieldStage
+from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.symmetry import SymmetryStage
+from neural_sim.stages.target_sets import TargetSetsStage
+from neural_sim.stages.views import Objects, ViewsStage
+from neural_sim.types import PinholeCamera
+
+Psi = Float[Tensor, "objects K"]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Stages of images by what they give.
+
+    Raises:
+        ValueError: objects that a setting names and the source lacks.
+    """
+
+    experiment: Experiment
+
+    def __post_init__(self) -> None:
+        imaging, loop = self.experiment.imaging, self.experiment.loop
+        unknown = {*imaging.distribution.biased, *(loop.outer.learned or ())} - set(self.names)
+        if unknown:
+            raise ValueError(
+                f"biased or outer.learned names {sorted(unknown)}, objects are {list(self.names)}"
+            )
+
+    @cached_property
+    def objects(self) -> Objects:
+        """The objects."""
+        return Objects.of(self.experiment.imaging.objects, self.experiment.imaging.views)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The objects' names, in the order of their class labels."""
+        return self.objects.names
+
+    @cached_property
+    def device(self) -> torch.device:
+        """The device of fields and detectors."""
+        return device_of(self.experiment.run.accelerator)
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera of synthesised and of rendered target images."""
+        return self.experiment.imaging.camera
+
+    @cached_property
+    def radii(self) -> tuple[float, ...] | None:
+        """The objects' radii in metres; None where distances are in radii, and objects need not be read."""
+        distribution = self.experiment.imaging.distribution
+        return None if distribution.distance_unit == "radii" else distribution.radii(self.objects.radii)
+
+    @cached_property
+    def views(self) -> tuple[ViewsStage, ...]:
+        """Every object's views."""
+        settings = self.experiment.imaging.views
+        return tuple(self.objects.stage(name, settings) for name in self.names)
+
+    @cached_property
+    def fields(self) -> tuple[FieldStage, ...]:
+        """Every object's field."""
+        recipe = self.experiment.imaging.field
+        return tuple(FieldStage(views, recipe, self.device) for views in self.views)
+
+    @cached_property
+    def scene(self) -> SceneStage:
+        """What training images are synthesised from."""
+        imaging = self.experiment.imaging
+        return SceneStage(
+            self.names, self.fields, imaging.renderer, self.camera, imaging.synthesis,
+            imaging.distribution.drawn, self.radii, imaging.distribution,
+        )  # fmt: skip
+
+    @cached_property
+    def targets(self) -> TargetSetsStage:
+        """The target sets."""
+        imaging = self.experiment.imaging
+        rendered = self.fields if self.renders_target else ()
+        return TargetSetsStage(
+            imaging.target, self.objects.digests, imaging.distribution, imaging.synthesis, self.camera,
+            imaging.views.rig, self.experiment.run.seed, self._in_place_of_meshes(*rendered), self.objects,
+        )  # fmt: skip
+
+    @property
+    def renders_target(self) -> bool:
+        """Whether the target's images are rendered; otherwise they are photographs."""
+        return self.experiment.imaging.target.renders
+
+    def symmetry(self, name: str, angle: str) -> SymmetryStage:
+        """Return the groups of an object's bins of an angle that look the same."""
+        imaging = self.experiment.imaging
+        camera = imaging.views.camera(48)
+        fields = self._in_place_of_meshes(self.fields[self.names.index(name)])
+        return SymmetryStage(
+            name, self.objects.digests[name], angle, imaging.distribution, camera, fields, self.objects
+        )
+
+    def _in_place_of_meshes(self, *fields: FieldStage) -> tuple[FieldStage, ...]:
+        return () if self.objects.has_meshes else fields
+
+    def psi(self, which: Literal["initial", "target"]) -> Psi:
+        """Return the configured psi of all objects."""
+        return self.experiment.imaging.distribution.psi(which, list(self.names))
+
+    @property
+    def uniform(self) -> Psi:
+        """The psi of equal probabilities."""
+        return self.experiment.imaging.distribution.uniform.expand_as(self.psi("initial"))
+
+    @property
+    def target_psi(self) -> Psi | None:
+        """The target's psi, None if unknown.
+
+        Photographs have none unless a configured distribution says what they show: uniform, the default, would not be
+        meant as a target.
+        """
+        known = self.renders_target or self.experiment.imaging.distribution.states_target
+        return self.psi("target") if known else None
+
+    def stated_psi(self, which: Literal["initial", "target"], key: str) -> Psi:
+        """Return the initial psi or the target's, which ``key`` of the configuration asks for.
+
+        Raises:
+            ValueError: the target's is unknown.
+        """
+        psi = self.psi("initial") if which == "initial" else self.target_psi
+        if psi is None:
+            raise ValueError(
+                f"{key}=target: no distribution of the target is known, because its images are photographs and no "
+                "parameter.*.target says what they show"
+            )
+        return psi
