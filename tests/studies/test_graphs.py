@@ -136,7 +136,7 @@ def test_objects_of_photographs_alone_are_refused_before_anything_is_rendered(tm
         "+experiment=nerf_vs_mesh", "target=coco", "target.annotations=" + str(_labels(tmp_path))
     )
     with pytest.raises(ValueError, match="want target=rendered"):
-        steps["nerf_vs_mesh"].run(run)
+        list(steps["nerf_vs_mesh"].reads(run))
 
 
 def _labels(folder):

@@ -266,6 +266,6 @@ class Captures(Objects):
     @override
     def stage(self, name: str, settings: Views) -> ViewsStage:
         content, source = self.digests[name], self.source
-        computed = source.masks == "scene" and source.scene is not None
-        masks = MasksStage(name, content, source.scene, source) if computed else None
+        maker = source.scene if source.masks == "scene" else None
+        masks = None if maker is None else MasksStage(name, content, maker, source)
         return ViewsStage(name, content, settings, self, masks, source.poses)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,12 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 from torchvision.ops import box_iou
+from typing_extensions import override
 
 from neural_sim.detector.metrics import AveragePrecision
 from neural_sim.documents import markdown_table
 from neural_sim.ranges import Fraction, PositiveInt, validated
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
+from neural_sim.stages.stage import Stage
 from neural_sim.studies.graphs import Methods, graphs_of_methods
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
@@ -73,9 +75,14 @@ class DetectionGallery(Task):
     draw_above: Fraction = 0.3
     overlap: Fraction = 0.5
 
-    def run(self, context: Context) -> None:
-        """Train a detector on what every method learned, and publish the figure, counts and AP."""
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
         context.experiment.check_boxes("detection_gallery")
+        graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
+        return [context.graph.targets, *(graph.learned for graph in graphs.values())]
+
+    @override
+    def run(self, context: Context) -> None:
         graphs = graphs_of_methods(context, self.methods, "detection_gallery.methods")
         results = context.results
         test = results(context.graph.targets).test

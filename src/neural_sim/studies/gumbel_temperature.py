@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.checks import at_least
 from neural_sim.documents import markdown_table
@@ -22,6 +23,7 @@ from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run
+from neural_sim.stages.stage import Stage
 from neural_sim.studies.frozen import FrozenLoop, centred
 from neural_sim.tasks.context import Context, Task
 
@@ -89,21 +91,20 @@ class Temperatures(Task):
             raise ValueError(f"temperatures.values: want positive numbers, got {list(self.values)}")
         at_least("temperatures", 2, rounds=self.rounds, truth_per_bin=self.truth_per_bin, draws=self.draws)
 
-    def run(self, context: Context) -> None:
-        """Measure at the initial psi with the warm-started detector, and publish.
-
-        Raises:
-            ValueError: an estimator that does not relax its draws, or photographs among the training images.
-        """
-        x = context.experiment
-        if not isinstance(x.loop.gradient, PathwiseEstimator):
-            raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
-        if x.training.real.combined:
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        _estimator(context)
+        if context.experiment.training.real.combined:
             raise ValueError(
                 "temperatures: want training.real.mode=none, their problem has synthesised images only"
             )
-        loop = FrozenLoop.of(context, x.run.seed)
-        rows, truths = self.measure(loop, x.loop.gradient, x.loop.outer.images_per_object, x.run.seed)
+        return [context.graph.warm_start, context.graph.targets]
+
+    @override
+    def run(self, context: Context) -> None:
+        seed, images = context.experiment.run.seed, context.experiment.loop.outer.images_per_object
+        loop = FrozenLoop.of(context, seed)
+        rows, truths = self.measure(loop, _estimator(context), images, seed)
         print(f"v {loop.solve}")
         publish(context, rows, truths)
 
@@ -136,6 +137,13 @@ class Temperatures(Task):
                 found = against(estimates[:, label], truth[label], errors[label])
                 rows.append(AtTemperature(name, value, frequencies, *found, images))
         return rows, truths
+
+
+def _estimator(context: Context) -> PathwiseEstimator:
+    estimator = context.experiment.loop.gradient
+    if not isinstance(estimator, PathwiseEstimator):
+        raise ValueError("temperatures: want gradient=pathwise, no other estimator relaxes its draws")
+    return estimator
 
 
 def against(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.cameras import orbit
 from neural_sim.documents import markdown_table
@@ -21,6 +22,7 @@ from neural_sim.ranges import Distinct, PositiveInt, validated
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.report.figures import INK, MUTED
 from neural_sim.report.tracking import Run
+from neural_sim.stages.stage import Stage
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PinholeCamera
 
@@ -57,18 +59,25 @@ class Interpolation(Task):
     rho_deg: float = 30.0
     distance: Annotated[float, Gt(1)] = 3.0
 
-    def run(self, context: Context) -> None:
-        """Render every object between the two lights, and publish the figure and how little opacity changed.
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        self._lights(context)
+        return context.graph.fields
 
-        Raises:
-            ValueError: a light that is fixed, or one that does not exist.
-        """
-        views = context.experiment.imaging.views
-        if views.rig is None:
+    def _lights(self, context: Context) -> int:
+        """Return the number of anchor lights."""
+        rig = context.experiment.imaging.views.rig
+        if rig is None:
             raise ValueError("interpolation: want renderer=nerf_w, the light is fixed")
-        anchors = views.rig.anchors
-        if max(self.ends) > anchors:
-            raise ValueError(f"interpolation.ends: there are {anchors} anchor lights, got {list(self.ends)}")
+        if max(self.ends) > rig.anchors:
+            raise ValueError(
+                f"interpolation.ends: there are {rig.anchors} anchor lights, got {list(self.ends)}"
+            )
+        return rig.anchors
+
+    @override
+    def run(self, context: Context) -> None:
+        views, anchors = context.experiment.imaging.views, self._lights(context)
         scene, camera = context.results(context.graph.scene), views.camera(self.image_size)
         place = [math.radians(self.phi_deg), math.radians(self.rho_deg), self.distance]
         pose = orbit(*(torch.tensor(value) for value in place))

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+from typing_extensions import override
 
 from neural_sim.checks import at_least
 from neural_sim.report.coco import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
+from neural_sim.stages.stage import Stage
+from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
 from neural_sim.studies.sources import compare_sources, publish, training_images
 from neural_sim.target.coco import CocoTarget
@@ -72,24 +77,20 @@ class NerfVsMesh(Task):
             )
         return CocoTarget(found[0], categories=self.categories)
 
-    def run(self, context: Context) -> None:
-        """Train, score and publish; write the training images of the fields with their poses (``training_set``).
-
-        From these another program can render the same images.
-
-        Raises:
-            ValueError: objects without meshes, or a target of photographs.
-        """
-        x = context.experiment
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
         if not context.graph.objects.has_meshes:
             raise ValueError("nerf_vs_mesh: want objects with meshes, objects=photos has none")
-        if not x.imaging.target.renders:
+        if not context.experiment.imaging.target.renders:
             raise ValueError("nerf_vs_mesh: want target=rendered, its test images are rendered from meshes")
+        for graph in graphs_of_seeds(context, self.seeds):
+            yield from self.tests(graph).values()
+            yield from self.sources(graph).values()
+
+    @override
+    def run(self, context: Context) -> None:
         graphs, results = graphs_of_seeds(context, self.seeds), context.results
-        kinds = {"single": self.single, "multiple": self.multiple}
-        found = compare_sources(
-            graphs, results, self.sources, lambda graph: sets_of_kinds(graph, kinds), self.draws
-        )
+        found = compare_sources(graphs, results, self.sources, self.tests, self.draws)
         first, names = graphs[0], list(context.graph.names)
         drawn = self.sources(first)["nerf"].images(results)
         write_training_set(drawn, names, context.folder / "training_set")
@@ -97,6 +98,10 @@ class NerfVsMesh(Task):
         other = found.sources[1]
         heading = f"Detectors trained on images of fields (nerf) and of meshes ({other})."
         publish(context, found, shown, names, heading)
+
+    def tests(self, graph: Graph) -> dict[str, TargetSetsStage]:
+        """Return the test sets by their names."""
+        return sets_of_kinds(graph, {"single": self.single, "multiple": self.multiple})
 
     def sources(self, graph: Graph) -> dict[str, DetectorStage]:
         """Return the detectors that are compared, by what their images show."""

@@ -6,11 +6,13 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.checks import at_least
 from neural_sim.devices import peak_bytes, synchronise
@@ -19,6 +21,7 @@ from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
 from neural_sim.outer.binding import image_losses, rendered_path
 from neural_sim.report.tracking import Run
+from neural_sim.stages.stage import Stage
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.synthesis.assembly import RenderedObject, one_each
 from neural_sim.synthesis.draws import HARD
@@ -75,18 +78,15 @@ class PatchMemory(Task):
             raise ValueError(f"patch_memory.patches: want numbers of rays from 1, got {list(self.patches)}")
         at_least("patch_memory", 1, repeats=self.repeats)
 
-    def run(self, context: Context) -> None:
-        """Measure at the initial psi with the warm-started detector, and publish.
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        _estimator(context)
+        return [context.graph.warm_start, context.graph.targets]
 
-        Raises:
-            ValueError: an estimator that does not differentiate the renderer.
-        """
+    @override
+    def run(self, context: Context) -> None:
         x = context.experiment
-        if not isinstance(x.loop.gradient, PathwiseEstimator):
-            raise ValueError(
-                "patch_memory: want gradient=pathwise, no other estimator differentiates the renderer"
-            )
-        rows = self.measure(FrozenLoop.of(context, x.run.seed), x.loop.gradient, x.run.seed)
+        rows = self.measure(FrozenLoop.of(context, x.run.seed), _estimator(context), x.run.seed)
         camera, field = context.graph.camera, type(context.results(context.graph.fields[0]).field).__name__
         setting = f"{field}, {camera.width} x {camera.height} pixels, {x.imaging.renderer.rays_per_chunk} rays a chunk"
         publish(context, rows, setting)
@@ -128,6 +128,15 @@ class PatchMemory(Task):
             wall.append(time.perf_counter() - begun)
             worked.append(time.process_time() - cpu_begun)
         return 1e3 * statistics.median(wall), 1e3 * statistics.median(worked)
+
+
+def _estimator(context: Context) -> PathwiseEstimator:
+    estimator = context.experiment.loop.gradient
+    if not isinstance(estimator, PathwiseEstimator):
+        raise ValueError(
+            "patch_memory: want gradient=pathwise, no other estimator differentiates the renderer"
+        )
+    return estimator
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from neural_sim.documents import markdown_table
 from neural_sim.parameter.distributions import total_variation
@@ -15,7 +17,7 @@ from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.figures import INK
 from neural_sim.report.tracking import Run
 from neural_sim.stages.graph import Graph, Psi
-from neural_sim.stages.stage import Results
+from neural_sim.stages.stage import Results, Stage
 from neural_sim.studies.graphs import Methods, graphs_of_methods
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import LabelledImages
@@ -52,16 +54,20 @@ class SamplesGallery(Task):
     columns: PositiveInt = 9
     objects: Sequence[str] | None = None
 
-    def run(self, context: Context) -> None:
-        """Draw from what every method learned, and publish a figure for each object and the distances.
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        names, known = self._names(context), context.graph.names
+        if not names or set(names) - set(known):
+            raise ValueError(f"samples_gallery.objects: want some of {list(known)}, got {list(names)}")
+        graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
+        return [context.graph.targets, *(graph.learned for graph in graphs.values())]
 
-        Raises:
-            ValueError: an unknown object.
-        """
-        graph = context.graph
-        names = tuple(self.objects or context.experiment.imaging.distribution.biased)
-        if not names or set(names) - set(graph.names):
-            raise ValueError(f"samples_gallery.objects: want some of {list(graph.names)}, got {list(names)}")
+    def _names(self, context: Context) -> tuple[str, ...]:
+        return tuple(self.objects or context.experiment.imaging.distribution.biased)
+
+    @override
+    def run(self, context: Context) -> None:
+        graph, names = context.graph, self._names(context)
         graphs = graphs_of_methods(context, self.methods, "samples_gallery.methods")
         results = context.results
         learned = {method: results(other.learned).last for method, other in graphs.items()}

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.alpha import over_white, premultiplied
 from neural_sim.checks import at_least
@@ -25,7 +27,7 @@ from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.other_images import trained_on
 from neural_sim.stages.reconstruction import ReconstructionDetectorStage, ReconstructionStage
-from neural_sim.stages.stage import Results
+from neural_sim.stages.stage import Results, Stage
 from neural_sim.studies.graphs import graphs_of_seeds
 from neural_sim.studies.sources import More, compare_sources, publish, training_images
 from neural_sim.tasks.context import Context, Task
@@ -75,17 +77,21 @@ class SfmVsNerf(Task):
                 f"sfm_vs_nerf.resolution must be a power of two from {COARSEST}, got {self.resolution}"
             )
 
-    def run(self, context: Context) -> None:
-        """Score on held-out views and by detectors, and publish.
-
-        Raises:
-            ValueError: no held-out view.
-        """
-        x, results = context.experiment, context.results
-        graphs, names = graphs_of_seeds(context, self.seeds), list(context.graph.names)
-        if not x.imaging.views.held_out:
+    @override
+    def reads(self, context: Context) -> Iterable[Stage[Any]]:
+        if not context.experiment.imaging.views.held_out:
             raise ValueError("sfm_vs_nerf: want views.held_out of at least 1, got 0")
-        stages = tuple(ReconstructionStage(views, self.resolution) for views in graphs[0].views)
+        graphs = graphs_of_seeds(context, self.seeds)
+        nerf = [graph.synthetic(graph.psi("target"), "images of the fields") for graph in graphs]
+        return [*self._reconstructions(graphs[0]), *(graph.targets for graph in graphs), *nerf]
+
+    def _reconstructions(self, graph: Graph) -> tuple[ReconstructionStage, ...]:
+        return tuple(ReconstructionStage(views, self.resolution) for views in graph.views)
+
+    @override
+    def run(self, context: Context) -> None:
+        graphs, results = graphs_of_seeds(context, self.seeds), context.results
+        names, stages = list(context.graph.names), self._reconstructions(graphs[0])
         meshes = self._meshes(graphs[0], stages, results)
         objects = [self._held_out(graphs[0], results, i, mesh) for i, mesh in enumerate(meshes)]
 
