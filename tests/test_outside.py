@@ -1,8 +1,9 @@
-"""A parameter, an estimator, a detector and a target from outside the package: each one file and one YAML."""
+"""Parts from outside the package, each one file and one YAML in tests/outside: what CONTRIBUTING.md says to add."""
 
 import importlib.util
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -145,3 +146,40 @@ def test_they_run_together(adjoint, tmp_path):
     ]
     walk(*context_of(composed("stages=[predict]", "progress=false", *words), tmp_path / "predicted"))
     assert 0.0 <= json.loads((tmp_path / "predicted" / "scores.json").read_text())["ap"] <= 1.0
+
+
+def test_a_stage_s_result_is_stored_and_its_task_pulls_it(tmp_path):
+    paths = [f"paths.store={tmp_path}/store", "objects.names=[can,mug]", "views.count=3", "views.held_out=1"]
+
+    def brightness(above):
+        words = [*paths, "+experiment=my_brightness", f"brightness.above={above}", "progress=false"]
+        context, tasks = context_of(composed(*words), tmp_path)
+        walk(context, tasks)
+        return context, json.loads((tmp_path / "brightness.json").read_text())
+
+    context, found = brightness(0.0)
+    assert {*found} == {"can", "mug"} and all(
+        0.0 < part < 1.0 for part in found.values()
+    )  # the objects' pixels
+    assert {*context.account.seconds} == {"views", "brightness"}
+    again, same = brightness(0.0)
+    stored = {each.what for each in again.account.left_out if each.why == "found in the store"}
+    assert same == found and stored == {"brightness of can", "brightness of mug"}  # the views are not read
+    _, brighter = brightness(0.9)
+    assert all(brighter[name] < found[name] for name in found)
+    with pytest.raises(UserError, match=r"brightness\.above must lie in \[0, 1\], got 2\.0"):
+        brightness(2.0)
+
+
+def test_a_study_publishes_what_it_found(tmp_path, empty_store, capsys):
+    shutil.copy(empty_store, tmp_path / "mlflow.db")
+    words = ["+experiment=my_study", f"paths.mlflow={tmp_path}/mlflow.db", "progress=false"]
+    walk(*context_of(composed(*words), tmp_path / "run"))
+    found = json.loads((tmp_path / "run" / "distances.json").read_text())
+    assert found["pitcher"] > 0.5 and found["can"] == 0.0  # the pitcher's start is biased
+    assert "| pitcher | 0." in (tmp_path / "run" / "distances.md").read_text()
+    assert (tmp_path / "run" / "figures" / "distances.png").is_file()
+    assert "| pitcher | 0." in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"distances\.factor: want one of \['pose'\], got zoom"):
+        walk(*context_of(composed(*words, "distances.factor=zoom"), tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
