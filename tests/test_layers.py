@@ -11,10 +11,6 @@ ORDER = (
     "devices", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient",
     "baseline", "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
-TASKS_IN_STAGES = {
-    "compare", "experiments",
-}  # fmt: skip
-"""Tasks and studies that still stand among the stages; the set only shrinks."""
 TORCH_ONLY = ("types", "cameras", "solver")
 
 
@@ -39,8 +35,6 @@ def test_rooms_import_from_earlier_rooms_only():
         if module.startswith("neural_sim.") and package != "__init__":
             other = module.split(".")[1]
             assert other in ORDER, f"{path} imports {module}, which has no place in the order"
-            if package == "stages" and other == "tasks" and path.stem in TASKS_IN_STAGES:
-                continue
             assert ORDER.index(other) <= ORDER.index(package), f"{path} imports {module}, a later package"
 
 

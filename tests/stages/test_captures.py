@@ -87,7 +87,7 @@ def test_metres_want_a_size(root, tmp_path):
 
 
 def test_what_is_wrong_with_a_capture_is_said_before_any_stage(root, tmp_path):
-    with pytest.raises(UserError, match=r"objects: objects\.up: want one of"):
+    with pytest.raises(UserError, match=r"objects\.up: want one of"):
         started(root, tmp_path, "objects.up=sky")
 
 
