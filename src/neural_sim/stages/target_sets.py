@@ -59,9 +59,7 @@ class TargetSetsStage(Stage[TargetSets]):
     @property
     @override
     def early(self) -> bool:
-        return not getattr(
-            self.target, "renders", True
-        )  # photographs that cannot be used are refused at once
+        return not self.target.renders  # photographs that cannot be used are refused at once
 
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}
