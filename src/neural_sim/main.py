@@ -23,6 +23,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from typing_extensions import override
 
 from neural_sim.configuration import (
     UserError,
@@ -168,7 +169,7 @@ def _product(parameters: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain values, its top level checked."""
+    """Return the configuration as plain values, its top level checked."""
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
@@ -209,7 +210,7 @@ def _told(message: str, node: Mapping[str, Any], where: str, inner: str) -> str:
 
 
 def _with(overrides: Sequence[str], choices: Sequence[str]) -> list[str]:
-    """A command's overrides with ``choices`` in the place of those of the same groups."""
+    """Return a command's overrides with ``choices`` in the place of those of the same groups."""
     chosen = {choice.partition("=")[0] for choice in choices}
     return [*(o for o in overrides if o.partition("=")[0].lstrip("+") not in chosen), *choices]
 
@@ -246,6 +247,7 @@ class RefuseStudies(Callback):
     way.
     """
 
+    @override
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         if not config.hydra.sweeper.get("params"):
             return
@@ -257,13 +259,16 @@ class RefuseStudies(Callback):
 
 
 class OwnFolder(Callback):
-    """A folder of its own for each of the runs, or sweeps, of an experiment that begin in the same second, by which
-    folders are named. A folder that the command line names is taken as it is.
+    """Gives runs, or sweeps, of an experiment that begin in the same second folders of their own.
+
+    Folders are named by the second. One that the command line names is taken as it is.
     """
 
+    @override
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._take(config, "run")
 
+    @override
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         if self._take(config, "sweep"):
             with read_write(config):  # each job composes its configuration anew

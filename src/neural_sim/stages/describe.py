@@ -15,7 +15,7 @@ from neural_sim.digests import tensor_digest
 
 
 def describe(value: Any) -> Any:
-    """A JSON tree that is equal for equal settings.
+    """Return a JSON tree that is equal for equal settings.
 
     Takes scalars, sequences, mappings, tensors, paths, partial calls, classes and functions. Other objects are
     described by their class, their ``digest()`` if they have one (sources of files do), and what they were constructed
@@ -55,7 +55,7 @@ def describe(value: Any) -> Any:
 
 
 def _arguments(kind: type) -> list[str]:
-    """Names of a constructor's arguments, none where it does not tell."""
+    """Return the names of a constructor's arguments, none where it does not tell."""
     try:
         return list(inspect.signature(kind).parameters)
     except ValueError:
@@ -63,7 +63,7 @@ def _arguments(kind: type) -> list[str]:
 
 
 def modules_of(description: Any) -> Iterator[str]:
-    """The modules of all classes and functions named in a description."""
+    """Yield the modules of all classes and functions named in a description."""
     if isinstance(description, Mapping):
         for key, item in description.items():
             if key in ("class", "call") and isinstance(item, str):

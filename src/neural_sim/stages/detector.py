@@ -1,6 +1,4 @@
-"""Stages ``warm_start`` and ``evaluate``: detectors trained on images of one distribution, with or without photographs,
-or on photographs.
-"""
+"""Trained detectors: on images of one distribution, with or without photographs, or on photographs alone."""
 
 from __future__ import annotations
 
@@ -59,7 +57,7 @@ class TrainedStage(Stage[TrainedDetector]):
         """Of the images."""
 
     def build(self) -> Detector:
-        """The detector's shape, without parameters."""
+        """Return the detector's shape, without parameters."""
         camera = self.camera
         return self.detector(num_classes=len(self.names), image_size=(camera.height, camera.width))
 
@@ -67,9 +65,11 @@ class TrainedStage(Stage[TrainedDetector]):
     def check(self) -> None:
         self.build()  # refuses initial weights that are missing or do not fit
 
+    @override
     def pack(self, value: TrainedDetector) -> dict[str, Any]:
         return {"params": placed(value.params, CPU), "cost": dataclasses.asdict(value.cost)}
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> TrainedDetector:
         return TrainedDetector(placed(stored["params"], self.device), Cost(**stored["cost"]))
 
@@ -96,36 +96,40 @@ class DetectorStage(TrainedStage):
     targets: TargetSetsStage | None = None
 
     @property
+    @override
     def title(self) -> str:
         return f"detector trained on {self.called}" + ("" if self.targets is None else " and photographs")
 
     @property
+    @override
     def names(self) -> tuple[str, ...]:
         return self.scene.names
 
     @property
+    @override
     def camera(self) -> PinholeCamera:
         return self.scene.camera
 
     def photographs(self, results: Results) -> LabelledImages | None:
-        """Those that train beside the drawn images."""
+        """Return those that train with the drawn images, None without any."""
         if self.targets is None:
             return None
         return self.training.real.chosen(results(self.targets).train, self.seed)
 
     def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
-        """The training images, equal in every call."""
+        """Return the training images, equal in every call."""
         generator = self.generator() if generator is None else generator
         return self.shown(results).training_set(self.psi, self.training.images_per_object, generator)
 
     def shown(self, results: Results) -> Scene:
-        """The scene of the training images."""
+        """Return the scene of the training images."""
         return results(self.scene)
 
     def generator(self) -> torch.Generator:
         """Of images, new parameters and the order of training."""
         return stream(self.seed, "detector")
 
+    @override
     def make(self, results: Results) -> TrainedDetector:
         results(self.scene)  # so that fields are not charged
         detector, training, generator = self.build(), self.training, self.generator()
@@ -175,19 +179,23 @@ class PhotographsStage(TrainedStage):
     device: torch.device = field(default=CPU, metadata=UNKEYED)
 
     @property
+    @override
     def title(self) -> str:
         if self.start is None:
             return "detector trained on photographs only"
         return f"{self.start.title}, fine-tuned on photographs"
 
     @property
+    @override
     def names(self) -> tuple[str, ...]:
         return self.class_names
 
     @property
+    @override
     def camera(self) -> PinholeCamera:
         return self.image_camera
 
+    @override
     def make(self, results: Results) -> TrainedDetector:
         detector, training = self.build(), self.training
         generator = stream(self.seed, "fine-tuning")

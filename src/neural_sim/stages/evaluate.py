@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.detector.metrics import TestScore, evaluate, of_document
 from neural_sim.stages.detector import TrainedStage
@@ -35,17 +36,21 @@ class ScoresStage(Stage[Scores]):
     part: Literal["val", "test"] = "test"
 
     @property
+    @override
     def title(self) -> str:
         return f"{self.part} scores of the {self.trained.title}"
 
+    @override
     def make(self, results: Results) -> Scores:
         params, images = results(self.trained).params, getattr(results(self.targets), self.part)
         detector = self.trained.build()
         detections = detector.predict(params, images.images)
         return Scores(evaluate(detections, images, list(self.trained.names), detector.score), detections)
 
+    @override
     def pack(self, value: Scores) -> dict[str, Any]:
         return {"ap": dataclasses.asdict(value.ap), "detections": value.detections}
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> Scores:
         return Scores(of_document(stored["ap"]), stored["detections"])

@@ -30,8 +30,9 @@ SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
 
 @dataclass(frozen=True)
 class Run:
-    """What a run is called and where it works. ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is
-    one of :data:`SCORES`.
+    """What a run is called and where it works.
+
+    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of :data:`SCORES`.
     """
 
     name: str
@@ -46,8 +47,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Imaging:
-    """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target. ``camera``
-    is that of synthesised and of rendered target images.
+    """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target.
+
+    ``camera`` is that of synthesised and of rendered target images.
     """
 
     objects: ObjectSource | Photos
@@ -72,8 +74,10 @@ class Loop:
 
 @dataclass(frozen=True)
 class Experiment:
-    """All parts of a run; ``config`` is the configuration that they were built from, for reports alone, ``model`` what
-    the report writes of the final detector.
+    """All parts of a run.
+
+    ``config`` is the configuration that they were built from, for reports alone, ``model`` what the report writes of
+    the final detector.
 
     Raises:
         ValueError: a detector, an objective or images that are not of the task; a first hypergradient at a warm start
@@ -120,6 +124,6 @@ class Experiment:
         return score_of(self.detector)
 
     def check_boxes(self, key: str) -> None:
-        """Raises ``ValueError`` where there is no AP for a stage of this name."""
+        """Raise ``ValueError`` where there is no AP; ``key`` is the task that wants it."""
         if self.score != "AP":
             raise ValueError(f"{key} compares boxes: want task=detection, got task={self.run.task}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
+from typing_extensions import override
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
@@ -34,14 +35,18 @@ class FieldStage(Stage[FittedField]):
     device: torch.device = field(default=torch.device("cpu"), metadata=UNKEYED)
 
     @property
+    @override
     def title(self) -> str:
         return f"field of {self.views.object}"
 
+    @override
     def make(self, results: Results) -> FittedField:
         return FittedField(*self.recipe.fit(results(self.views), self.views.held_out, self.device))
 
+    @override
     def pack(self, value: FittedField) -> dict[str, Any]:
         return {"field": field_state(value.field), "history": value.history}
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> FittedField:
         return FittedField(field_from_state(stored["field"]).to(self.device), stored["history"])

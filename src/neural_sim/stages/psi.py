@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
 from neural_sim.gradient.estimators import Estimator
@@ -69,10 +70,12 @@ class PsiStage(Stage[LearnedPsi]):
             self.warm_start.build().in_loop(self.outer.loop_layers)
 
     @property
+    @override
     def title(self) -> str:
         return "psi loop"
 
     @property
+    @override
     def needed(self) -> Iterator[Stage[Any]]:
         return iter(()) if isinstance(self.method, Fixed) else self.inputs
 
@@ -83,6 +86,7 @@ class PsiStage(Stage[LearnedPsi]):
             return self.parts.estimator.draws
         return HardDraws(explore=self.method.explores)
 
+    @override
     def make(self, results: Results) -> LearnedPsi:
         if isinstance(self.method, Fixed):
             psi = self.distribution.psi(self.method.which, list(self.warm_start.scene.names))
@@ -92,8 +96,10 @@ class PsiStage(Stage[LearnedPsi]):
         return replace(learned, before=warm_start.cost)
 
     def loop(self, results: Results) -> OuterLoop:
-        """The method's loop, not yet run, on renders of ``outer.quality``. Raises ``ValueError`` for a method
-        without one.
+        """Return the method's loop, not yet run, on renders of ``outer.quality``.
+
+        Raises:
+            ValueError: a method without one.
         """
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
@@ -110,6 +116,7 @@ class PsiStage(Stage[LearnedPsi]):
             raise ValueError(f"baseline={method.name} has no outer loop")
         return RewardLoop(inner, self.initial, method)
 
+    @override
     def pack(self, value: LearnedPsi) -> dict[str, Any]:
         return {
             "trajectory": value.trajectory,
@@ -117,6 +124,7 @@ class PsiStage(Stage[LearnedPsi]):
             "before": dataclasses.asdict(value.before),
         }
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> LearnedPsi:
         records = [record_of(record) for record in stored["records"]]
         return LearnedPsi(stored["trajectory"], records, Cost(**stored["before"]))

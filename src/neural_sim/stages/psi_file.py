@@ -17,7 +17,7 @@ from neural_sim.parameter.product import SceneDistribution
 def psi_of_file(
     path: Path, distribution: SceneDistribution, names: Sequence[str], key: str = "export.psi"
 ) -> Float[Tensor, "objects K"]:
-    """The psi of a run's folder or its ``results.json`` (the learned one), or of an export's ``psi.json``.
+    """Read the psi of a run's folder or its ``results.json`` (the learned one), or of an export's ``psi.json``.
 
     ``key`` is the setting that named the file.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from typing_extensions import override
+
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stages.field import FieldStage
@@ -16,7 +18,9 @@ from neural_sim.types import PinholeCamera
 
 @dataclass(frozen=True)
 class SceneStage(Stage[Scene]):
-    """Of ``distribution`` the key holds what draws of given probabilities depend on (``drawn``): methods that relax
+    """What training images are synthesised from.
+
+    The key covers ``drawn``, what draws of given probabilities depend on, and not ``distribution``: methods that relax
     draws differently use the same results of hard draws. ``radii`` are the objects' in metres, None where distances are
     in radii.
     """
@@ -35,9 +39,11 @@ class SceneStage(Stage[Scene]):
     distribution: SceneDistribution = field(metadata=UNKEYED)
 
     @property
+    @override
     def title(self) -> str:
         return "scene of all objects"
 
+    @override
     def make(self, results: Results) -> Scene:
         fields = tuple(results(stage).field for stage in self.fields)
         return Scene(

@@ -42,7 +42,7 @@ class Store:
     root: Path
 
     def fetch(self, kind: str, key: str, description: Mapping[str, Any], make: Callable[[], Any]) -> Entry:
-        """The result ``key``, from the store or from ``make``.
+        """Return the result ``key``, from the store or from ``make``.
 
         ``make`` returns tensors, numbers, strings and lists and dicts of these: all that is read back is read
         with ``weights_only``, so that a shared store cannot run code. An unreadable entry is computed again, with

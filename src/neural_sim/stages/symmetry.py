@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from typing_extensions import override
+
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
@@ -15,8 +17,9 @@ from neural_sim.types import PinholeCamera
 
 @dataclass(frozen=True)
 class SymmetryStage(Stage[list[list[int]]]):
-    """Groups of bins, numbered from 1, that look the same; ``content`` is the digest of the object. ``fields`` has the
-    field of an object that there is no mesh of.
+    """Groups of bins, numbered from 1, that look the same.
+
+    ``content`` is the digest of the object; ``fields`` has the field of an object without a mesh.
     """
 
     phase: ClassVar[str] = "report"
@@ -31,9 +34,11 @@ class SymmetryStage(Stage[list[list[int]]]):
     objects: Objects = field(metadata=UNKEYED)
 
     @property
+    @override
     def title(self) -> str:
         return f"symmetry of {self.object}"
 
+    @override
     def make(self, results: Results) -> list[list[int]]:
         item = self.objects.subject(self.object, *(results(stage).field for stage in self.fields))
         groups = equivalent_bins(item, self.distribution, self.angle, self.camera)

@@ -22,8 +22,10 @@ from neural_sim.types import LabelledImages, PinholeCamera
 
 @dataclass(frozen=True)
 class TargetSets:
-    """Disjoint parts: ``val`` is what psi is learned on, ``test`` is scored once, ``train`` trains detectors if
-    ``training.real`` asks for it (None: no such part).
+    """Disjoint parts of the target's labelled images.
+
+    Psi is learned on ``val``, ``test`` is scored once, and ``train`` trains detectors if ``training.real`` asks for it
+    (None: no such part).
     """
 
     val: LabelledImages
@@ -53,6 +55,7 @@ class TargetSetsStage(Stage[TargetSets]):
     objects: Objects = field(metadata=UNKEYED)
 
     @property
+    @override
     def title(self) -> str:
         return "target sets"
 
@@ -61,16 +64,19 @@ class TargetSetsStage(Stage[TargetSets]):
     def early(self) -> bool:
         return not self.target.renders  # photographs that cannot be used are refused at once
 
+    @override
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}
         objects = {name: self.objects.subject(name, fields.get(name)) for name in self.objects.names}
         how = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
         return TargetSets(**self.target.sets(objects, *how))
 
+    @override
     def pack(self, value: TargetSets) -> dict[str, dict[str, Tensor]]:
         parts = {part.name: getattr(value, part.name) for part in fields(TargetSets)}
         return {name: _packed(images) for name, images in parts.items() if images is not None}
 
+    @override
     def unpack(self, stored: Mapping[str, Mapping[str, Tensor]]) -> TargetSets:
         return TargetSets(**{part: _unpacked(images) for part, images in stored.items()})
 

@@ -76,8 +76,10 @@ def _parsed(path: Path, root: Path, _modified: int, _size: int) -> _File:
 
 
 def _text(node: object) -> str:
-    """A syntax tree as text, equal in all versions of Python: newer ones add fields, which are empty unless a file uses
-    them (``ast.dump`` of 3.12 has ``type_params`` of every function).
+    """Return a syntax tree as text, equal in all versions of Python.
+
+    Newer ones add fields, which are empty unless a file uses them (``ast.dump`` of 3.12 has ``type_params`` of every
+    function).
     """
     if isinstance(node, ast.AST):
         fields = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
@@ -88,7 +90,7 @@ def _text(node: object) -> str:
 
 
 def _source(name: str, root: Path) -> Path | None:
-    """The file of a module, None where there is none: builtins, extensions, names that are no modules."""
+    """Return the file of a module, None without one: builtins, extensions, names that are no modules."""
     first, *rest = name.split(".")
     if first == root.name:
         place = root.joinpath(*rest)
