@@ -42,5 +42,5 @@ def test_the_reference_is_the_derivative_of_the_image_at_fixed_samples(small_wor
 
 def test_bad_settings_name_their_key():
     for wrong in ({"numbers": (13,)}, {"steps": (0.0,)}, {"size": 0}):
-        with pytest.raises(ValueError, match=r"work_precision\.derivative"):
+        with pytest.raises(ValueError, match=r"Derivative\."):
             Derivative(**wrong)

@@ -41,5 +41,5 @@ def test_errors_are_those_of_the_fits(small_world):
 
 def test_bad_settings_name_their_key():
     for wrong in ({"parts": {"mlp": (1.0,)}}, {"parts": {"grid": (0.0,)}}, {"default": "mlp"}):
-        with pytest.raises(ValueError, match=r"work_precision\.field"):
+        with pytest.raises(ValueError, match=r"work_precision\.field|Fields\.parts\.grid"):
             Fields(**{"recipes": {"grid": RECIPE}, "parts": {"grid": (1.0,)}, **wrong})

@@ -126,7 +126,7 @@ def test_correlation_of_known_vectors():
 
 
 def test_bad_settings_name_their_key():
-    with pytest.raises(ValueError, match=r"work_precision\.hypergradient\.trainings"):
+    with pytest.raises(ValueError, match=r"Hypergradients\.trainings: want at least 1"):
         Hypergradients(0)
-    with pytest.raises(ValueError, match=r"work_precision\.hypergradient\.places"):
+    with pytest.raises(ValueError, match=r"Hypergradients\.places\[0\]: want one of start"):
         Hypergradients(places=("middle",))

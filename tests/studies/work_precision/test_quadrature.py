@@ -86,7 +86,7 @@ def _exact(density, offset):
 
 
 def test_bad_settings_name_their_key():
-    with pytest.raises(ValueError, match=r"work_precision\.quadrature\.samples"):
+    with pytest.raises(ValueError, match=r"Quadrature\.samples"):
         Quadrature(samples=(64, 32))
-    with pytest.raises(ValueError, match=r"work_precision\.quadrature: rays"):
+    with pytest.raises(ValueError, match=r"Quadrature\.rays: want at least 2"):
         Quadrature(rays=1)

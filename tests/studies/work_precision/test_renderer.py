@@ -38,5 +38,5 @@ def test_undoing_an_omission_costs_no_error_and_more_of_what_was_left_out(small_
 
 
 def test_bad_sizes_name_their_key():
-    with pytest.raises(ValueError, match=r"work_precision\.renderer: size and views"):
+    with pytest.raises(ValueError, match=r"Renderer\.views: want at least 1"):
         Renderer(views=0)

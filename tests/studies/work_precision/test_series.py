@@ -84,5 +84,5 @@ def test_timings_count_each_run_once_by_their_clock():
     cpu, _ = Timing(2, "cpu_seconds").of(sleep)
     assert cpu < 0.5 * wall  # sleep takes no processor time
     for wrong in ({"repeats": 0}, {"clock": "sundial"}):
-        with pytest.raises(ValueError, match=f"work_precision.{next(iter(wrong))}"):
+        with pytest.raises(ValueError, match=rf"Timing\.{next(iter(wrong))}"):
             Timing(**wrong)

@@ -54,7 +54,7 @@ def test_the_parts_are_those_of_the_configuration(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("work_precision.families=[astrology]", r"work_precision\.families wants some of quadrature"),
+        ("work_precision.families=[astrology]", r"work_precision\.families\[0\]: want one of quadrature"),
         ("work_precision.repeats=0", r"work_precision\.repeats"),
         ("work_precision.clock=sundial", r"work_precision\.clock"),
         ("work_precision.quadrature.rays=1", r"work_precision\.quadrature"),

@@ -10,8 +10,10 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,6 +21,7 @@ from neural_sim import cameras
 from neural_sim.field.base import RadianceField
 from neural_sim.field.rendering import render_samples
 from neural_sim.gradient.pathwise import contract
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
@@ -121,6 +124,7 @@ def difference(of: Case, step: float, same: bool) -> Float[Tensor, "m"]:
     return torch.stack(found)
 
 
+@validated
 @dataclass(frozen=True)
 class Derivative:
     """The family ``derivative``.
@@ -130,23 +134,12 @@ class Derivative:
         numbers: m, by how many numbers of its camera an image is differentiated; a series each.
         patches: rays of a patch of the reverse mode.
         steps: of the central differences, in radians and object radii.
-
-    Raises:
-        ValueError: a size, patch or step that is not positive, or m outside of 1 to 12.
     """
 
-    size: int = 64
-    numbers: tuple[int, ...] = (1, 12)
-    patches: tuple[int, ...] = (64, 512)
-    steps: tuple[float, ...] = (1e-2, 1e-4, 1e-6)
-
-    def __post_init__(self) -> None:
-        positive = (self.size, *self.patches, *self.steps)
-        if min(positive) <= 0 or not all(1 <= m <= MOST for m in self.numbers):
-            raise ValueError(
-                f"work_precision.derivative: want size, patches and steps above 0 and numbers from 1 to {MOST}, got "
-                f"{self.size}, {list(self.patches)}, {list(self.steps)} and {list(self.numbers)}"
-            )
+    size: PositiveInt = 64
+    numbers: tuple[Annotated[int, Ge(1), Le(MOST)], ...] = (1, 12)
+    patches: tuple[PositiveInt, ...] = (64, 512)
+    steps: tuple[Positive, ...] = (1e-2, 1e-4, 1e-6)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure errors relative to the norm of the whole image's reverse mode in float64, of the first object."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,6 +22,7 @@ from neural_sim.gradient.base import Losses, MixedDerivative, ObjectImages, Prob
 from neural_sim.gradient.estimators import Estimator, ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.update import shrinkage
+from neural_sim.ranges import Ascending, PositiveInt, validated
 from neural_sim.studies.frozen import FrozenLoop, centred
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
@@ -55,6 +58,7 @@ class Result:
     seconds: dict[int, float] = field(default_factory=dict)
 
 
+@validated
 @dataclass(frozen=True)
 class Estimators:
     """The family ``estimator``.
@@ -67,13 +71,13 @@ class Estimators:
         pathwise: variants of the pathwise estimator, of :data:`PATHWISE`.
 
     Raises:
-        ValueError: an unknown variant, numbers of images that are no multiples of the first, or a count below 1.
+        ValueError: an unknown variant, or numbers of images that are no multiples of the first.
     """
 
-    images: tuple[int, ...] = (16, 32, 64, 128)
-    default: int = 192
-    repeats: int = 2
-    truth_per_bin: int = 128
+    images: Annotated[tuple[PositiveInt, ...], MinLen(1), Ascending()] = (16, 32, 64, 128)
+    default: PositiveInt = 192
+    repeats: PositiveInt = 2
+    truth_per_bin: Annotated[int, Ge(2)] = 128
     pathwise: Sequence[str] = tuple(PATHWISE)
 
     def __post_init__(self) -> None:
@@ -82,19 +86,9 @@ class Estimators:
             raise ValueError(
                 f"work_precision.estimator.pathwise: want some of {', '.join(PATHWISE)}, got {sorted(unknown)}"
             )
-        if (
-            not self.images
-            or any(n % self.images[0] for n in self.images)
-            or list(self.images) != sorted(self.images)
-        ):
+        if any(count % self.images[0] for count in self.images):
             raise ValueError(
-                "work_precision.estimator.images: want growing multiples of the first, got "
-                f"{list(self.images)}"
-            )
-        if min(*self.images, self.default, self.repeats, self.truth_per_bin - 1) < 1:
-            raise ValueError(
-                "work_precision.estimator: want at least 1 image and repeat and 2 truth_per_bin, got "
-                f"{list(self.images)}, {self.repeats} and {self.truth_per_bin}"
+                f"work_precision.estimator.images: want multiples of the first, got {list(self.images)}"
             )
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from neural_sim.field.recipe import FieldRecipe
+from neural_sim.ranges import Positive, validated
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
 
@@ -27,6 +28,7 @@ def scaled(recipe: FieldRecipe, part: float) -> FieldRecipe:
     return replace(recipe, steps=max(1, round(part * recipe.steps)), fitting=fitting, score_every=0)
 
 
+@validated
 @dataclass(frozen=True)
 class Fields:
     """The family ``field``.
@@ -37,11 +39,11 @@ class Fields:
         default: the project's own among ``recipes``, at all of its steps.
 
     Raises:
-        ValueError: names that differ, no such default, or a part that is not positive.
+        ValueError: names that differ, or no such default.
     """
 
     recipes: Mapping[str, FieldRecipe] = field(default_factory=dict)
-    parts: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    parts: Mapping[str, Sequence[Positive]] = field(default_factory=dict)
     default: str = "grid"
 
     def __post_init__(self) -> None:
@@ -50,8 +52,6 @@ class Fields:
                 f"work_precision.field: want parts for each of {sorted(self.recipes)} and one of them as default, got "
                 f"{sorted(self.parts)} and {self.default!r}"
             )
-        if any(part <= 0.0 for parts in self.parts.values() for part in parts):
-            raise ValueError(f"work_precision.field.parts: want numbers above 0, got {dict(self.parts)}")
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Fit the run's first object; seconds on the wall, of the training without the renders that score it."""

@@ -13,15 +13,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from statistics import fmean
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import MinLen
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import centred_cosine, response
 from neural_sim.outer.settings import Outer
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
 from neural_sim.studies.work_precision.series import Point, Series, Timing
@@ -71,6 +73,7 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
     }
 
 
+@validated
 @dataclass(frozen=True)
 class Hypergradients:
     """The family ``hypergradient``.
@@ -79,26 +82,11 @@ class Hypergradients:
         trainings: seeds of the training whose derivative is taken.
         solver: of the implicit ways, the project's own.
         places: where on the loop's way; all but its start run the loop first.
-
-    Raises:
-        ValueError: fewer than one training, or no place.
     """
 
-    trainings: int = 2
+    trainings: PositiveInt = 2
     solver: AdjointSolver = field(default_factory=AdjointSolver)
-    places: Sequence[Place] = ("start",)
-
-    def __post_init__(self) -> None:
-        if self.trainings < 1:
-            raise ValueError(
-                f"work_precision.hypergradient.trainings must be at least 1, got {self.trainings}"
-            )
-
-        if not self.places or not set(self.places) <= set(get_args(Place)):
-            raise ValueError(
-                f"work_precision.hypergradient.places wants some of {', '.join(get_args(Place))}, got "
-                f"{list(self.places)}"
-            )
+    places: Annotated[Sequence[Place], MinLen(1)] = ("start",)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure at every place that the loop has come to."""

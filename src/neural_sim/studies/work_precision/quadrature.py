@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.field.quadrature import PackedSamples, composite
+from neural_sim.ranges import Ascending, validated
 from neural_sim.studies.work_precision.series import Order, Point, Series, Timing, slope
 
 SPAN = 2.0
@@ -115,6 +118,7 @@ def reference(density: Density, offset: Float[Tensor, "rays"], samples: int) -> 
     return torch.cat([rendered(density, part, samples, None) for part in parts])
 
 
+@validated
 @dataclass(frozen=True)
 class Quadrature:
     """The family ``quadrature``.
@@ -123,25 +127,19 @@ class Quadrature:
         samples: numbers of samples a ray, growing.
         default: the project's own: one for each cell of a grid field along the unit sphere's diameter.
         rays: of every density, at random places.
-
-    Raises:
-        ValueError: fewer than two numbers of samples, ones that do not grow from 2, or fewer than two rays or samples.
     """
 
-    samples: tuple[int, ...] = (16, 32, 64, 128, 256, 512, 1024)
-    default: int = 128
-    rays: int = 256
-
-    def __post_init__(self) -> None:
-        pairs = zip(self.samples, self.samples[1:], strict=False)
-        if len(self.samples) < 2 or self.samples[0] < 2 or any(a >= b for a, b in pairs):
-            raise ValueError(
-                f"work_precision.quadrature.samples: want growing numbers from 2, got {list(self.samples)}"
-            )
-        if min(self.rays, self.default) < 2:
-            raise ValueError(
-                f"work_precision.quadrature: rays and default must be at least 2, got {self.rays} and {self.default}"
-            )
+    samples: Annotated[tuple[Annotated[int, Ge(2)], ...], MinLen(2), Ascending(strictly=True)] = (
+        16,
+        32,
+        64,
+        128,
+        256,
+        512,
+        1024,
+    )
+    default: Annotated[int, Ge(2)] = 128
+    rays: Annotated[int, Ge(2)] = 256
 
     @property
     def counts(self) -> list[int]:

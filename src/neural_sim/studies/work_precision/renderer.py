@@ -13,6 +13,7 @@ from torch import Tensor
 from neural_sim import cameras
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pixels import seen_pixels
+from neural_sim.ranges import Fraction, Positive, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.studies.work_precision.series import Point, Series, Timing
 from neural_sim.studies.work_precision.world import World
@@ -78,6 +79,7 @@ def left_out(
     )
 
 
+@validated
 @dataclass(frozen=True)
 class Renderer:
     """The family ``renderer``.
@@ -87,21 +89,12 @@ class Renderer:
         views: held-out poses of which images are rendered.
         terminations: transmittances behind which samples are skipped.
         steps: factors of the field's step.
-
-    Raises:
-        ValueError: an image or a number of views below 1.
     """
 
-    size: int = 96
-    views: int = 4
-    terminations: tuple[float, ...] = (1e-4, 3e-3, 3e-2, 1e-1)
-    steps: tuple[float, ...] = (1.5, 3.0)
-
-    def __post_init__(self) -> None:
-        if min(self.size, self.views) < 1:
-            raise ValueError(
-                f"work_precision.renderer: size and views must be at least 1, got {self.size}, {self.views}"
-            )
+    size: PositiveInt = 96
+    views: PositiveInt = 4
+    terminations: tuple[Fraction, ...] = (1e-4, 3e-3, 3e-2, 1e-1)
+    steps: tuple[Positive, ...] = (1.5, 3.0)
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure means over the run's objects; seconds an image."""

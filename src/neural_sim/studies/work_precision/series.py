@@ -7,11 +7,12 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar, get_args
+from typing import Literal, TypeVar
 
 import torch
 
 from neural_sim.devices import peak_bytes, synchronise
+from neural_sim.ranges import PositiveInt, validated
 
 T = TypeVar("T")
 Clock = Literal["cpu_seconds", "seconds"]
@@ -143,22 +144,13 @@ def slope(steps: Sequence[float], errors: Sequence[float]) -> float:
     return statistics.linear_regression(x, y).slope
 
 
+@validated
 @dataclass(frozen=True)
 class Timing:
-    """How run times are measured: the median of ``repeats`` runs by ``clock``.
+    """How run times are measured: the median of ``repeats`` runs by ``clock``."""
 
-    Raises:
-        ValueError: fewer than one repeat, or another clock.
-    """
-
-    repeats: int = 3
+    repeats: PositiveInt = 3
     clock: Clock = "cpu_seconds"
-
-    def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ValueError(f"work_precision.repeats must be at least 1, got {self.repeats}")
-        if self.clock not in get_args(Clock):
-            raise ValueError(f"work_precision.clock must be one of {get_args(Clock)}, got {self.clock!r}")
 
     def now(self, device: torch.device | None = None) -> float:
         """Return seconds of the clock, after the device's work."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Solution
 from neural_sim.solver.damping import FixedDamping
@@ -137,6 +138,7 @@ def _words(solution: Solution) -> str:
     return solution.status.name.lower().replace("_", " ")
 
 
+@validated
 @dataclass(frozen=True)
 class Solver:
     """The family ``solver``.
@@ -153,28 +155,25 @@ class Solver:
         images: of ``timed``, at ``size`` pixels a side.
 
     Raises:
-        ValueError: an unknown default, or a number that is not positive.
+        ValueError: an unknown default.
     """
 
     solvers: Mapping[str, AdjointSolver] = field(default_factory=lambda: {"cg": AdjointSolver()})
     detector: Callable[..., Detector] | None = None
     timed: Callable[..., Detector] | None = None
     default: str = "cg"
-    rtols: tuple[float, ...] = (1e-6, 1e-9)
-    steps: tuple[int, ...] = (5, 10, 20, 40)
-    factors: tuple[float, ...] = (1.0, 0.75)
-    conditions: tuple[float, ...] = (1e2, 1e6, 1e10)
-    images: int = 64
-    size: int = 96
+    rtols: tuple[Positive, ...] = (1e-6, 1e-9)
+    steps: tuple[PositiveInt, ...] = (5, 10, 20, 40)
+    factors: tuple[Positive, ...] = (1.0, 0.75)
+    conditions: tuple[Positive, ...] = (1e2, 1e6, 1e10)
+    images: PositiveInt = 64
+    size: PositiveInt = 96
 
     def __post_init__(self) -> None:
         if self.default not in self.solvers:
             raise ValueError(
                 f"work_precision.solver.default must be one of {', '.join(self.solvers)}, got {self.default!r}"
             )
-        numbers = (*self.rtols, *self.steps, *self.factors, *self.conditions, self.images, self.size)
-        if min(numbers) <= 0:
-            raise ValueError(f"work_precision.solver: want numbers above 0, got {numbers}")
 
     def measure(self, world: World, timing: Timing, seed: int) -> Iterator[Series]:
         """Measure on the detector of ``micro``, on linear systems, and products of the run's kind of detector."""

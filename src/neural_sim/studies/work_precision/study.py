@@ -7,10 +7,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
+from annotated_types import MinLen
 from typing_extensions import override
 
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.provenance import machine
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Stage
@@ -28,7 +30,10 @@ from neural_sim.studies.work_precision.world import Family, World
 from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
-FAMILIES = ("quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop")
+Name = Literal[
+    "quadrature", "renderer", "field", "solver", "hypergradient", "estimator", "derivative", "loop"
+]  # fmt: skip
+FAMILIES: tuple[Name, ...] = get_args(Name)
 """In the order of the loop; each is a key of the settings."""
 COMMAND = "python -m src.main +experiment=work_precision"
 """What a documentation page says that makes its sections; they are to be made at its scale, quick."""
@@ -43,6 +48,7 @@ READS: Mapping[str, Callable[[Graph], Iterable[Stage[Any]]]] = {
 """The stages that a family reads."""
 
 
+@validated
 @dataclass(frozen=True)
 class WorkPrecision(Task):
     """``+experiment=work_precision``.
@@ -60,13 +66,10 @@ class WorkPrecision(Task):
         estimator: likewise.
         derivative: likewise.
         loop: likewise.
-
-    Raises:
-        ValueError: an unknown family or clock, or fewer than one repeat.
     """
 
-    families: Sequence[str] = FAMILIES
-    repeats: int = 3
+    families: Annotated[Sequence[Name], MinLen(1)] = FAMILIES
+    repeats: PositiveInt = 3
     clock: Clock = "cpu_seconds"
     docs: str | None = None
     quadrature: Quadrature = field(default_factory=Quadrature)
@@ -77,13 +80,6 @@ class WorkPrecision(Task):
     estimator: Estimators = field(default_factory=Estimators)
     derivative: Derivative = field(default_factory=Derivative)
     loop: Loops = field(default_factory=Loops)
-
-    def __post_init__(self) -> None:
-        if not self.families or not set(self.families) <= set(FAMILIES):
-            raise ValueError(
-                f"work_precision.families wants some of {', '.join(FAMILIES)}, got {list(self.families)}"
-            )
-        _ = self.timing  # raises for a bad clock or number of repeats
 
     @property
     def timing(self) -> Timing:
