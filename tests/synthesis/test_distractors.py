@@ -176,20 +176,6 @@ def test_exported_masks_leave_out_what_is_hidden(scene_with, folder):
     assert lost > 0
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"count": (2, 1)}, r"count: want 0 <= fewest <= most, got \[2, 1\]"),
-        ({"size": (0.0, 1.0)}, "size: want 0 < smallest"),
-        ({"front": 1.5}, r"front must lie in \[0, 1\], got 1.5"),
-        ({"root": "nowhere"}, "root: want a folder of pictures, got nowhere"),
-    ],
-)
-def test_bad_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Distractors(**settings)
-
-
 def test_files_without_an_alpha_channel_are_named(tmp_path):
     with pytest.raises(ValueError, match="no picture"):
         Distractors(tmp_path)

@@ -43,9 +43,3 @@ def test_a_selection_keeps_its_own_blur_and_noise():
         seen_by(images[rows], drawn.select(rows)), seen_by(images, drawn)[rows], atol=1e-6, rtol=0
     )
     assert isinstance(drawn.select(rows), SensorDraw)
-
-
-@pytest.mark.parametrize("bad", [{"blur": [1.0, 0.5]}, {"noise": [-0.1, 0.1]}, {"blur": [1.0]}])
-def test_ranges_that_are_none_are_refused(bad):
-    with pytest.raises(ValueError, match=r"synthesis\.sensor"):
-        Sensor(**bad)

@@ -122,7 +122,7 @@ def test_sets_follow_the_target_distribution_and_share_nothing(
 
 
 def test_fewer_than_one_image_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"target\.val_per_object must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"RenderedTarget\.val_per_object: want at least 1, got 0"):
         RenderedTarget(val_per_object=0)
 
 
@@ -139,5 +139,5 @@ def test_images_for_training_are_others_and_change_none_that_is_scored(
     assert all(torch.equal(made[part].images, without[part].images) for part in without)
     colours = [{tuple(c.tolist()) for c in part.images[:, :, 0, 0]} for part in made.values()]
     assert not any(one & other for i, one in enumerate(colours) for other in colours[i + 1 :])
-    with pytest.raises(ValueError, match=r"target\.train_per_object must be at least 0, got -1"):
+    with pytest.raises(ValueError, match=r"RenderedTarget\.train_per_object: want at least 0, got -1"):
         RenderedTarget(train_per_object=-1)

@@ -108,12 +108,12 @@ def results(path, document):
 
 
 REFUSED = [
-    (["export.count=0"], r"export\.count must be at least 1, got 0"),
+    (["export.count=0"], r"export\.count: want at least 1, got 0"),
     (["export.width=null"], r"export: want width and height or neither, got None and 36"),
-    (["export.formats=[coco,voc]"], r"export\.formats: want some of \['coco', 'yolo', 'bop'\], got \['coco', 'voc'\]"),
-    (["export.formats=[]"], r"export\.formats: want some of .*, got \[\]"),
-    (["export.image_format=gif"], r"export\.image_format: want .*'gif'|export\.image_format must be one of"),
-    (["export.workers=-1"], r"export\.workers must be at least 0, got -1"),
+    (["export.formats=[coco,voc]"], r"export\.formats\[1\]: want one of coco, yolo, bop, got 'voc'"),
+    (["export.formats=[]"], r"export\.formats: want 1 or more values and no value twice, got \[\]"),
+    (["export.image_format=gif"], r"export\.image_format: want one of jpg, png, got 'gif'"),
+    (["export.workers=-1"], r"export\.workers: want at least 0 or null, got -1"),
     (["export.psi=/none"], r"export\.psi: want learned, initial, target, a run's folder.*, got /none, which does not"),
     (lambda path: [results(path, "{")], r"export\.psi: .*results\.json is no results\.json or psi\.json"),
     (lambda path: [results(path, {"psi": {"pitcher": {"pose": [0.125] * 8}}})],

@@ -6,20 +6,21 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, MinLen
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.checks import at_least
 from neural_sim.documents import markdown_table
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.bins import BinNoise, gumbel
 from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.ranges import Positive, validated
 from neural_sim.report import figures
 from neural_sim.report.figures import INK, METHOD_COLOURS, MUTED
 from neural_sim.report.tracking import Run
@@ -67,6 +68,7 @@ class Truth:
     probabilities: list[float]
 
 
+@validated
 @dataclass(frozen=True)
 class Temperatures(Task):
     """``+experiment=gumbel_temperature``.
@@ -76,20 +78,12 @@ class Temperatures(Task):
         rounds: estimates at each tau, from ``outer.images_per_object`` images each.
         truth_per_bin: images of every bin for the truth.
         draws: relaxed draws of a bin, for the frequencies.
-
-    Raises:
-        ValueError: no temperature, one that is not positive, or fewer than two rounds, images or draws.
     """
 
-    values: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-    rounds: int = 8
-    truth_per_bin: int = 240
-    draws: int = 20_000
-
-    def __post_init__(self) -> None:
-        if not self.values or not all(value > 0.0 for value in self.values):
-            raise ValueError(f"temperatures.values: want positive numbers, got {list(self.values)}")
-        at_least("temperatures", 2, rounds=self.rounds, truth_per_bin=self.truth_per_bin, draws=self.draws)
+    values: Annotated[tuple[Positive, ...], MinLen(1)] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+    rounds: Annotated[int, Ge(2)] = 8
+    truth_per_bin: Annotated[int, Ge(2)] = 240
+    draws: Annotated[int, Ge(2)] = 20_000
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

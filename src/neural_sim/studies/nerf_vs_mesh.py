@@ -6,11 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge
 from typing_extensions import override
 
-from neural_sim.checks import at_least
+from annotated_types import Ge
+
+from neural_sim.ranges import Ascending, NonNegativeInt, PositiveInt, validated
 from neural_sim.report.coco import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
@@ -26,6 +29,7 @@ ANNOTATIONS = ("coco_annotations.json", "coco_data/coco_annotations.json")
 """Where BlenderProc's ``write_coco_annotations`` writes, in its output folder."""
 
 
+@validated
 @dataclass(frozen=True)
 class NerfVsMesh(Task):
     """``+experiment=nerf_vs_mesh``: one detector trained on images of the fields and of the meshes.
@@ -44,24 +48,18 @@ class NerfVsMesh(Task):
         shown: training images of each kind in the figure.
 
     Raises:
-        ValueError: numbers below their least, a range that is none, or a folder without BlenderProc's annotations.
+        ValueError: a folder without BlenderProc's annotations.
     """
 
-    single: Sequence[int] = (1, 1)
-    multiple: Sequence[int] = (2, 4)
-    seeds: int = 5
+    single: Annotated[tuple[NonNegativeInt, PositiveInt], Ascending()] = (1, 1)
+    multiple: Annotated[tuple[NonNegativeInt, PositiveInt], Ascending()] = (2, 4)
+    seeds: PositiveInt = 5
     blenderproc: str | None = None
     categories: Mapping[str, str | None] | None = None
-    draws: int = 300
-    shown: int = 8
+    draws: Annotated[int, Ge(2)] = 300
+    shown: PositiveInt = 8
 
     def __post_init__(self) -> None:
-        at_least("nerf_vs_mesh", 1, seeds=self.seeds, shown=self.shown)
-        at_least("nerf_vs_mesh", 2, draws=self.draws)
-        for key in ("single", "multiple"):
-            value = list(getattr(self, key))
-            if len(value) != 2 or not 0 <= value[0] <= value[1] or value[1] < 1:
-                raise ValueError(f"nerf_vs_mesh.{key}: want fewest and most objects of an image, got {value}")
         _ = self._rendered  # a folder without annotations is refused before anything is computed
 
     @cached_property

@@ -8,18 +8,19 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import MinLen
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.checks import at_least
 from neural_sim.devices import peak_bytes, synchronise
 from neural_sim.documents import markdown_table
 from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
 from neural_sim.outer.binding import image_losses, rendered_path
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
 from neural_sim.studies.frozen import FrozenLoop
@@ -58,6 +59,7 @@ class PatchCost:
     difference: float
 
 
+@validated
 @dataclass(frozen=True)
 class PatchMemory(Task):
     """``+experiment=patch_memory``.
@@ -65,18 +67,10 @@ class PatchMemory(Task):
     Args:
         patches: rays per patch of the reverse mode.
         repeats: timings, whose median counts.
-
-    Raises:
-        ValueError: no patch, one of less than a ray, or fewer than one repeat.
     """
 
-    patches: tuple[int, ...] = (64, 128, 256, 512)
-    repeats: int = 3
-
-    def __post_init__(self) -> None:
-        if not self.patches or min(self.patches) < 1:
-            raise ValueError(f"patch_memory.patches: want numbers of rays from 1, got {list(self.patches)}")
-        at_least("patch_memory", 1, repeats=self.repeats)
+    patches: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64, 128, 256, 512)
+    repeats: PositiveInt = 3
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

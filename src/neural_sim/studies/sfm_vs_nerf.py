@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.alpha import over_white, premultiplied
-from neural_sim.checks import at_least
 from neural_sim.documents import markdown_table
-from neural_sim.field.hull import COARSEST
+from neural_sim.field.hull import Resolution
 from neural_sim.field.scores import compare, where_known
 from neural_sim.objects.mesh import ObjectMesh, content_digest
+from neural_sim.ranges import PositiveInt, validated
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
@@ -50,32 +51,22 @@ class HeldOut:
     scores: Mapping[str, Mapping[str, float]]
 
 
+@validated
 @dataclass(frozen=True)
 class SfmVsNerf(Task):
     """``+experiment=sfm_vs_nerf``: what a reconstructed mesh lacks that a field has.
 
     Args:
-        resolution: cells of the reconstruction along the unit sphere's diameter, a power of two from 32.
+        resolution: cells of the reconstruction along the unit sphere's diameter.
         seeds: how many detectors of each kind, from the run's seed on.
         draws: of the bootstrap over test images.
         shown: training images of each kind in the figure.
-
-    Raises:
-        ValueError: numbers below their least, or another resolution.
     """
 
-    resolution: int = 128
-    seeds: int = 5
-    draws: int = 300
-    shown: int = 8
-
-    def __post_init__(self) -> None:
-        at_least("sfm_vs_nerf", 1, seeds=self.seeds, shown=self.shown)
-        at_least("sfm_vs_nerf", 2, draws=self.draws)
-        if self.resolution < COARSEST or self.resolution & (self.resolution - 1):
-            raise ValueError(
-                f"sfm_vs_nerf.resolution must be a power of two from {COARSEST}, got {self.resolution}"
-            )
+    resolution: Resolution = 128
+    seeds: PositiveInt = 5
+    draws: Annotated[int, Ge(2)] = 300
+    shown: PositiveInt = 8
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neural_sim.devices import moved
 from neural_sim.objects.files import content_digest
+from neural_sim.ranges import Fraction, NonNegative, NonNegativeInt, PositiveFraction, PositiveInt, validated
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 # Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
@@ -35,6 +36,7 @@ class Background(Protocol):
     ) -> Float[Tensor, "n 3 height width"]: ...
 
 
+@validated
 class ProceduralClutter:
     """Indoor-like clutter: smooth noise in random colours under textured, shaded rectangles and ellipses.
 
@@ -44,27 +46,16 @@ class ProceduralClutter:
         shapes: shapes an image, drawn far to near.
         distractors: fraction of shapes that are saturated red or blue, so that colour alone finds no object.
         grain: standard deviation of pixel noise.
-
-    Raises:
-        ValueError: a negative number, or a fraction above 1.
     """
 
     def __init__(
         self,
-        octaves: int = 5,
-        contrast: float = 0.35,
-        shapes: int = 10,
-        distractors: float = 0.4,
-        grain: float = 0.02,
+        octaves: PositiveInt = 5,
+        contrast: NonNegative = 0.35,
+        shapes: NonNegativeInt = 10,
+        distractors: Fraction = 0.4,
+        grain: NonNegative = 0.02,
     ) -> None:
-        if octaves < 1 or shapes < 0:
-            raise ValueError(f"ProceduralClutter: want octaves >= 1 and shapes >= 0, got {octaves}, {shapes}")
-        if contrast < 0.0 or grain < 0.0:
-            raise ValueError(
-                f"ProceduralClutter: contrast and grain must not be negative, got {contrast}, {grain}"
-            )
-        if not 0.0 <= distractors <= 1.0:
-            raise ValueError(f"ProceduralClutter: distractors must lie in [0, 1], got {distractors}")
         self.octaves, self.contrast, self.shapes = octaves, contrast, shapes
         self.distractors, self.grain = distractors, grain
 
@@ -154,25 +145,22 @@ class ProceduralClutter:
         return (value[:, None] * (1.0 - saturation[:, None] * (1.0 - pure)))[..., None, None]
 
 
+@validated
 class PhotoFolder:
     """Random crops of the photographs under a folder, resized; ``smallest`` is the side of the smallest
     crop relative to the largest.
 
     Raises:
-        ValueError: no folder, no photograph in it, or ``smallest`` outside (0, 1].
+        ValueError: no folder, or no photograph in it.
     """
 
-    def __init__(self, root: str | Path, smallest: float = 0.4) -> None:
+    def __init__(self, root: str | Path, smallest: PositiveFraction = 0.4) -> None:
         self.root, self.smallest = Path(root).expanduser(), smallest
         if not self.root.is_dir():
-            raise ValueError(f"synthesis.background.root: want a folder of photographs, got {self.root}")
-        if not 0.0 < smallest <= 1.0:
-            raise ValueError(f"synthesis.background.smallest must lie in (0, 1], got {smallest}")
+            raise ValueError(f"PhotoFolder.root: want a folder of photographs, got {self.root}")
         self.files = sorted(path for path in self.root.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
         if not self.files:
-            raise ValueError(
-                f"synthesis.background.root: no photograph ({', '.join(PHOTO_SUFFIXES)}) in {self.root}"
-            )
+            raise ValueError(f"PhotoFolder.root: no photograph ({', '.join(PHOTO_SUFFIXES)}) in {self.root}")
 
     def draw(
         self,

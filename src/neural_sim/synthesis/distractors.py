@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Gt, Le
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from neural_sim.objects.files import content_digest
+from neural_sim.ranges import Ascending, Fraction, NonNegativeInt, validated
 
+Size = Annotated[float, Gt(0), Le(4)]
 SUFFIXES = (".png", ".webp", ".tif", ".tiff")
 """Of formats with an alpha channel."""
 
@@ -35,6 +38,7 @@ class Cover:
         return rgb.movedim(-1, 1) + (1.0 - opacity)[:, None] * images
 
 
+@validated
 @dataclass(frozen=True)
 class Distractors:
     """Random cut-outs of a folder, at random places and sizes, behind the objects or in front of them.
@@ -46,27 +50,19 @@ class Distractors:
         front: probability of being in front of the objects, which it then hides.
 
     Raises:
-        ValueError: no folder, no picture in it, a range that is none, or a probability outside [0, 1].
+        ValueError: no folder, or no picture in it.
     """
 
     root: str | Path | None = None
-    count: Sequence[int] = (0, 3)
-    size: Sequence[float] = (0.15, 0.6)
-    front: float = 0.3
+    count: Annotated[tuple[NonNegativeInt, NonNegativeInt], Ascending()] = (0, 3)
+    size: Annotated[tuple[Size, Size], Ascending()] = (0.15, 0.6)
+    front: Fraction = 0.3
 
     def __post_init__(self) -> None:
-        if len(self.count) != 2 or not 0 <= self.count[0] <= self.count[1]:
-            raise ValueError(f"synthesis.distractors.count: want 0 <= fewest <= most, got {list(self.count)}")
-        if len(self.size) != 2 or not 0.0 < self.size[0] <= self.size[1] <= 4.0:
-            raise ValueError(
-                f"synthesis.distractors.size: want 0 < smallest <= largest <= 4, got {list(self.size)}"
-            )
-        if not 0.0 <= self.front <= 1.0:
-            raise ValueError(f"synthesis.distractors.front must lie in [0, 1], got {self.front}")
         if self._folder is not None and not self._folder.is_dir():
-            raise ValueError(f"synthesis.distractors.root: want a folder of pictures, got {self.root}")
+            raise ValueError(f"Distractors.root: want a folder of pictures, got {self.root}")
         if self._folder is not None and not self.files:
-            raise ValueError(f"synthesis.distractors.root: no picture ({', '.join(SUFFIXES)}) in {self.root}")
+            raise ValueError(f"Distractors.root: no picture ({', '.join(SUFFIXES)}) in {self.root}")
 
     @property
     def _folder(self) -> Path | None:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from neural_sim.ranges import Ascending, NonNegative, validated
+
+Deviations = Annotated[tuple[NonNegative, NonNegative], Ascending()]
+"""The smallest and the largest standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,7 @@ class SensorDraw:
         return SensorDraw(*(None if part is None else part[index] for part in (self.blur, self.grain)))
 
 
+@validated
 @dataclass(frozen=True)
 class Sensor:
     """Blur and noise of an image, each uniform in a range.
@@ -30,19 +37,10 @@ class Sensor:
     Args:
         blur: smallest and largest standard deviation of the blur, in pixels.
         noise: smallest and largest standard deviation of the noise, of sRGB values in [0, 1].
-
-    Raises:
-        ValueError: a range that is not 0 <= smallest <= largest.
     """
 
-    blur: Sequence[float] = (0.0, 0.0)
-    noise: Sequence[float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for key in ("blur", "noise"):
-            bounds = list(getattr(self, key))
-            if len(bounds) != 2 or not 0.0 <= bounds[0] <= bounds[1] < float("inf"):
-                raise ValueError(f"synthesis.sensor.{key}: want 0 <= smallest <= largest, got {bounds}")
+    blur: Deviations = (0.0, 0.0)
+    noise: Deviations = (0.0, 0.0)
 
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from neural_sim.ranges import Ascending, Fraction, NonNegative, NonNegativeInt, PositiveInt, validated
 from neural_sim.synthesis.background import Background
 from neural_sim.synthesis.boxes import boxes_from_opacity
 from neural_sim.synthesis.compositing import apply_shift, composite, draw_shift
@@ -43,6 +45,7 @@ class Nuisance:
         return Nuisance(self.backgrounds[index], self.shifts[index], sensor, front)
 
 
+@validated
 @dataclass(frozen=True)
 class Synthesizer:
     """How a rendered object becomes a labelled training image.
@@ -59,32 +62,22 @@ class Synthesizer:
         distractors: things without a label, behind and in front of the objects.
 
     Raises:
-        ValueError: a fraction outside [0, 1], a threshold outside [0, 1), a negative area, or a range that is none.
+        ValueError: a background that does not draw.
     """
 
     background: Background
-    shift: float = 0.15
-    threshold: float = 0.5
-    minimum_area: float = 16.0
-    objects_per_image: Sequence[int] = (1, 1)
-    min_visibility: float = 0.1
+    shift: Fraction = 0.15
+    threshold: Annotated[float, Ge(0), Lt(1)] = 0.5
+    minimum_area: NonNegative = 16.0
+    objects_per_image: Annotated[tuple[NonNegativeInt, PositiveInt], Ascending()] = (1, 1)
+    min_visibility: Fraction = 0.1
     sensor: Sensor = field(default_factory=Sensor)
     distractors: Distractors = field(default_factory=Distractors)
 
     def __post_init__(self) -> None:
         if not hasattr(self.background, "draw"):
-            raise ValueError(f"synthesis.background must have a draw method, got {self.background!r}")
-        if not 0.0 <= self.shift <= 1.0:
-            raise ValueError(f"synthesis.shift must lie in [0, 1], got {self.shift}")
-        if not 0.0 <= self.threshold < 1.0:
-            raise ValueError(f"synthesis.threshold must lie in [0, 1), got {self.threshold}")
-        if not self.minimum_area >= 0.0:
-            raise ValueError(f"synthesis.minimum_area must not be negative, got {self.minimum_area}")
-        if not 0.0 <= self.min_visibility <= 1.0:
-            raise ValueError(f"synthesis.min_visibility must lie in [0, 1], got {self.min_visibility}")
-        if len(self.objects_per_image) != 2:
             raise ValueError(
-                f"synthesis.objects_per_image: want fewest and most, got {list(self.objects_per_image)}"
+                f"Synthesizer.background: want something with a draw method, got {self.background!r}"
             )
 
     @property

@@ -15,6 +15,7 @@ from typing_extensions import override
 from neural_sim.cameras import cameras_of, orbit
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
+from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.subject import Subject
@@ -30,6 +31,7 @@ _log = logging.getLogger(__name__)
 CHUNK = 64
 
 
+@validated
 @dataclass(frozen=True)
 class RenderedTarget(Target):
     """Images rendered at the target distribution, each part with random numbers of its own.
@@ -39,23 +41,13 @@ class RenderedTarget(Target):
         test_per_object: images of each object to score.
         test_per_biased_object: the same for objects that some parameter's ``biased`` names, whose scores are compared.
         train_per_object: images that stand for labelled photographs in training (``training.real``); 0: none do.
-
-    Raises:
-        ValueError: a number out of its range.
     """
 
     renders: ClassVar[bool] = True
-    val_per_object: int = 50
-    test_per_object: int = 100
-    test_per_biased_object: int = 200
-    train_per_object: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("val_per_object", "test_per_object", "test_per_biased_object"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"target.{name} must be at least 1, got {getattr(self, name)}")
-        if self.train_per_object < 0:
-            raise ValueError(f"target.train_per_object must be at least 0, got {self.train_per_object}")
+    val_per_object: PositiveInt = 50
+    test_per_object: PositiveInt = 100
+    test_per_biased_object: PositiveInt = 200
+    train_per_object: NonNegativeInt = 0
 
     @property
     @override

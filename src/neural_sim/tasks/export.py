@@ -7,15 +7,16 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
+from annotated_types import Ge, MinLen
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.cameras import reframed
-from neural_sim.checks import at_least
+from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.nerf import Quality
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
@@ -25,7 +26,7 @@ from neural_sim.stages.store import locked
 from neural_sim.stages.version import code_version
 from neural_sim.stages.views import Meshes, Objects
 from neural_sim.synthesis.export.bop import Model
-from neural_sim.synthesis.export.dataset import FORMATS, DataSet, Format, ImageFormat
+from neural_sim.synthesis.export.dataset import DataSet, Format, ImageFormat
 from neural_sim.synthesis.export.files import write_json, write_whole
 from neural_sim.synthesis.export.folder import ExportFolder
 from neural_sim.synthesis.export.images import ImageSource
@@ -40,6 +41,7 @@ UNKNOWN_RADIUS = 100.0
 """Millimetres that stand for the radius of objects of unknown size in BOP's files."""
 
 
+@validated
 @dataclass(frozen=True)
 class ExportTask(Task):
     """A data set of ``count`` images. See ``docs/usage.md``, Exporting a data set.
@@ -60,38 +62,25 @@ class ExportTask(Task):
         workers: processes; 0: this one alone; null: one for each core, this one alone with a GPU.
 
     Raises:
-        ValueError: any of these out of its range.
+        ValueError: a width without a height.
     """
 
-    count: int = 1000
+    count: PositiveInt = 1000
     psi: str = "learned"
-    width: int | None = None
-    height: int | None = None
-    formats: Sequence[str] = ("coco",)
+    width: Annotated[int, Ge(8)] | None = None
+    height: Annotated[int, Ge(8)] | None = None
+    formats: Annotated[Sequence[Format], MinLen(1), Distinct()] = ("coco",)
     folder: str | None = None
     image_format: ImageFormat = "jpg"
     quality: Quality | None = None
     detail: Literal["auto", "run"] = "auto"
-    largest_views: int = 384
-    scene_size: int = 1000
-    workers: int | None = None
+    largest_views: PositiveInt = 384
+    scene_size: PositiveInt = 1000
+    workers: NonNegativeInt | None = None
 
     def __post_init__(self) -> None:
-        at_least("export", 1, count=self.count, largest_views=self.largest_views, scene_size=self.scene_size)
-        at_least("export", 0, workers=self.workers or 0)
-        for side in ("width", "height"):
-            if getattr(self, side) is not None:
-                at_least("export", 8, **{side: getattr(self, side)})
         if (self.width is None) != (self.height is None):
             raise ValueError(f"export: want width and height or neither, got {self.width} and {self.height}")
-        wanted = list(self.formats) if not isinstance(self.formats, str) else [self.formats]
-        if not wanted or set(wanted) - set(FORMATS) or len(set(wanted)) < len(wanted):
-            raise ValueError(f"export.formats: want some of {list(FORMATS)}, got {wanted}")
-        choices = {"image_format": get_args(ImageFormat), "quality": (None, *get_args(Quality)),
-                   "detail": ("auto", "run")}  # fmt: skip
-        for key, known in choices.items():
-            if getattr(self, key) not in known:
-                raise ValueError(f"export.{key} must be one of {known}, got {getattr(self, key)!r}")
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:

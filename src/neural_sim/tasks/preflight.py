@@ -14,6 +14,7 @@ from neural_sim.documents import write_json
 from neural_sim.outer.descent import GradientLoop
 from neural_sim.outer.foreseen import foresee
 from neural_sim.outer.labelled import labelled_gains
+from neural_sim.ranges import PositiveFraction, PositiveInt, validated
 from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
 from neural_sim.stages.stage import Stage
@@ -21,6 +22,7 @@ from neural_sim.target.mismatch import distance_factor, matching_settings, misma
 from neural_sim.tasks.context import Context, Task
 
 
+@validated
 @dataclass(frozen=True)
 class PreflightTask(Task):
     """What to expect of an optimisation, before any.
@@ -33,22 +35,11 @@ class PreflightTask(Task):
         moved: fraction of an object's images that is moved to a bin for the gains by bin.
         labelled: numbers of labelled photographs whose gain in training is measured beside it, where the target has a
             part for training.
-
-    Raises:
-        ValueError: no trial, a fraction outside (0, 1], or a number of photographs below 1.
     """
 
-    trials: int = 2
-    moved: float = 0.15
-    labelled: Sequence[int] = (10, 25)
-
-    def __post_init__(self) -> None:
-        if self.trials < 1:
-            raise ValueError(f"preflight.trials must be at least 1, got {self.trials}")
-        if not 0.0 < self.moved <= 1.0:
-            raise ValueError(f"preflight.moved must lie in (0, 1], got {self.moved}")
-        if any(count < 1 for count in self.labelled):
-            raise ValueError(f"preflight.labelled: want numbers of at least 1, got {list(self.labelled)}")
+    trials: PositiveInt = 2
+    moved: PositiveFraction = 0.15
+    labelled: Sequence[PositiveInt] = (10, 25)
 
     @override
     def reads(self, context: Context) -> Iterable[Stage[Any]]:
