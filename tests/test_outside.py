@@ -55,7 +55,7 @@ def test_each_is_built_from_its_group():
     ("override", "message"),
     [
         ("parameter.turn.bins=two", "parameter.turn.bins: want a whole number, got 'two'"),
-        ("parameter.turn.range_deg=[3,1]", r"parameter.turn.range_deg must be ordered, got \[3, 1\]"),
+        ("parameter.turn.range_deg=[3,1]", r"parameter.turn.range_deg: want increasing values, got \[3, 1\]"),
         ("+gradient.draws=1", "gradient.draws: unknown key, want one of chunk_size"),
         ("detector.cell=0.5", "detector.cell: want a whole number, got 0.5"),
     ],

@@ -2,19 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions
+from neural_sim.ranges import Ascending, PositiveInt, validated
 
 
+@validated
 @dataclass(frozen=True)
 class Turn:
-    bins: int = 3
-    range_deg: tuple[float, float] = (-60.0, 60.0)
+    bins: PositiveInt = 3
+    range_deg: Annotated[tuple[float, float], Ascending(strictly=True)] = (-60.0, 60.0)
     target: str | dict | list = "uniform"
-
-    def __post_init__(self):
-        if not self.range_deg[0] < self.range_deg[1]:
-            raise ValueError(f"parameter.turn.range_deg must be ordered, got {list(self.range_deg)}")
 
     @property
     def factors(self):
