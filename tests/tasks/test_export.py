@@ -153,7 +153,9 @@ def test_on_the_command_line_bad_settings_end_with_status_two(base, tmp_path):
         [sys.executable, "-m", "src.main", *words], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith("neural-sim: export.formats[0]: want one of coco, yolo, bop")
+    assert done.stderr.splitlines()[-1].startswith(
+        "neural-sim: export.formats[0]: want one of coco, yolo, bop"
+    )
 
 
 def test_views_for_larger_images_have_as_many_pixels_for_a_radius(base):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +10,6 @@ from typing import Annotated, Any
 
 from annotated_types import Ge
 from typing_extensions import override
-
-from annotated_types import Ge
 
 from neural_sim.ranges import Ascending, NonNegativeInt, PositiveInt, validated
 from neural_sim.report.coco import write_training_set
