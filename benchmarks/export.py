@@ -29,7 +29,8 @@ from neural_sim.synthesis.export.dataset import ImageWriter
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.workers import each
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 
@@ -37,10 +38,8 @@ def source_of(fields: dict[str, torch.nn.Module], quality: str) -> ImageSource:
     """Poses uniform round the objects, at 2.4 to 4 radii, as in a run."""
     distribution = SceneDistribution.of([Pose()])
     camera = PinholeCamera(96, 96, math.radians(40.0))
-    scene = Scene(
-        tuple(fields), tuple(fields.values()), NerfRenderer(quality), camera, Synthesizer(ProceduralClutter()),
-        distribution,
-    )  # fmt: skip
+    subjects = tuple(FieldSubject(name, field, NerfRenderer(quality)) for name, field in fields.items())
+    scene = Scene(subjects, camera, Synthesizer(ProceduralClutter()), distribution)
     psi = torch.zeros(len(fields), distribution.size, dtype=torch.float64)
     return ImageSource(scene, psi, camera, (100.0,) * len(fields), 0)
 

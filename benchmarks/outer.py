@@ -43,8 +43,11 @@ PHASES = (
 def repeated(scene: Scene, count: int) -> Scene:
     """Repeat a scene's objects under new names until there are ``count``."""
     index = [i % len(scene.names) for i in range(count)]
-    names = tuple(f"{scene.names[i]}_{label}" for label, i in enumerate(index))
-    return dataclasses.replace(scene, names=names, fields=tuple(scene.fields[i] for i in index))
+    subjects = tuple(
+        dataclasses.replace(scene.fields[i], name=f"{scene.names[i]}_{label}")
+        for label, i in enumerate(index)
+    )
+    return dataclasses.replace(scene, subjects=subjects)
 
 
 def loop(context: Context, count: int, images: int) -> SimulatorModule:

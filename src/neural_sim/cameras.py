@@ -134,7 +134,7 @@ def cameras_of(
 
     ``magnification`` are the focal lengths in units of the camera's.
     """
-    if magnification is None:
+    if magnification is None or len(magnification) == 0:
         return [(camera, slice(None))]
     sizes = cast(list[float], magnification.tolist())  # pyright: ignore[reportUnknownMemberType]
     return [(magnified(camera, size), slice(i, i + 1)) for i, size in enumerate(sizes)]

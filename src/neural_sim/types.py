@@ -86,6 +86,11 @@ class Maps:
     rgb: Float[Tensor, "n h w 3"]
     opacity: Float[Tensor, "n h w"]
 
+    @property
+    def rgba(self) -> Float[Tensor, "n h w 4"]:
+        """Both in one array."""
+        return torch.cat([self.rgb, self.opacity[..., None]], -1)
+
 
 @dataclass(frozen=True)
 class LabelledImages:

@@ -21,7 +21,7 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.motion import pose_rates
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 
 DOUBLE = torch.float64

@@ -28,6 +28,7 @@ from neural_sim.solver.operator import Shifted, flatten, unflatten
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import moved_by
 from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.subjects import FieldSubject
 from neural_sim.types import Maps
 
 DOUBLE = torch.float64
@@ -93,16 +94,10 @@ def against_central_differences(scene, part, psi, generator):
 def test_the_focal_length_of_every_image_against_central_differences(pipeline, mode, generator):
     """From psi through the scene's own draw, each image at a focal length of its own, to random cotangents of maps."""
     distribution = SceneDistribution.of([Zoom(bins=3, by="focal_length", range=(0.6, 1.8), temperature=0.8)])
-    scene = Scene(
-        ("block",),
-        (pipeline.field,),
-        NerfRenderer(termination=0.0),
-        pipeline.camera,
-        pipeline.synthesizer,
-        distribution,
-    )
+    subject = FieldSubject("block", pipeline.field, NerfRenderer(termination=0.0))
+    scene = Scene((subject,), pipeline.camera, pipeline.synthesizer, distribution)
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
-    part = scene.drawn(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
     assert len(part.draw.magnification.unique()) == COUNT
     against_central_differences(scene, part, psi, generator)
 
@@ -117,11 +112,13 @@ def test_an_off_centre_camera_and_metres_against_central_differences(pipeline, m
     distribution = SceneDistribution.of([zoom], Unlearned(distance=(0.5, 0.7), distance_unit="metres"))
     camera = cameras.opencv_camera(36, 24, 40.0, 30.0, 14.0, 13.5)
     renderer = NerfRenderer(termination=0.0)
-    scene = Scene(("block",), (pipeline.field,), renderer, camera, pipeline.synthesizer, distribution,
-                  radii=distribution.radii({"block": 0.2}))  # fmt: skip
+    subject = FieldSubject("block", pipeline.field, renderer, radius=0.2)
+    scene = Scene((subject,), camera, pipeline.synthesizer, distribution)
     psi = torch.tensor([0.3, -0.2, 0.1], dtype=DOUBLE)
-    part = scene.drawn(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
-    distance = scene._poses(0, part.draw)[:, :3, 3].norm(dim=-1)
+    part = scene.draw(0, psi, COUNT, generator, RelaxedDraws(tangents=mode == "forward"))
+    draw = part.draw
+    poses = cameras.orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius)
+    distance = poses[:, :3, 3].norm(dim=-1)
     torch.testing.assert_close(distance, part.draw.distance / 0.2)
     against_central_differences(scene, part, psi, generator)
 

@@ -11,7 +11,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 
@@ -29,4 +30,5 @@ def scene():
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
     distribution = SceneDistribution.of([Pose(bins=4)])
     camera = PinholeCamera(32, 32, math.radians(40.0))
-    return Scene(("a", "b"), (_block(1), _block(2)), NerfRenderer(), camera, synthesizer, distribution)
+    subjects = tuple(FieldSubject(name, _block(seed), NerfRenderer()) for name, seed in (("a", 1), ("b", 2)))
+    return Scene(subjects, camera, synthesizer, distribution)

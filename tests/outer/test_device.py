@@ -27,7 +27,7 @@ from neural_sim.solver.damping import LanczosDamping
 from neural_sim.solver.hvp import HessianOperator
 from neural_sim.solver.operator import Shifted
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 
 TINY = {
     "num_classes": 2, "image_size": 32, "anchors": Anchors(sizes=((10,), (18,)), reference=32), "head": Head(8, 1),
@@ -40,7 +40,10 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
     detector, psi = RetinaNet(**TINY), torch.zeros(2, 4)
     scene = dataclasses.replace(
         scene,
-        fields=tuple(copy.deepcopy(field).to(device) for field in scene.fields),
+        subjects=tuple(
+            dataclasses.replace(subject, field=copy.deepcopy(subject.field).to(device))
+            for subject in scene.fields
+        ),
         synthesizer=Synthesizer(ProceduralClutter(octaves=1, shapes=1), shift=0.1),
     )
     validation = scene.training_set(psi, 3, generator).images.to("cpu")

@@ -30,7 +30,8 @@ from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.draws import HARD
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 ANCHORS, DOUBLE = 3, torch.float64
@@ -51,10 +52,12 @@ def _field(seed, dtype=torch.float32):
 
 def _scene(dtype=torch.float32, parameters=None):
     parameters = [Illumination(anchors=ANCHORS)] if parameters is None else parameters
-    fields = tuple(_field(seed, dtype) for seed in (1, 2))
+    subjects = tuple(
+        FieldSubject(name, _field(seed, dtype), NerfWRenderer()) for name, seed in (("a", 1), ("b", 2))
+    )
     camera = PinholeCamera(32, 32, math.radians(40.0))
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-    return Scene(("a", "b"), fields, NerfWRenderer(), camera, synthesizer, SceneDistribution.of(parameters))
+    return Scene(subjects, camera, synthesizer, SceneDistribution.of(parameters))
 
 
 def test_the_derivative_by_weights_against_central_differences():
@@ -75,7 +78,7 @@ def test_the_derivative_by_weights_against_central_differences():
         """sum_i w_i <dl_i / dtheta, v> of one object's images under another light, all else replayed."""
         part = rendered.objects[label]
         draw = dataclasses.replace(part.draw, weights=light.expand(3, -1))
-        maps = scene._maps(label, draw)
+        maps = scene.render(label, draw)
         pixels = rendered.compose[label](maps.rgb, maps.opacity).images
         index = torch.arange(3 * label, 3 * label + 3)
         loss = image_losses(detector, backbone, targets)
@@ -178,7 +181,7 @@ def test_opacity_does_not_know_the_light():
         torch.ones(ANCHORS) / ANCHORS, scene.distribution.draw_noise(4, torch.Generator())
     )
     lights = [dataclasses.replace(draw, weights=light.expand(4, -1)) for light in torch.eye(ANCHORS)]
-    maps = [scene._maps(0, lit) for lit in lights]
+    maps = [scene.render(0, lit) for lit in lights]
     assert all(torch.equal(other.opacity, maps[0].opacity) for other in maps[1:])
     assert not torch.equal(maps[0].rgb, maps[1].rgb)
 
@@ -186,11 +189,11 @@ def test_opacity_does_not_know_the_light():
 def test_explored_lights_differ_and_carry_their_density():
     scene, generator = _scene(), torch.Generator().manual_seed(0)
     psi = scene.distribution.psi("initial", ["a"])[0].float()
-    part = scene.drawn(0, psi, 4, generator, ReinforceEstimator().draws)
+    part = scene.draw(0, psi, 4, generator, ReinforceEstimator().draws)
     assert part.draw.explored is not None and part.draw.weights is not None
     assert len(part.draw.weights.unique(dim=0)) == 4
     density = torch.distributions.Normal(psi, 0.1).log_prob(part.draw.explored).sum(-1)
     torch.testing.assert_close(scene.distribution.log_prob(psi, part.draw), density)
-    still = scene.drawn(0, psi, 2, generator)
+    still = scene.draw(0, psi, 2, generator)
     with pytest.raises(ValueError, match="no density"):
         scene.distribution.log_prob(psi, still.draw)

@@ -20,7 +20,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.synthesis.draws import HardDraws, RelaxedDraws
-from neural_sim.synthesis.pool import ImagePool
+from neural_sim.synthesis.pool import pool_of
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(32, 32, math.radians(40.0))
@@ -89,9 +89,11 @@ def test_replaying_noise_and_nuisance_gives_the_same_images(scene):
 @pytest.mark.parametrize("bin_mean", ["linear", "circular"])
 def test_forward_and_reverse_mode_agree_through_the_loops_own_binding(scene, bin_mean):
     """The scene's tangents, and the paper's second forward through the path that the loop binds, in float64."""
-    fields = tuple(copy.deepcopy(field).double() for field in scene.fields)
+    subjects = tuple(
+        dataclasses.replace(subject, field=copy.deepcopy(subject.field).double()) for subject in scene.fields
+    )
     distribution = SceneDistribution.of([Pose(bins=4, temperature=1.0, bin_mean=bin_mean)])
-    wide = dataclasses.replace(scene, fields=fields, distribution=distribution)
+    wide = dataclasses.replace(scene, subjects=subjects, distribution=distribution)
     generator = torch.Generator().manual_seed(1)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     params = {name: value.double() for name, value in detector.init(generator).items()}
@@ -122,10 +124,10 @@ def test_training_sets_have_the_expected_number_of_images_of_every_bin_unless_dr
     scene, pooled
 ):
     generator = torch.Generator().manual_seed(0)
-    source = ImagePool.render(scene, 1, generator) if pooled else None
+    scene = pool_of(scene, 1, generator) if pooled else scene
 
     def counts(how):
-        drawn = scene.training_set(torch.zeros(2, 4), 40, generator, how, source)
+        drawn = scene.training_set(torch.zeros(2, 4), 40, generator, how)
         return torch.stack([part.draw.bins[:, 0].bincount(minlength=4) for part in drawn.objects])
 
     assert (counts(HardDraws()) == 10).all()
@@ -147,8 +149,8 @@ def test_probes_cover_every_bin_equally(scene):
 @pytest.mark.parametrize("pooled", [True, False])
 def test_probes_show_the_same_scenes_in_every_bin(scene, pooled):
     generator = torch.Generator().manual_seed(0)
-    source = ImagePool.render(scene, 4, generator) if pooled else None
-    images, draw = scene.probes(0, "pose", 8, torch.zeros(2, 4), generator, source)
+    scene = pool_of(scene, 4, generator) if pooled else scene
+    images, draw = scene.probes(0, "pose", 8, torch.zeros(2, 4), generator)
     for same in (draw.rho, draw.distance, images.images[:, :, 0, 0], images.images[:, :, -1, -1]):
         table = same.unflatten(0, (4, 8))
         assert torch.equal(table, table[:1].expand_as(table))
@@ -189,10 +191,11 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
 def test_the_pool_holds_every_combination_of_bins(scene):
     joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(5)
-    pool = ImagePool.render(dataclasses.replace(scene, distribution=joint), 4, generator)
-    held = pool.objects[0].draw
+    pool = pool_of(dataclasses.replace(scene, distribution=joint), 4, generator)
+    held = pool.subjects[0].drawn
     assert len(held) == 2 * 6  # 4 a bin of the finest factor: 2 in each of 3 x 2 cells
     assert torch.equal(joint.bins_of(held), held.bins)
-    drawn = pool.drawn(1, psi, 200, generator).draw
+    drawn = pool.draw(1, psi, 200, generator).draw
     assert torch.equal(joint.bins_of(drawn), drawn.bins)
-    assert pool.probed(1, "zoom", 5, psi, generator).draw.bins[:, 1].tolist() == [0] * 5 + [1] * 5
+    probes = pool.probes(1, "zoom", 5, psi.expand(2, -1), generator)[1]
+    assert probes.bins[:, 1].tolist() == [0] * 5 + [1] * 5

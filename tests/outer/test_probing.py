@@ -28,7 +28,8 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 BINS, OBJECTS, FACTORS = 3, 2, ("pose", "zoom")
@@ -93,7 +94,8 @@ def scene():
     distribution = SceneDistribution.of([Pose(bins=4)])
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
     camera = PinholeCamera(32, 32, math.radians(40.0))
-    return Scene(("a",), (field.requires_grad_(False),), NerfRenderer(), camera, synthesizer, distribution)
+    subject = FieldSubject("a", field.requires_grad_(False), NerfRenderer())
+    return Scene((subject,), camera, synthesizer, distribution)
 
 
 def test_the_loop_draws_a_part_of_its_probes_anew(scene):
@@ -127,7 +129,9 @@ def test_the_loop_draws_a_part_of_its_probes_anew(scene):
 
 
 def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
-    two = dataclasses.replace(scene, names=("a", "b"), fields=scene.fields * 2)
+    two = dataclasses.replace(
+        scene, subjects=tuple(dataclasses.replace(scene.fields[0], name=name) for name in "ab")
+    )
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = two.training_set(psi, 2, generator).images

@@ -13,7 +13,7 @@ from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
 from neural_sim.synthesis.draws import HARD
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 
 DOUBLE = torch.float64
 OBJECTS, BINS, SIZE = 3, 2, 4
@@ -30,23 +30,39 @@ class Plain:
 class Painted:
     """Renders that depend on the object and its bin alone."""
 
-    def __init__(self, distribution):
-        self.distribution = distribution
+    def __init__(self):
         generator = torch.Generator().manual_seed(3)
         self.opacity = torch.rand(OBJECTS, BINS, SIZE, SIZE, generator=generator, dtype=DOUBLE)
         colour = torch.rand(OBJECTS, BINS, SIZE, SIZE, 3, generator=generator, dtype=DOUBLE)
         self.rgb = colour * self.opacity[..., None]
 
-    def _at(self, label, draw):
+    def in_place_of_the_fields(self, scene):
+        subjects = tuple(
+            PaintedSubject(name, *maps)
+            for name, *maps in zip(scene.names, self.rgb, self.opacity, strict=True)
+        )
+        return dataclasses.replace(scene, subjects=subjects)
+
+
+@dataclasses.dataclass(frozen=True)
+class PaintedSubject:
+    """One painted object."""
+
+    name: str
+    rgb: torch.Tensor
+    opacity: torch.Tensor
+    device = torch.device("cpu")
+
+    def _at(self, draw):
         bins = draw.bins[:, 0]
-        return RenderedObject(draw, self.rgb[label, bins], self.opacity[label, bins])
+        return RenderedObject(draw, self.rgb[bins], self.opacity[bins])
 
-    def drawn(self, label, psi, count, generator, how=HARD):
-        noise = self.distribution.draw_noise(count, generator, DOUBLE)
-        return self._at(label, self.distribution.hard(psi, noise))
+    def draw(self, camera, distribution, psi, count, generator, how=HARD):
+        noise = distribution.draw_noise(count, generator, DOUBLE)
+        return self._at(distribution.hard(psi, noise))
 
-    def probed(self, label, factor, per_bin, psi, generator):
-        return self._at(label, self.distribution.probes(factor, per_bin, psi, generator, DOUBLE))
+    def probe(self, camera, distribution, factor, per_bin, psi, generator):
+        return self._at(distribution.probes(factor, per_bin, psi, generator, DOUBLE))
 
 
 @pytest.fixture
@@ -54,8 +70,7 @@ def several(scene):
     def made(counts):
         return dataclasses.replace(
             scene,
-            names=("a", "b", "c"),
-            fields=(scene.fields[0],) * OBJECTS,
+            subjects=tuple(dataclasses.replace(scene.fields[0], name=name) for name in "abc"),
             distribution=SceneDistribution.of([Pose(bins=BINS, floor=0.0)]),
             synthesizer=Synthesizer(Plain(), shift=0.0, minimum_area=1.0, objects_per_image=counts),
             camera=dataclasses.replace(scene.camera, width=SIZE, height=SIZE),
@@ -106,17 +121,18 @@ ONE = {"scale": torch.ones((), dtype=DOUBLE)}
 
 @pytest.mark.parametrize("counts", [(1, 2), (1, 3), (0, 2), (2, 3)])
 def test_the_stratified_derivative_is_that_of_enumeration(several, counts):
-    scene = several(counts)
-    painted, generator, per_bin = Painted(scene.distribution), torch.Generator().manual_seed(0), 4000
+    painted = Painted()
+    scene = painted.in_place_of_the_fields(several(counts))
+    generator, per_bin = torch.Generator().manual_seed(0), 4000
     expected = truth(painted, counts)
-    rendered = scene.training_set(PSI, 3000, generator, HARD, painted)
+    rendered = scene.training_set(PSI, 3000, generator, HARD)
     weights = torch.full((len(rendered),), 1.0 / len(rendered), dtype=DOUBLE)
     held = object_images(scene, rendered, PSI, weights)
     for label, name in enumerate(scene.names):
         # The part of the images that show the object; its expectation is that of the derivative.
         share = counts[0] + counts[1]
         assert float(held[name].weights.sum()) == pytest.approx(0.5 * share / OBJECTS, rel=0.05)
-        images, draw = scene.probes(label, "pose", per_bin, PSI, generator, painted)
+        images, draw = scene.probes(label, "pose", per_bin, PSI, generator)
         probes = {"pose": Probes(torch.arange(len(images)), draw.bins[:, 0])}
         losses = Losses(lossy(score(rendered.images.images)), lambda *_: None, lossy(score(images.images)))
         found = StratifiedEstimator(per_bin, theta_mode="forward").estimate(
@@ -129,10 +145,10 @@ def test_the_stratified_derivative_is_that_of_enumeration(several, counts):
 
 @pytest.mark.parametrize("counts", [(0, 3)])
 def test_the_score_functions_derivative_is_that_of_enumeration(several, counts):
-    scene = several(counts)
-    painted, generator = Painted(scene.distribution), torch.Generator().manual_seed(1)
+    painted, generator = Painted(), torch.Generator().manual_seed(1)
+    scene = painted.in_place_of_the_fields(several(counts))
     expected = truth(painted, counts)
-    rendered = scene.training_set(PSI, 800, generator, HARD, painted)
+    rendered = scene.training_set(PSI, 800, generator, HARD)
     weights = torch.full((len(rendered),), 1.0 / len(rendered), dtype=DOUBLE)
     losses = Losses(lossy(score(rendered.images.images)), lambda *_: None)
     for label, held in enumerate(object_images(scene, rendered, PSI, weights).values()):
@@ -143,9 +159,8 @@ def test_the_score_functions_derivative_is_that_of_enumeration(several, counts):
 
 def test_images_are_made_again_of_one_objects_maps(several):
     """Composed again of the same maps they are the same; of others, only where the object shows, and as if drawn so."""
-    scene = several((1, 3))
-    painted = Painted(scene.distribution)
-    rendered = scene.training_set(PSI, 20, torch.Generator().manual_seed(0), HARD, painted)
+    scene = Painted().in_place_of_the_fields(several((1, 3)))
+    rendered = scene.training_set(PSI, 20, torch.Generator().manual_seed(0), HARD)
     part, rows = rendered.objects[1], rendered.rows[1]
     again = rendered.compose[1](part.rgb, part.opacity)
     assert torch.equal(again.images, rendered.images.images[rows])

@@ -18,7 +18,8 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.viewer import GREY, PER_BIN, Shots, Viewer, colour
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 STEP = 1.2 / 16
@@ -39,10 +40,9 @@ def block(red):
 @pytest.fixture(scope="module")
 def shots():
     distribution = SceneDistribution.of([Pose(bins=4), Zoom(bins=3)])
-    scene = Scene(
-        ("red", "black"), (block(True), block(False)), NerfRenderer(), PinholeCamera(32, 32, math.radians(40.0)),
-        Synthesizer(ProceduralClutter()), distribution,
-    )  # fmt: skip
+    subjects = tuple(FieldSubject(name, block(name == "red"), NerfRenderer()) for name in ("red", "black"))
+    camera = PinholeCamera(32, 32, math.radians(40.0))
+    scene = Scene(subjects, camera, Synthesizer(ProceduralClutter()), distribution)
     detector = RetinaNet(2, 32, Backbone("micro"), Head(8, 1), Anchors(sizes=((14,), (28,)), reference=48))
     params = detector.init(torch.Generator().manual_seed(0))
     params["head.classification_head.cls_logits.bias"] += 6.0  # else no score is large

@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim.field.scores import compare
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.renderer.subject import FieldSubject
+from neural_sim.synthesis.subjects import PhotographedField
 from neural_sim.tasks.walk import walk
 
 SMALL = (
@@ -74,7 +74,7 @@ def test_a_target_of_photographs_needs_no_field(root, tmp_path):
     sets = context.results(graph.targets)
     assert sets.test.images.shape[-2:] == (45, 60)
     with pytest.raises(ValueError, match="nothing to render"):
-        graph.objects.subject("can").render(graph.camera, torch.eye(4)[None])
+        graph.objects.subject("can").maps(graph.camera, torch.eye(4)[None])
 
 
 def test_metres_want_a_size(root, tmp_path):
@@ -96,12 +96,10 @@ def test_a_fields_image_has_straight_alpha(root, tmp_path):
     field = context.results(context.graph.fields[0]).field
     views = context.results(context.graph.views[0])
     subject = context.graph.objects.subject("can", field)
-    assert isinstance(subject, FieldSubject)
-    rgba = subject.render(views.camera, views.camera_to_world[:2])
+    assert isinstance(subject, PhotographedField)
+    maps = subject.maps(views.camera, views.camera_to_world[:2])
     rgb, opacity = subject.renderer.render(field, views.camera, views.camera_to_world[:2])
-    torch.testing.assert_close(rgba[..., :3] * rgba[..., 3:], rgb, atol=2e-3, rtol=0.0)
-    torch.testing.assert_close(rgba[..., 3], opacity)
-    from neural_sim.renderer.lighting import Lighting
-
+    torch.testing.assert_close(maps.rgb, rgb, atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(maps.opacity, opacity)
     with pytest.raises(ValueError, match="under their light alone"):
-        subject.render(views.camera, views.camera_to_world[:1], Lighting())
+        subject.maps(views.camera, views.camera_to_world[:1], torch.ones(1, 3))

@@ -8,8 +8,8 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from neural_sim.main import UserError, _with, conf_directory, context_of
-from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage
 from neural_sim.stages.reconstruction import ReconstructionStage
+from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
 from neural_sim.studies.nerf_vs_mesh import NerfVsMesh
 from neural_sim.synthesis.export.coco import write_coco
@@ -94,11 +94,12 @@ def test_nerf_and_mesh_share_all_but_what_is_rendered():
     run, steps = command("+experiment=nerf_vs_mesh", "seed=5")
     first, second = graphs_of_seeds(run, 2)
     nerf, mesh = steps["nerf_vs_mesh"].sources(first).values()
-    assert isinstance(mesh, MeshDetectorStage) and nerf.key != mesh.key
+    assert all(isinstance(subject, MeshSubjectStage) for subject in mesh.scene.subjects)
+    assert nerf.key != mesh.key and mesh.scene.synthesizer is nerf.scene.synthesizer
     for name in ("detector", "training", "epochs", "probabilities", "seed", "psi"):
         assert getattr(nerf, name) is getattr(mesh, name)
     assert nerf.seed == 5 and steps["nerf_vs_mesh"].sources(second)["nerf"].seed == 6
-    assert set(steps["nerf_vs_mesh"].sources(second)["mesh"].contents) == set(first.names)
+    assert steps["nerf_vs_mesh"].sources(second)["mesh"].scene.names == first.names
     tests = sets_of_kinds(first, {"single": (1, 1), "multiple": (2, 4)})
     assert [t.synthesizer.objects_per_image for t in tests.values()] == [(1, 1), (2, 4)]
     assert len(
@@ -118,7 +119,7 @@ def test_blenderproc_images_take_the_place_of_the_mesh_renderers(tmp_path, folde
     run, _ = command("+experiment=nerf_vs_mesh")
     step = NerfVsMesh(blenderproc=str(output), categories={"red mug": "mug"})
     stage = step.sources(run.graph)["blenderproc"]
-    assert isinstance(stage, CocoDetectorStage)
+    assert isinstance(stage.scene, LoadedImagesStage)
 
     loaded = stage.images(run.results).images
     assert [run.graph.names[label] for label in loaded.labels[:, 0]] == ["mug", "can"]

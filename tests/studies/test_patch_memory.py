@@ -25,7 +25,10 @@ PATCHES = (64, 128, 256)
 def loop(scene):
     psi = torch.tensor([[2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    scene = dataclasses.replace(scene, fields=tuple(copy.deepcopy(field).double() for field in scene.fields))
+    subjects = tuple(
+        dataclasses.replace(subject, field=copy.deepcopy(subject.field).double()) for subject in scene.fields
+    )
+    scene = dataclasses.replace(scene, subjects=subjects)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     theta = {name: value.double() for name, value in detector.init(generator).items()}
     validation = scene.training_set(psi, 3, generator).images

@@ -14,7 +14,8 @@ from neural_sim.synthesis.distractors import Cover, Distractors
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.layout import Layout
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Nuisance, Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(24, 16, 0.7)
@@ -49,7 +50,8 @@ def scene_with():
     def scene(distractors):
         synthesizer = Synthesizer(ProceduralClutter(), shift=0.1, distractors=distractors)
         camera, distribution = PinholeCamera(32, 32, 0.7), SceneDistribution.of([Pose(bins=4)])
-        return Scene(("a", "b"), (block(1), block(2)), NerfRenderer(), camera, synthesizer, distribution)
+        subjects = tuple(FieldSubject(name, block(i), NerfRenderer()) for name, i in (("a", 1), ("b", 2)))
+        return Scene(subjects, camera, synthesizer, distribution)
 
     return scene
 

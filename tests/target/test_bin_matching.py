@@ -9,7 +9,7 @@ from PIL import Image
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.bin_matching import apportioned, matching, most
 from neural_sim.target.coco import CocoTarget
 from neural_sim.types import LabelledImages, PinholeCamera

@@ -13,9 +13,9 @@ from neural_sim.cameras import focal_lengths, orbit, principal_point
 from neural_sim.objects.bop import BOP
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.subject import FieldSubject
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import PhotographedField
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.bop import BopTarget
 from neural_sim.target.camera import TargetCamera
 from neural_sim.target.frames import FrameName
@@ -116,7 +116,7 @@ def test_the_sets_of_a_run(root):
         TargetCamera(60).camera(64, 40.0, target),
         Synthesizer(ProceduralClutter(), shift=0.0),
     )
-    subjects = {name: FieldSubject(name) for name in ("a", "b")}
+    subjects = {name: PhotographedField(name) for name in ("a", "b")}
     made = target.sets(subjects, SceneDistribution.of([Pose()]), camera, synthesizer, 0)
     assert {name: part.images.shape for name, part in made.items()} == {
         "val": (2, 3, 45, 60), "test": (4, 3, 45, 60),

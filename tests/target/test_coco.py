@@ -12,10 +12,10 @@ from neural_sim.objects.mesh import normalise
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.raycast import RaycastRenderer
-from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export.coco import write_coco
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import MeshSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.coco import CocoTarget
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -127,7 +127,8 @@ def test_the_digest_follows_the_contents_of_labels_and_photos(tmp_path: Path) ->
 def sets_of(target: CocoTarget, seed: int = 3) -> dict[str, LabelledImages]:
     camera, synthesizer = PinholeCamera(24, 16, 0.7), Synthesizer(ProceduralClutter(), shift=0.0)
     renderer = RaycastRenderer()
-    boxes = {name: MeshSubject(normalise(trimesh.creation.box(), name, "test"), renderer) for name in NAMES}
+    box = trimesh.creation.box()
+    boxes = {name: MeshSubject(name, normalise(box, name, "test").mesh, renderer) for name in NAMES}
     return target.sets(boxes, SceneDistribution.of([Pose()]), camera, synthesizer, seed)
 
 

@@ -12,9 +12,9 @@ from neural_sim.objects.mesh import normalise
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.raycast import RaycastRenderer
-from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import MeshSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.folders import FolderTarget
 from neural_sim.types import PinholeCamera
 
@@ -35,7 +35,7 @@ def write(root, counts=(("can", 6), ("mug", 4)), size=(20, 40)):
 
 def sets_of(target, names=NAMES, seed=3, camera=None):
     renderer, box = RaycastRenderer(), trimesh.creation.box()
-    objects = {name: MeshSubject(normalise(box, name, "test"), renderer) for name in names}
+    objects = {name: MeshSubject(name, normalise(box, name, "test").mesh, renderer) for name in names}
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.0)
     distribution = SceneDistribution.of([Pose()])
     return target.sets(objects, distribution, camera or PinholeCamera(24, 16, 0.7), synthesizer, seed)

@@ -10,10 +10,11 @@ from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.lighting import Lighting
-from neural_sim.renderer.subject import MeshSubject
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
-from neural_sim.target.rendered import RenderedTarget, render_target
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.subjects import MeshSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
+from neural_sim.target.rendered import RenderedTarget
 from neural_sim.types import PinholeCamera, SceneDraw
 
 CAMERA = PinholeCamera(32, 32, 0.7)
@@ -54,11 +55,14 @@ def synthesizer() -> Synthesizer:
 
 
 def named(meshes: dict[str, ObjectMesh], renderer: MeshRenderer | None = None) -> dict[str, MeshSubject]:
-    return {name: MeshSubject(item, renderer or Sphere()) for name, item in meshes.items()}
+    return {name: MeshSubject(name, item.mesh, renderer or Sphere()) for name, item in meshes.items()}
 
 
-def subjects(meshes: dict[str, ObjectMesh], renderer: MeshRenderer | None = None) -> list[MeshSubject]:
-    return list(named(meshes, renderer).values())
+def scene_of(
+    meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, renderer: MeshRenderer | None = None
+) -> Scene:
+    subjects = tuple(named(meshes, renderer).values())
+    return Scene(subjects, CAMERA, synthesizer, SceneDistribution.of([Pose()]))
 
 
 def draw_at(distances: list[float]) -> SceneDraw:
@@ -71,7 +75,7 @@ def test_images_boxes_and_labels_of_spheres(
     meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
 ) -> None:
     draws = [draw_at([2.5, 3.0, 4.0]), draw_at([3.5])]
-    made = render_target(subjects(meshes), draws, CAMERA, synthesizer, generator)
+    made = scene_of(meshes, synthesizer).images(draws, generator)
     replayed = torch.Generator().manual_seed(0)
     plain = torch.cat([synthesizer.draw_nuisance(n, CAMERA, replayed).backgrounds for n in (3, 1)])
     assert made.labels[:, 0].tolist() == [0, 0, 0, 1]
@@ -91,7 +95,7 @@ def test_many_views_come_in_chunks_and_lost_objects_without_boxes(
 ) -> None:
     renderer = Sphere()
     draws = [draw_at([3.0] * 70), draw_at([500.0])]
-    made = render_target(subjects(meshes, renderer), draws, CAMERA, synthesizer, generator)
+    made = scene_of(meshes, synthesizer, renderer).images(draws, generator)
     assert renderer.calls == [64, 6, 1]
     assert made.labels[:, 0].tolist() == [0] * 70 + [-1]
 
@@ -100,7 +104,7 @@ def test_a_draw_per_object_is_wanted(
     meshes: dict[str, ObjectMesh], synthesizer: Synthesizer, generator: torch.Generator
 ) -> None:
     with pytest.raises(ValueError, match="got 1 draws for 2 objects"):
-        render_target(subjects(meshes), [draw_at([3.0])], CAMERA, synthesizer, generator)
+        scene_of(meshes, synthesizer).images([draw_at([3.0])], generator)
 
 
 def test_sets_follow_the_target_distribution_and_share_nothing(

@@ -15,7 +15,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
-from neural_sim.renderer.subject import MeshSubject
+from neural_sim.synthesis.subjects import MeshSubject
 from neural_sim.target.symmetry import equivalent_bins
 from neural_sim.types import PinholeCamera
 
@@ -34,13 +34,15 @@ def _grey(mesh, name):
 def test_a_plain_sphere_has_one_group():
     sphere = _grey(trimesh.creation.icosphere(4), "ball")
     assert equivalent_bins(
-        MeshSubject(sphere, RENDERER), POSE, "pose", CAMERA, samples=3, tolerance=0.02
+        MeshSubject(sphere.name, sphere.mesh, RENDERER), POSE, "pose", CAMERA, samples=3, tolerance=0.02
     ) == [list(range(8))]
 
 
 def test_a_plain_cylinder_joins_opposite_bins():
     cylinder = _grey(trimesh.creation.cylinder(0.5, 2.0, sections=96), "rod")
-    groups = equivalent_bins(MeshSubject(cylinder, RENDERER), POSE, "pose", CAMERA, samples=3, tolerance=0.02)
+    groups = equivalent_bins(
+        MeshSubject(cylinder.name, cylinder.mesh, RENDERER), POSE, "pose", CAMERA, samples=3, tolerance=0.02
+    )
     assert all(any({b, b + 4} <= set(group) for group in groups) for b in range(4))
     assert len(groups) > 1  # its end does not look like its side
 
@@ -48,7 +50,7 @@ def test_a_plain_cylinder_joins_opposite_bins():
 @pytest.mark.parametrize("name", ["pitcher", "drill"])
 def test_the_embedded_objects_differ_in_every_bin(name):
     (item,) = Procedural([name]).load()
-    groups = equivalent_bins(MeshSubject(item, RENDERER), POSE, "pose", CAMERA, samples=3)
+    groups = equivalent_bins(MeshSubject(item.name, item.mesh, RENDERER), POSE, "pose", CAMERA, samples=3)
     assert groups == [[b] for b in range(8)]
 
 
@@ -74,9 +76,9 @@ def test_an_upside_down_camera_turns_the_image_so_the_bins_are_not_one():
     turned = RENDERER.render(item.mesh, CAMERA, orbit(*_mirrored(phi, rho), distance))
     # Supersampled pixels on a silhouette may fall to either side of it by rounding.
     assert (upright - turned.rot90(2, (1, 2))).abs().mean() < 1e-3 < 1e-2 < (upright - turned).abs().mean()
-    assert equivalent_bins(MeshSubject(item, RENDERER), ALL_ROUND, "pose", CAMERA, samples=3) == [
-        [b] for b in range(8)
-    ]
+    assert equivalent_bins(
+        MeshSubject(item.name, item.mesh, RENDERER), ALL_ROUND, "pose", CAMERA, samples=3
+    ) == [[b] for b in range(8)]
 
 
 def test_half_a_turn_of_the_second_angle_joins_bins_where_it_goes_all_round():
@@ -98,8 +100,10 @@ def test_half_a_turn_of_the_second_angle_joins_bins_where_it_goes_all_round():
         sorted(map(tuple, mesh.vertices.round(6))), sorted(map(tuple, turned.vertices.round(6)))
     )
     item = normalise(mesh, "knot", "test")
-    assert equivalent_bins(MeshSubject(item, RENDERER), POSE, "pose", CAMERA, samples=3) == [
+    assert equivalent_bins(MeshSubject(item.name, item.mesh, RENDERER), POSE, "pose", CAMERA, samples=3) == [
         [b] for b in range(8)
     ]
-    groups = equivalent_bins(MeshSubject(item, RENDERER), ALL_ROUND, "pose", CAMERA, samples=3)
+    groups = equivalent_bins(
+        MeshSubject(item.name, item.mesh, RENDERER), ALL_ROUND, "pose", CAMERA, samples=3
+    )
     assert groups == [[b, b + 4] for b in range(4)]

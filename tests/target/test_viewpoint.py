@@ -63,7 +63,7 @@ def test_the_projects_cameras_are_read_back(name):
     assert _apart(seen.phi, draw.phi) < 1e-8 and _apart(seen.rho, draw.rho) < 1e-8
     assert _apart(seen.roll, roll) < 1e-8
     torch.testing.assert_close(seen.distance, draw.distance, atol=1e-12, rtol=0)
-    assert torch.equal(bins_of_poses(distribution, poses, 1.0, centre), distribution.label_of(draw))
+    assert torch.equal(bins_of_poses(distribution, poses, 1.0, centre), distribution.bins_of(draw)[:, 0])
     low, high = ranges["rho"]
     assert bool(((seen.rho >= low - 1e-8) & (seen.rho <= high + 1e-8)).all())
 
@@ -118,9 +118,9 @@ def test_distances_and_what_a_pose_does_not_tell():
     zoom = SceneDistribution.of([Zoom()])
     draw = drawn(zoom)
     poses = object_to_camera(orbit(*_angles(draw)))
-    assert torch.equal(bins_of_poses(zoom, poses, 1.0), zoom.label_of(draw))
+    assert torch.equal(bins_of_poses(zoom, poses, 1.0), zoom.bins_of(draw)[:, 0])
     poses[:, :3, 3] *= 0.07  # metres, of an object of 7 cm
-    assert torch.equal(bins_of_poses(zoom, poses, 0.07), zoom.label_of(draw))
+    assert torch.equal(bins_of_poses(zoom, poses, 0.07), zoom.bins_of(draw)[:, 0])
     assert bins_of_poses(zoom, poses, None).eq(-1).all()
     metres = SceneDistribution.of([Zoom(unit="metres", range=(0.5, 1.5))])
     poses[:, :3, 3] = torch.tensor([0.0, 0.0, 1.49])

@@ -18,9 +18,9 @@ from posed_scenes import (
 from neural_sim.cameras import focal_lengths, principal_point
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.subject import FieldSubject
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import PhotographedField
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.camera import TargetCamera
 from neural_sim.target.frames import FrameName
 from neural_sim.target.viewpoint import bins_of_poses
@@ -98,7 +98,7 @@ def sets_of(target, names=NAMES, seed=3):
     camera = TargetCamera(60).camera(64, 40.0, target)
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.0)
     return target.sets(
-        {name: FieldSubject(name, radius=0.06) for name in names}, POSES, camera, synthesizer, seed
+        {name: PhotographedField(name, radius=0.06) for name in names}, POSES, camera, synthesizer, seed
     )
 
 

@@ -46,7 +46,8 @@ def seen_pixels(
                 *whole, rest = _split(_join(waiting), rays_per_chunk)
                 yield from whole
                 waiting = [rest]
-    yield from _split(_join(waiting), rays_per_chunk)
+    if waiting:
+        yield from _split(_join(waiting), rays_per_chunk)
 
 
 def _strip(

@@ -39,14 +39,14 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
         raise ValueError("pathwise: these images were not drawn from psi by a relaxed draw")
 
     # All of an object's images are under psi's light.
-    light = {} if part.draw.weights is None else {"weights": part.draw.weights[0]}
+    light = None if part.draw.weights is None else part.draw.weights[0]
 
     def replay(psi: Tensor) -> SceneDraw:
         return scene.distribution.relaxed(psi, noise)
 
     return RenderedPath(
         relaxed=replay,
-        render_rays=lambda rays: scene.renderer.render_rays(scene.fields[label], rays, **light),
+        render_rays=lambda rays: scene.fields[label].render_rays(rays, light),
         compose=lambda rgb, opacity: compose(rgb, opacity).images,
         camera=scene.camera,
         rgb=part.rgb,

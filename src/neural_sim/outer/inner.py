@@ -25,7 +25,7 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.synthesis.assembly import RenderedImages
 from neural_sim.synthesis.draws import HARD, Draws, HardDraws
-from neural_sim.synthesis.pool import ImagePool
+from neural_sim.synthesis.pool import pool_of
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
@@ -90,10 +90,10 @@ class InnerLoop:
         self.photographs = None
         if photographs is not None:
             self.photographs = CachedSet.of(detector, self.backbone, photographs)
-        self.pool: ImagePool | None = None
+        self.pool: Scene | None = None
         began, self.cpu_begun = time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
-            self.pool = ImagePool.render(scene, settings.pool_per_bin, generator)
+            self.pool = pool_of(scene, settings.pool_per_bin, generator)
         synchronise(self.device)
         self.pool_seconds = time.perf_counter() - began
         self._start = params
@@ -114,9 +114,8 @@ class InnerLoop:
 
     def draw(self, psi: Float[Tensor, "objects K"]) -> RenderedImages:
         """An iteration's training images, without maps where no derivative goes through them."""
-        rendered = self.scene.training_set(
-            psi, self.settings.images_per_object, self._common("images"), self.draws, self.pool
-        )
+        scene, count = self.pool or self.scene, self.settings.images_per_object
+        rendered = scene.training_set(psi, count, self._common("images"), self.draws)
         self.images += len(rendered)
         return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
 

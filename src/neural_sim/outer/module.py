@@ -105,14 +105,13 @@ class SimulatorModule(GradientLoop):
         """``per_bin`` images of every bin of every factor of the learned objects, with their features."""
         inner = self.inner
         probed = ProbeSet.draw(
-            self.scene,
+            inner.pool or inner.scene,
             inner.detector,
             inner.backbone,
             per_bin,
             self.psi,
             inner.generator,
             self._learned,
-            inner.pool,
         )
         inner.images += len(probed.cached)
         return probed

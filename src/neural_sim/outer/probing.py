@@ -12,7 +12,7 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Probes
-from neural_sim.synthesis.scene import Scene, Source
+from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
 
 
@@ -37,18 +37,15 @@ class ProbeSet:
         psi: Float[Tensor, "objects K"],
         generator: torch.Generator,
         objects: Sequence[int],
-        source: Source | None = None,
     ) -> ProbeSet:
-        """Probes of some ``objects``, rendered by ``source`` (None: the scene); all factors but the stratified one are
-        drawn from p_psi.
-        """
+        """Draw probes of some ``objects``; all factors but the stratified one are drawn from p_psi."""
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
 
         def drawn() -> Iterator[LabelledImages]:
             first = 0
             for label in objects:
                 for factor in scene.distribution.factors:
-                    images, draw = scene.probes(label, factor.name, per_bin, psi, generator, source)
+                    images, draw = scene.probes(label, factor.name, per_bin, psi, generator)
                     index = torch.arange(first, first + len(images))
                     probes[label][factor.name] = Probes(index, factor.stratum_of(draw))
                     first += len(index)

@@ -299,11 +299,6 @@ class SceneDistribution:
         """Find the bins of each draw's coordinates, see :meth:`BinnedFactor.stratum_of`; a column a binned factor."""
         return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
-    def label_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """Find the first binned factor's bin, for reports; -1 where nothing is binned."""
-        bins = self.bins_of(draw)
-        return bins[:, 0] if bins.shape[1] else torch.full((len(draw),), -1)
-
     def _draw(
         self,
         placed: Mapping[str, Float[Tensor, "n"]],

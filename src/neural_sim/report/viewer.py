@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -90,24 +90,22 @@ class Shots:
         """Points [n, 3] of the field's surface in object radii, and their colours [n, 3] in [0, 1]: what ``views``
         renders round the object show, from every height and under equal weights of the lights.
         """
-        scene, field = self.scene, self.scene.fields[label]
+        subject = self.scene.fields[label]
         turn = torch.arange(views) * (math.pi * (3.0 - math.sqrt(5.0)))  # a spiral of the golden angle
         height = torch.acos(1.0 - 2.0 * (torch.arange(views) + 0.5) / views)
         camera = PinholeCamera(size, size, math.radians(40.0))
         poses = cameras.orbit(height, turn, torch.full((views,), 3.2))
-        poses = poses.to(scene.device(label), scene.dtype(label))
-        if lights := scene.distribution.lights:
-            weights = poses.new_full((views, lights), 1.0 / lights)
-            rgb, opacity, depth = scene.lit_renderer.render_surface(field, camera, poses, weights=weights)
-        else:
-            rgb, opacity, depth = scene.renderer.render_surface(field, camera, poses)
+        poses = poses.to(subject.device, subject.dtype)
+        lights = self.scene.distribution.lights
+        weights = poses.new_full((views, lights), 1.0 / lights) if lights else None
+        maps, depth = subject.surface(camera, poses, weights)
         rays = cameras.rays(camera, poses)
         along = -(rays.directions * poses[:, None, None, :3, 2]).sum(
             -1
         )  # of a ray's unit length, along the axis
         points = rays.origins + rays.directions * (depth / along)[..., None]
         solid = depth > 0.0
-        colours = rgb[solid] / opacity[solid][:, None].clamp_min(1e-3)
+        colours = maps.rgb[solid] / maps.opacity[solid][:, None].clamp_min(1e-3)
         return points[solid].cpu().numpy(), colours.clamp(0.0, 1.0).cpu().numpy()
 
     def bin_cameras(self, label: int, which: str, factor: str, seed: int = 0) -> list[BinCamera]:
@@ -115,9 +113,8 @@ class Shots:
         distribution, psi = self.scene.distribution, self.psi[which][label].float()
         p = distribution.probabilities(psi)[factor]
         draw = distribution.probes(factor, PER_BIN, psi, torch.Generator().manual_seed(seed), psi.dtype)
-        if self.scene.radii is not None:
-            draw = replace(draw, radius=self.scene.radii[label])
-        poses = cameras.orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius).numpy()
+        radius = self.scene.radii[label]
+        poses = cameras.orbit(draw.phi, draw.rho, draw.distance, radius=radius).numpy()
         return [
             BinCamera(i // PER_BIN, float(p[i // PER_BIN]), draw.select(slice(i, i + 1)), pose)
             for i, pose in enumerate(poses)

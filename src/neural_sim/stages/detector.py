@@ -20,11 +20,10 @@ from neural_sim.detector.training import Training, train_detector
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.cost import Cost
 from neural_sim.randomness import stream
-from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.scene import TrainingImages, TrainingImagesStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.synthesis.assembly import RenderedImages
-from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages, PinholeCamera
 
 CPU = torch.device("cpu")
@@ -83,7 +82,7 @@ class DetectorStage(TrainedStage):
     where ``training.real`` combines both (None: it does not).
     """
 
-    scene: SceneStage
+    scene: TrainingImagesStage
     detector: Callable[..., Detector]
     training: Training
     epochs: int
@@ -119,11 +118,8 @@ class DetectorStage(TrainedStage):
     def images(self, results: Results, generator: torch.Generator | None = None) -> RenderedImages:
         """Return the training images, equal in every call."""
         generator = self.generator() if generator is None else generator
-        return self.shown(results).training_set(self.psi, self.training.images_per_object, generator)
-
-    def shown(self, results: Results) -> Scene:
-        """Return the scene of the training images."""
-        return results(self.scene)
+        scene: TrainingImages = results(self.scene)
+        return scene.training_set(self.psi, self.training.images_per_object, generator)
 
     def generator(self) -> torch.Generator:
         """Of images, new parameters and the order of training."""
@@ -134,10 +130,10 @@ class DetectorStage(TrainedStage):
         results(self.scene)  # so that fields are not charged
         detector, training, generator = self.build(), self.training, self.generator()
         begun, cpu_begun = time.perf_counter(), time.process_time()
-        images, sampling = self.images(results, generator).images, None
+        images, sampling = self.images(results, generator).images.to(self.device), None
         drawn, photographs = len(images), self.photographs(results)
         if photographs is not None:
-            images = LabelledImages.concatenate([images, photographs.to(images.images.device)])
+            images = LabelledImages.concatenate([images, photographs.to(self.device)])
             sampling = training.real.sampling(drawn, len(photographs), training.batch_size)
         params, history = train_detector(
             detector,

@@ -20,7 +20,7 @@ from neural_sim.report.model_files import ModelFiles
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.psi import Method
 from neural_sim.stages.views import ObjectSource
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
 

@@ -15,8 +15,8 @@ from neural_sim.outer.records import IterationRecord, LearnedPsi
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.images import Images, Psi
-from neural_sim.stages.other_images import ViewsDetectorStage, trained_on
 from neural_sim.stages.psi import HypergradientParts, PsiStage
+from neural_sim.stages.scene import PictureSubjectStage
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,13 @@ class Graph(Images):
 
     def _on_views(self) -> DetectorStage:
         """Return a detector trained on the views that the fields are fitted to."""
+        radii = self.radii or (1.0,) * len(self.views)
+        pictures = tuple(
+            PictureSubjectStage(views, self.camera, radius, self.device)
+            for views, radius in zip(self.views, radii, strict=True)
+        )
         uniform = self.synthetic(self.uniform, "the fields' own views")
-        return trained_on(uniform, ViewsDetectorStage, views=self.views)
+        return replace(uniform, scene=self.scene.showing(pictures))
 
     @cached_property
     def learned(self) -> PsiStage:

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.devices import device_of
+from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
-from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.scene import FieldSubjectStage, SceneStage
 from neural_sim.stages.symmetry import SymmetryStage
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.stages.views import Objects, ViewsStage
@@ -83,9 +84,18 @@ class Images:
         """What training images are synthesised from."""
         imaging = self.experiment.imaging
         return SceneStage(
-            self.names, self.fields, imaging.renderer, self.camera, imaging.synthesis,
-            imaging.distribution.drawn, self.radii, imaging.distribution,
+            self.subjects(self.fields, imaging.renderer), self.camera, imaging.synthesis,
+            imaging.distribution.drawn, imaging.distribution,
         )  # fmt: skip
+
+    def subjects(
+        self, fields: tuple[FieldStage, ...], renderer: NerfRenderer
+    ) -> tuple[FieldSubjectStage, ...]:
+        """Return the objects of the scene by given fields."""
+        radii = self.radii or (None,) * len(fields)
+        return tuple(
+            FieldSubjectStage(field, renderer, radius) for field, radius in zip(fields, radii, strict=True)
+        )
 
     @cached_property
     def targets(self) -> TargetSetsStage:

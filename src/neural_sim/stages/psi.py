@@ -103,7 +103,7 @@ class PsiStage(Stage[LearnedPsi]):
         """
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
-            scene = replace(scene, renderer=scene.renderer.at(self.outer.quality))
+            scene = scene.with_quality(self.outer.quality)
         inner = InnerLoop(
             scene, self.warm_start.build(), results(self.warm_start).params, results(self.targets).val, self.outer,
             training, stream(self.seed, "psi"), self.draws, self.warm_start.photographs(results),

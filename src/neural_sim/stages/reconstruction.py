@@ -1,4 +1,4 @@
-"""The meshes that are reconstructed from an object's views, and detectors trained on images of them."""
+"""Meshes that are reconstructed from objects' views, and subjects of scenes that show them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 import trimesh
+from typing_extensions import override
 
 from neural_sim.field.reconstruction import reconstruct
-from neural_sim.renderer.subject import Subject
-from neural_sim.stages.detector import DetectorStage
+from neural_sim.renderer.base import MeshRenderer
+from neural_sim.stages.scene import SubjectStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
-from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.subjects import SubjectScene
+from neural_sim.synthesis.subjects import MeshSubject
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,18 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
 
 
 @dataclass(frozen=True)
-class ReconstructionDetectorStage(DetectorStage):
-    """A detector trained on images of reconstructed meshes at the draws, backgrounds and places of those of the fields.
-    ``subjects`` are the results of ``reconstructions``, with their renderer.
-    """
+class ReconstructionSubjectStage(SubjectStage[MeshSubject]):
+    """An object by its reconstructed mesh; ``radius`` is in metres, None where distances are in radii."""
 
-    reconstructions: tuple[ReconstructionStage, ...] = field(kw_only=True)
-    subjects: tuple[Subject, ...] = field(kw_only=True, metadata=UNKEYED)
+    reconstruction: ReconstructionStage
+    radius: float | None
+    renderer: MeshRenderer = field(metadata=UNKEYED)
 
-    def shown(self, results: Results) -> Scene:
-        return SubjectScene.of(super().shown(results), self.subjects)
+    @property
+    @override
+    def object(self) -> str:
+        return self.reconstruction.views.object
+
+    @override
+    def make(self, results: Results) -> MeshSubject:
+        return MeshSubject(self.object, results(self.reconstruction), self.renderer, radius=self.radius)

@@ -1,51 +1,200 @@
-"""The fields of all objects, with the renderer and synthesizer of their images; assembled in memory."""
+"""Scenes and their subjects, put together in memory from fields, meshes or views; and images of another program."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from abc import abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Protocol, TypeVar
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stages.field import FieldStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.views import Objects, ViewsStage
+from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.synthesis.pictures import PictureSubject
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
-from neural_sim.types import PinholeCamera
+from neural_sim.synthesis.subjects import FieldSubject, RenderedSubject, Subject
+from neural_sim.synthesis.synthesizer import Synthesizer
+from neural_sim.target.coco import CocoTarget
+from neural_sim.types import LabelledImages, PinholeCamera
+
+SubjectT = TypeVar("SubjectT", bound=Subject)
+
+
+class SubjectStage(Stage[SubjectT]):
+    """One object of a scene."""
+
+    phase: ClassVar[str] = "field"
+    kind: ClassVar[str] = "subject"
+    stored: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def object(self) -> str:
+        """Name of the object."""
+
+    @property
+    def title(self) -> str:
+        """The result in words."""
+        return f"{self.object} in a scene"
 
 
 @dataclass(frozen=True)
-class SceneStage(Stage[Scene]):
-    """What training images are synthesised from.
+class FieldSubjectStage(SubjectStage[FieldSubject]):
+    """An object by its field; ``radius`` is in metres, None where distances are in radii."""
 
-    The key covers ``drawn``, what draws of given probabilities depend on, and not ``distribution``: methods that relax
-    draws differently use the same results of hard draws. ``radii`` are the objects' in metres, None where distances are
-    in radii.
+    field: FieldStage
+    renderer: NerfRenderer
+    radius: float | None
+
+    @property
+    @override
+    def object(self) -> str:
+        return self.field.views.object
+
+    @override
+    def make(self, results: Results) -> FieldSubject:
+        return FieldSubject(self.object, results(self.field).field, self.renderer, radius=self.radius)
+
+
+@dataclass(frozen=True)
+class MeshSubjectStage(SubjectStage[RenderedSubject]):
+    """The object ``item`` by its mesh, whose digest is ``content``, under one fixed light."""
+
+    item: str
+    content: str
+    supersample: int
+    objects: Objects = field(metadata=UNKEYED)
+
+    @property
+    @override
+    def object(self) -> str:
+        return self.item
+
+    @override
+    def make(self, results: Results) -> RenderedSubject:
+        return self.objects.subject(self.item)
+
+
+@dataclass(frozen=True)
+class PictureSubjectStage(SubjectStage[PictureSubject]):
+    """An object by the views that its field is fitted to (the paper's "images to train NeRF", Sec. 4.4 and Table 2).
+
+    ``camera`` is that of the scene's images; ``radius`` is the object's in the unit of the scene's distances.
     """
+
+    views: ViewsStage
+    camera: PinholeCamera
+    radius: float
+    device: torch.device = field(metadata=UNKEYED)
+
+    @property
+    @override
+    def object(self) -> str:
+        return self.views.object
+
+    @override
+    def make(self, results: Results) -> PictureSubject:
+        views = self.views.fitted(results).to(self.device)
+        return PictureSubject.of(self.object, views, self.camera, self.radius)
+
+
+class TrainingImages(Protocol):
+    """What gives a detector its training images: a :class:`Scene`, or :class:`LoadedImages`."""
+
+    def training_set(
+        self, psi: Float[Tensor, "objects K"], count: int, generator: torch.Generator
+    ) -> RenderedImages:
+        """Return labelled images, ``count`` of every object where they are drawn from p_psi."""
+        ...
+
+
+class TrainingImagesStage(Stage[Any]):
+    """What gives a detector its training images (:class:`TrainingImages`)."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"
     stored: ClassVar[bool] = False
 
-    names: tuple[str, ...]
-    fields: tuple[FieldStage, ...]
-    renderer: NerfRenderer
+    camera: PinholeCamera
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of the objects, in the order of their class labels."""
+
+
+@dataclass(frozen=True)
+class SceneStage(TrainingImagesStage):
+    """The scene of ``subjects``.
+
+    The key covers ``drawn``, which is what draws of given probabilities depend on, not ``distribution``: methods that
+    relax draws differently use the same results of hard draws.
+    """
+
+    subjects: tuple[SubjectStage[Any], ...]
     camera: PinholeCamera
     synthesizer: Synthesizer
     drawn: Any
-    radii: tuple[float, ...] | None
     distribution: SceneDistribution = field(metadata=UNKEYED)
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return tuple(subject.object for subject in self.subjects)
 
     @property
     @override
     def title(self) -> str:
         return "scene of all objects"
 
+    def showing(self, subjects: tuple[SubjectStage[Any], ...]) -> SceneStage:
+        """Return the scene with other subjects at the same draws, backgrounds and places."""
+        return replace(self, subjects=subjects)
+
     @override
     def make(self, results: Results) -> Scene:
-        fields = tuple(results(stage).field for stage in self.fields)
-        return Scene(
-            self.names, fields, self.renderer, self.camera, self.synthesizer, self.distribution, radii=self.radii
-        )  # fmt: skip
+        subjects = tuple(results(subject) for subject in self.subjects)
+        return Scene(subjects, self.camera, self.synthesizer, self.distribution)
+
+
+@dataclass(frozen=True)
+class LoadedImages:
+    """Images that another program made, which psi has no part in."""
+
+    images: LabelledImages
+
+    def training_set(
+        self, psi: Float[Tensor, "objects K"], count: int, generator: torch.Generator
+    ) -> RenderedImages:
+        """Return all images."""
+        return RenderedImages(self.images, (), (), ())
+
+
+@dataclass(frozen=True)
+class LoadedImagesStage(TrainingImagesStage):
+    """All images of a COCO file, resized to the camera's size."""
+
+    source: CocoTarget
+    class_names: tuple[str, ...]
+    camera: PinholeCamera
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return self.class_names
+
+    @property
+    @override
+    def title(self) -> str:
+        return "images of another program"
+
+    @override
+    def make(self, results: Results) -> LoadedImages:
+        return LoadedImages(self.source.load(self.names, self.camera.height, self.camera.width))

@@ -15,7 +15,7 @@ from neural_sim.stages.field import FieldStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.store import from_bytes, to_bytes
 from neural_sim.stages.views import Objects
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Target
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -67,8 +67,10 @@ class TargetSetsStage(Stage[TargetSets]):
     @override
     def make(self, results: Results) -> TargetSets:
         fields = {stage.views.object: results(stage).field for stage in self.fields}
-        objects = {name: self.objects.subject(name, fields.get(name)) for name in self.objects.names}
-        how = self.distribution, self.camera, self.synthesizer, self.seed, self.rig
+        objects = {
+            name: self.objects.subject(name, fields.get(name), rig=self.rig) for name in self.objects.names
+        }
+        how = self.distribution, self.camera, self.synthesizer, self.seed
         return TargetSets(**self.target.sets(objects, *how))
 
     @override

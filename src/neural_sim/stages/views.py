@@ -22,10 +22,11 @@ from neural_sim.objects.pictures import SceneMaskMaker
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
-from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
+from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.views import Views, choose_mesh_renderer
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.store import from_bytes, to_bytes
+from neural_sim.synthesis.subjects import MeshSubject, PhotographedField, RenderedSubject
 from neural_sim.types import PinholeCamera, PosedViews
 
 MasksOfFrames = tuple[Float[Tensor, "_ _"], ...]
@@ -186,8 +187,16 @@ class Objects(ABC):
         """Radii of the bounding spheres in metres by name, None where unknown."""
 
     @abstractmethod
-    def subject(self, name: str, field: RadianceField | None = None) -> Subject:
-        """Return an object as target sets render it; ``field`` is its radiance field where there is one."""
+    def subject(
+        self, name: str, field: RadianceField | None = None, *, rig: LightRig | None = None
+    ) -> RenderedSubject:
+        """Return an object as target sets render it.
+
+        Args:
+            name: name of the object.
+            field: its radiance field, for objects without meshes.
+            rig: lights whose weights scenes may draw, for objects with meshes.
+        """
 
     @abstractmethod
     def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
@@ -223,8 +232,10 @@ class Meshes(Objects):
         return {name: item.radius if self.source.metric else None for name, item in self.items.items()}
 
     @override
-    def subject(self, name: str, field: RadianceField | None = None) -> MeshSubject:
-        return MeshSubject(self.items[name], self.renderer, self.radii[name])
+    def subject(
+        self, name: str, field: RadianceField | None = None, *, rig: LightRig | None = None
+    ) -> MeshSubject:
+        return MeshSubject(name, self.items[name].mesh, self.renderer, rig, radius=self.radii[name])
 
     @override
     def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
@@ -250,9 +261,11 @@ class Captures(Objects):
         return {name: self.source.radius(name) for name in self.names}
 
     @override
-    def subject(self, name: str, field: RadianceField | None = None) -> FieldSubject:
+    def subject(
+        self, name: str, field: RadianceField | None = None, *, rig: LightRig | None = None
+    ) -> PhotographedField:
         renderer = NerfWRenderer() if isinstance(field, AppearanceField) else NerfRenderer()
-        return FieldSubject(name, field, self.radii[name], renderer)
+        return PhotographedField(name, field, renderer, radius=self.radii[name])
 
     @override
     def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:

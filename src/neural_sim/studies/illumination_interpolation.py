@@ -83,8 +83,8 @@ class Interpolation(Task):
         pose = orbit(*(torch.tensor(value) for value in place))
         one, other = (torch.eye(anchors)[end - 1] for end in self.ends)
         shown = {
-            name: interpolate(field, scene.lit_renderer, camera, pose, (one, other), self.steps)
-            for name, field in zip(scene.names, scene.fields, strict=True)
+            shown.name: interpolate(shown.field, shown.lit_renderer, camera, pose, (one, other), self.steps)
+            for shown in scene.fields
         }
         publish(context, shown, "From light {} to light {}".format(*self.ends))
 

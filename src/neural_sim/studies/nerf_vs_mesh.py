@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from neural_sim.ranges import Ascending, NonNegativeInt, PositiveInt, validated
 from neural_sim.report.coco import write_training_set
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.other_images import CocoDetectorStage, MeshDetectorStage, trained_on
+from neural_sim.stages.scene import LoadedImagesStage, MeshSubjectStage
 from neural_sim.stages.stage import Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.studies.graphs import graphs_of_seeds, sets_of_kinds
@@ -103,8 +103,10 @@ class NerfVsMesh(Task):
         """Return the detectors that are compared, by what their images show."""
         nerf = graph.synthetic(graph.psi("target"), "images of the fields")
         if self._rendered is not None:
-            other = trained_on(nerf, CocoDetectorStage, source=self._rendered)
-            return {"nerf": nerf, "blenderproc": other}
-        supersample = graph.experiment.imaging.views.supersample
-        meshes = {"contents": graph.objects.digests, "supersample": supersample, "objects": graph.objects}
-        return {"nerf": nerf, "mesh": trained_on(nerf, MeshDetectorStage, **meshes)}
+            loaded = LoadedImagesStage(self._rendered, graph.names, graph.camera)
+            return {"nerf": nerf, "blenderproc": replace(nerf, scene=loaded)}
+        supersample, objects = graph.experiment.imaging.views.supersample, graph.objects
+        meshes = tuple(
+            MeshSubjectStage(name, objects.digests[name], supersample, objects) for name in graph.names
+        )
+        return {"nerf": nerf, "mesh": replace(nerf, scene=graph.scene.showing(meshes))}

@@ -109,7 +109,7 @@ class PatchMemory(Task):
 
     def _total(self, loop: FrozenLoop, estimator: PathwiseEstimator, seed: int) -> float:
         """Return the peak memory in MiB of one estimate from one image of every object."""
-        device = loop.scene.device(0)
+        device = loop.scene.device
         return peak_bytes(lambda: loop.pathwise(estimator, 1, _generator(seed)), device) / 2**20
 
     def _timed(self, run: Callable[[], object], device: torch.device) -> tuple[float, float]:
@@ -146,10 +146,9 @@ class _Image:
     @staticmethod
     def of(loop: FrozenLoop, label: int, estimator: PathwiseEstimator, seed: int) -> _Image:
         scene, generator = loop.scene, _generator(seed)
-        part = scene.drawn(label, loop.psi[label], 1, generator, replace(estimator, mode="forward").draws)
-        nuisance = scene.synthesizer.draw_nuisance(1, scene.camera, generator, scene.device(label))
-        bins = scene.distribution.label_of(part.draw)
-        rendered = one_each([part], [nuisance], [label], [bins], scene.synthesizer)
+        part = scene.draw(label, loop.psi[label], 1, generator, replace(estimator, mode="forward").draws)
+        nuisance = scene.synthesizer.draw_nuisance(1, scene.camera, generator, scene.device)
+        rendered = one_each([part], [nuisance], [label], scene.synthesizer)
         images, first = rendered.images, torch.zeros(1, dtype=torch.long)
         targets = loop.detector.assign(images.boxes, images.labels)
         losses = image_losses(loop.detector, loop.backbone, targets)
@@ -168,7 +167,7 @@ class _Image:
     def render(self, tangents: bool) -> RenderedObject:
         relaxed = self.part.relaxed
         how = replace(relaxed, tangents=tangents) if relaxed is not None else HARD
-        return self.loop.scene.drawn(self.label, self.loop.psi[self.label], 1, _generator(self.seed), how)
+        return self.loop.scene.draw(self.label, self.loop.psi[self.label], 1, _generator(self.seed), how)
 
     def forward(self) -> dict[str, Tensor]:
         return contract(self.render(tangents=True).tangents or {}, self.cotangents)
@@ -176,9 +175,7 @@ class _Image:
     def reverse(self, patch: int) -> dict[str, Tensor]:
         scene = self.loop.scene
         field, draw = scene.fields[self.label], self.part.draw
-        return draw_cotangents(
-            lambda rays: scene.renderer.render_rays(field, rays), scene.camera, draw, self.cotangents, patch
-        )
+        return draw_cotangents(field.render_rays, scene.camera, draw, self.cotangents, patch)
 
     def output_mb(self) -> float:
         """Return MiB of the maps and their derivatives, each as large as the cotangents."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -18,19 +18,17 @@ from neural_sim.alpha import over_white, premultiplied
 from neural_sim.documents import markdown_table
 from neural_sim.field.hull import Resolution
 from neural_sim.field.scores import compare, where_known
-from neural_sim.objects.mesh import ObjectMesh, content_digest
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.renderer.lighting import Lighting
-from neural_sim.renderer.subject import FieldSubject, MeshSubject, Subject
 from neural_sim.renderer.views import choose_mesh_renderer
 from neural_sim.report.figures import INK
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.graph import Graph
-from neural_sim.stages.other_images import trained_on
-from neural_sim.stages.reconstruction import ReconstructionDetectorStage, ReconstructionStage
+from neural_sim.stages.reconstruction import ReconstructionStage, ReconstructionSubjectStage
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.studies.graphs import graphs_of_seeds
 from neural_sim.studies.sources import More, compare_sources, publish, training_images
+from neural_sim.synthesis.subjects import PhotographedField, RenderedSubject
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import PosedViews
 
@@ -73,23 +71,33 @@ class SfmVsNerf(Task):
         if not context.experiment.imaging.views.held_out:
             raise ValueError("sfm_vs_nerf: want views.held_out of at least 1, got 0")
         graphs = graphs_of_seeds(context, self.seeds)
-        nerf = [graph.synthetic(graph.psi("target"), "images of the fields") for graph in graphs]
-        return [*self._reconstructions(graphs[0]), *(graph.targets for graph in graphs), *nerf]
+        meshes = self._reconstructions(graphs[0])
+        detectors = [stage for graph in graphs for stage in self._sources(graph, meshes).values()]
+        return [*meshes, *(graph.targets for graph in graphs), *detectors]
 
-    def _reconstructions(self, graph: Graph) -> tuple[ReconstructionStage, ...]:
-        return tuple(ReconstructionStage(views, self.resolution) for views in graph.views)
+    def _reconstructions(self, graph: Graph) -> tuple[ReconstructionSubjectStage, ...]:
+        views = graph.experiment.imaging.views
+        renderer = choose_mesh_renderer(views.backend, views.supersample, UNLIT)
+        radii = graph.radii or (None,) * len(graph.names)
+        return tuple(
+            ReconstructionSubjectStage(ReconstructionStage(each, self.resolution), radius, renderer)
+            for each, radius in zip(graph.views, radii, strict=True)
+        )
+
+    def _sources(
+        self, graph: Graph, meshes: tuple[ReconstructionSubjectStage, ...]
+    ) -> dict[str, DetectorStage]:
+        nerf = graph.synthetic(graph.psi("target"), "images of the fields")
+        return {"nerf": nerf, "sfm": replace(nerf, scene=graph.scene.showing(meshes))}
 
     @override
     def run(self, context: Context) -> None:
         graphs, results = graphs_of_seeds(context, self.seeds), context.results
-        names, stages = list(context.graph.names), self._reconstructions(graphs[0])
-        meshes = self._meshes(graphs[0], stages, results)
-        objects = [self._held_out(graphs[0], results, i, mesh) for i, mesh in enumerate(meshes)]
+        names, meshes = list(context.graph.names), self._reconstructions(graphs[0])
+        objects = [self._held_out(graphs[0], results, i, results(mesh)) for i, mesh in enumerate(meshes)]
 
         def sources(graph: Graph) -> dict[str, DetectorStage]:
-            nerf = graph.synthetic(graph.psi("target"), "images of the fields")
-            more = {"reconstructions": stages, "subjects": meshes}
-            return {"nerf": nerf, "sfm": trained_on(nerf, ReconstructionDetectorStage, **more)}
+            return self._sources(graph, meshes)
 
         found = compare_sources(graphs, results, sources, lambda graph: {"test": graph.targets}, self.draws)
         shown = training_images(graphs[0], results, sources(graphs[0]), self.shown)
@@ -101,32 +109,21 @@ class SfmVsNerf(Task):
         )
         publish(context, found, shown, names, heading, more)
 
-    def _meshes(
-        self, graph: Graph, stages: tuple[ReconstructionStage, ...], results: Results
-    ) -> tuple[MeshSubject, ...]:
-        views = graph.experiment.imaging.views
-        renderer = choose_mesh_renderer(views.backend, views.supersample, UNLIT)
-        made = {stage.views.object: results(stage) for stage in stages}
-        return tuple(
-            MeshSubject(ObjectMesh(name, mesh, np.eye(4), content_digest(mesh)), renderer)
-            for name, mesh in made.items()
-        )
-
-    def _held_out(self, graph: Graph, results: Results, label: int, mesh: Subject) -> HeldOut:
+    def _held_out(self, graph: Graph, results: Results, label: int, mesh: RenderedSubject) -> HeldOut:
         """Render the held-out views of an object by its field and by its reconstruction, and score them."""
         views = results(graph.views[label])
         unseen = views.select(torch.arange(len(views) - graph.views[label].held_out, len(views)))
         renderer = graph.experiment.imaging.renderer
-        field = FieldSubject(mesh.name, results(graph.fields[label]).field, renderer=renderer)
-        shown: Mapping[str, Subject] = {"nerf": field, "sfm": mesh}
+        field = PhotographedField(mesh.name, results(graph.fields[label]).field, renderer)
+        shown: Mapping[str, RenderedSubject] = {"nerf": field, "sfm": mesh}
         rendered = {name: _as_seen(each, unseen) for name, each in shown.items()}
         scores = {name: compare(image, unseen.images) for name, image in rendered.items()}
         rendered = {"view": premultiplied(unseen.images), **rendered}
         return HeldOut(mesh.name, {name: over_white(image[0]) for name, image in rendered.items()}, scores)
 
 
-def _as_seen(subject: Subject, views: PosedViews) -> Float[Tensor, "views h w 4"]:
-    return where_known(premultiplied(subject.render(views.camera, views.camera_to_world)), views)
+def _as_seen(subject: RenderedSubject, views: PosedViews) -> Float[Tensor, "views h w 4"]:
+    return where_known(subject.maps(views.camera, views.camera_to_world).rgba, views)
 
 
 def held_out_table(objects: Sequence[HeldOut]) -> str:

@@ -12,7 +12,7 @@ from torch import Tensor
 from neural_sim.parameter.product import SceneNoise
 from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.layout import Layout
-from neural_sim.synthesis.training_set import Nuisance, Synthesizer
+from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, SceneDraw
 
 CHUNK = 64
@@ -38,6 +38,12 @@ class RenderedObject:
 
     def __len__(self) -> int:
         return len(self.draw)
+
+    @property
+    def bins(self) -> Int[Tensor, "m"]:
+        """Bins of the first binned factor, for reports; -1 where nothing is binned."""
+        bins = self.draw.bins
+        return bins[:, 0] if bins.shape[1] else torch.full((len(bins),), -1)
 
     def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
         """Some of the renders, without what reproduces or differentiates them."""
@@ -75,17 +81,20 @@ def one_each(
     objects: Sequence[RenderedObject],
     nuisances: Sequence[Nuisance],
     labels: Sequence[int],
-    bins: Sequence[Int[Tensor, "m"]],
     synthesizer: Synthesizer,
 ) -> RenderedImages:
-    """An image for every render, object by object; ``labels`` are the objects' classes."""
+    """Compose an image of every render, object by object; ``labels`` are the objects' classes."""
     images, rows, compose, first = [], [], [], 0
-    for part, nuisance, label, own in zip(objects, nuisances, labels, bins, strict=True):
+    for part, nuisance, label in zip(objects, nuisances, labels, strict=True):
 
         def again(
-            rgb: Tensor, opacity: Tensor, nuisance: Nuisance = nuisance, label: int = label, own: Tensor = own
+            rgb: Tensor,
+            opacity: Tensor,
+            nuisance: Nuisance = nuisance,
+            label: int = label,
+            bins: Tensor = part.bins,
         ) -> LabelledImages:
-            return synthesizer.compose(rgb, opacity, nuisance, label, own)
+            return synthesizer.compose(rgb, opacity, nuisance, label, bins)
 
         with torch.no_grad():
             images.append(again(part.rgb, part.opacity))
@@ -111,19 +120,18 @@ class Shared:
         objects: Sequence[RenderedObject],
         layout: Layout,
         nuisance: Nuisance,
-        bins: Sequence[Int[Tensor, "m"]],
         synthesizer: Synthesizer,
     ) -> Shared:
-        """``objects`` hold each class's renders in the order in which ``layout`` shows it, ``bins`` their bins."""
+        """Return the images of ``objects``, each class's renders in the order in which ``layout`` shows it."""
         place = torch.full_like(layout.labels, -1)
         own = torch.full((len(layout),), -1)
-        for label, (part, each) in enumerate(zip(objects, bins, strict=True)):
+        for label, part in enumerate(objects):
             rows, columns = layout.places(label)
             if len(rows) != len(part):
                 raise ValueError(f"layout: shows class {label} {len(rows)} times, got {len(part)} renders")
             place[rows, columns] = torch.arange(len(rows))
             mine = columns == 0
-            own[rows[mine]] = each[mine].to(own)
+            own[rows[mine]] = part.bins[mine].to(own)
         return Shared(tuple(objects), layout, place, nuisance, own, synthesizer)
 
     def composed(self) -> RenderedImages:
@@ -168,15 +176,13 @@ class Shared:
         rows, columns = self.layout.places(label)
         return lambda rgb, opacity: self.images(rows, columns, Maps(rgb, opacity))
 
-    def repeated(
-        self, index: Int[Tensor, "m"], label: int, part: RenderedObject, bins: Int[Tensor, "m"]
-    ) -> Shared:
-        """The images ``index``, whose own object, of class ``label``, is ``part``'s instead, one after the other."""
+    def repeated(self, index: Int[Tensor, "m"], label: int, part: RenderedObject) -> Shared:
+        """Return the images ``index``, each with the next render of ``part``, of class ``label``, as its own object."""
         place = self.place[index].clone()
         place[:, 0] = torch.arange(len(index))
         objects = [part if i == label else other for i, other in enumerate(self.objects)]
         return replace(
             self,
             objects=tuple(objects), layout=self.layout.select(index), place=place,
-            nuisance=self.nuisance.select(index), bins=bins.to(self.bins),
+            nuisance=self.nuisance.select(index), bins=part.bins.to(self.bins),
         )  # fmt: skip

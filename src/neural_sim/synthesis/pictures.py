@@ -1,69 +1,86 @@
-"""A scene that shows given pictures of the objects, such as the views that fields are fitted to, not their fields."""
+"""Objects in scenes by given pictures, such as the views that their fields are fitted to."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 from torchvision.transforms.v2.functional import resize
 
 from neural_sim.alpha import premultiplied
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD, Draws
-from neural_sim.synthesis.scene import Scene
-from neural_sim.types import PosedViews, SceneDraw
+from neural_sim.synthesis.draws import HARD, Draws, RelaxedDraws
+from neural_sim.synthesis.subjects import not_differentiable
+from neural_sim.types import PinholeCamera, PosedViews, SceneDraw
 
 
 @dataclass(frozen=True)
-class PictureScene(Scene):
-    """A :class:`Scene` that draws among each object's pictures with replacement, whatever psi is.
+class PictureSubject:
+    """Pictures of an object, drawn with replacement whatever psi is.
 
-    ``pictures`` are premultiplied RGBA of the scene's image size, ``seen`` from where they were taken, both by object.
+    Args:
+        name: name of the object.
+        pictures: premultiplied RGBA of the size of the scene's images.
+        seen: from where each was taken, without bins.
     """
 
-    pictures: tuple[Float[Tensor, "n h w 4"], ...] = ()
-    seen: tuple[SceneDraw, ...] = ()
+    name: str
+    pictures: Float[Tensor, "n h w 4"]
+    seen: SceneDraw
 
     @staticmethod
-    def of(scene: Scene, views: Sequence[PosedViews]) -> PictureScene:
-        """Of the views of every object of ``scene``, as large as fits into its images, in their middle.
+    def of(name: str, views: PosedViews, camera: PinholeCamera, radius: float = 1.0) -> PictureSubject:
+        """Return the subject of views, as large as fits into images of ``camera``, in their middle.
 
-        Raises:
-            ValueError: another number of views than of objects.
+        Args:
+            name: name of the object.
+            views: the views, on the device of the scene's images.
+            camera: camera of the scene's images.
+            radius: the object's radius in the unit of the scene's distances.
         """
-        if len(views) != len(scene.names):
-            raise ValueError(f"PictureScene: want views of {len(scene.names)} objects, got {len(views)}")
-        height, width = scene.camera.height, scene.camera.width
-        pictures, seen = [], []
-        for label, each in enumerate(views):
-            rgba = each.images.to(scene.device(label), scene.dtype(label))
-            pictures.append(_fitted(premultiplied(rgba), height, width))
-            seen.append(_seen(each, 1.0 if scene.radii is None else scene.radii[label]))
-        return PictureScene(
-            **{f.name: getattr(scene, f.name) for f in fields(Scene)},
-            pictures=tuple(pictures),
-            seen=tuple(seen),
-        )
+        fitted = _fitted(premultiplied(views.images), camera.height, camera.width)
+        return PictureSubject(name, fitted, _seen(views, radius))
 
-    def drawn(
-        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
+    @property
+    def device(self) -> torch.device:
+        """Device of the maps."""
+        return self.pictures.device
+
+    def draw(
+        self,
+        camera: PinholeCamera,
+        distribution: SceneDistribution,
+        psi: Float[Tensor, "K"],
+        count: int,
+        generator: torch.Generator,
+        how: Draws = HARD,
     ) -> RenderedObject:
-        """``count`` of the object's pictures."""
-        chosen = torch.randint(len(self.pictures[label]), (count,), generator=generator)
-        maps = self.pictures[label][chosen.to(self.device(label))]
-        return RenderedObject(self.seen[label].select(chosen), maps[..., :3], maps[..., 3])
+        """Draw ``count`` of the pictures; psi has no part in them."""
+        if isinstance(how, RelaxedDraws):
+            raise not_differentiable(self.name, how)
+        chosen = torch.randint(len(self.pictures), (count,), generator=generator)
+        rgba = self.pictures[chosen.to(self.device)]
+        return RenderedObject(self.seen.select(chosen), rgba[..., :3], rgba[..., 3])
 
-    def _bins(self, objects: Sequence[RenderedObject]) -> list[Int[Tensor, "m"]]:
-        """Unknown: pictures are not drawn by bins."""
-        return [torch.full((len(part),), -1) for part in objects]
+    def probe(
+        self,
+        camera: PinholeCamera,
+        distribution: SceneDistribution,
+        factor: str,
+        per_bin: int,
+        psi: Float[Tensor, "K"],
+        generator: torch.Generator,
+    ) -> RenderedObject:
+        """Refuse: there are no pictures of given bins."""
+        raise ValueError(f"{self.name}: pictures are not drawn by bins, want a field or a mesh")
 
 
 def _fitted(maps: Float[Tensor, "n h w 4"], height: int, width: int) -> Float[Tensor, "n height width 4"]:
-    """Maps resized to fit into an image, with empty margins."""
+    """Return maps resized to fit into an image, with empty margins."""
     scale = min(height / maps.shape[1], width / maps.shape[2])
     size = [round(scale * maps.shape[1]), round(scale * maps.shape[2])]
     small = resize(maps.movedim(-1, 1), size, antialias=True)

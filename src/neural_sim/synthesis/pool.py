@@ -8,105 +8,117 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from neural_sim.parameter.factor import BinnedFactor
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
 from neural_sim.synthesis.draws import HARD, Draws, HardDraws
 from neural_sim.synthesis.scene import Scene
-from neural_sim.types import SceneDraw
+from neural_sim.types import PinholeCamera, SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """Number of combinations of the factors' bins, and of maps of each that give every bin at least ``per_bin``."""
+    """Return the number of combinations of bins, and of maps of each that give every bin at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
 
 
 @dataclass(frozen=True)
-class ObjectPool:
-    """``per_cell`` maps of every cell of one object, cell by cell, the last factor's bins changing fastest.
+class PooledSubject:
+    """A subject whose draws are taken from ready renders, with replacement.
 
-    ``maps`` are premultiplied RGBA in 8 bits, ``draw`` the scene of each.
+    Args:
+        name: name of the object.
+        maps: premultiplied RGBA in 8 bits, ``per_cell`` of every combination of the factors' bins, one combination
+            after the other, the last factor's bins changing fastest.
+        drawn: scene parameters of each.
+        per_cell: maps of each combination.
     """
 
+    name: str
     maps: UInt8[Tensor, "n height width 4"]
-    draw: SceneDraw
+    drawn: SceneDraw
     per_cell: int
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the maps."""
+        return self.maps.device
 
-@dataclass(frozen=True)
-class ImagePool:
-    """The pools of all objects, in the order of their labels."""
-
-    scene: Scene
-    objects: tuple[ObjectPool, ...]
-
-    @staticmethod
-    def render(scene: Scene, per_bin: int, generator: torch.Generator) -> ImagePool:
-        """Render at least ``per_bin`` maps of every bin of every factor and object.
-
-        Raises:
-            ValueError: fewer than one, or a light that moves with psi.
-        """
-        if per_bin < 1:
-            raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
-        if scene.distribution.lights:
-            raise ValueError("outer.pool_per_bin: a pool has no images under a light that moves, want 0")
-        factors = scene.distribution.binned
-        cells, per_cell = pool_cells(factors, per_bin)
-        every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
-        bins = every.repeat_interleave(per_cell, 0)
-        named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
-        pools = []
-        for label in range(len(scene.names)):
-            # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
-            noise = scene.distribution.draw_noise(per_cell, generator, scene.dtype(label))
-            noise = noise.select(torch.arange(per_cell).repeat(cells))
-            part = scene.render(label, scene.distribution.at_bins(named, noise))
-            maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
-            pools.append(ObjectPool((maps * 255).round().to(torch.uint8), part.draw, per_cell))
-        return ImagePool(scene, tuple(pools))
-
-    def drawn(
-        self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
+    def draw(
+        self,
+        camera: PinholeCamera,
+        distribution: SceneDistribution,
+        psi: Float[Tensor, "K"],
+        count: int,
+        generator: torch.Generator,
+        how: Draws = HARD,
     ) -> RenderedObject:
-        """One object alone, ``count`` times from p_psi, its maps drawn with replacement.
-
-        Raises:
-            ValueError: for relaxed draws.
-        """
+        """See :class:`Subject`."""
         if not isinstance(how, HardDraws):
             raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
-        noise = how.noise(self.scene.distribution, count, generator, torch.float32)
-        within = torch.randint(self.objects[label].per_cell, (count,), generator=generator)
-        return self._taken(label, self.scene.distribution.hard(psi.float(), noise).bins, within)
+        noise = how.noise(distribution, count, generator, torch.float32)
+        within = torch.randint(self.per_cell, (count,), generator=generator)
+        return self._taken(distribution, distribution.hard(psi.float(), noise).bins, within)
 
-    def probed(
-        self, label: int, factor: str, per_bin: int, psi: Float[Tensor, "K"], generator: torch.Generator
+    def probe(
+        self,
+        camera: PinholeCamera,
+        distribution: SceneDistribution,
+        factor: str,
+        per_bin: int,
+        psi: Float[Tensor, "K"],
+        generator: torch.Generator,
     ) -> RenderedObject:
-        """One object alone, ``per_bin`` times in every bin of a factor, in the order of its bins; all else from p_psi
-        and the same in all bins.
-        """
-        distribution = self.scene.distribution
+        """See :class:`Subject`."""
         size = distribution.factor(factor).size
         bins, scenes = torch.arange(size).repeat_interleave(per_bin), torch.arange(per_bin).repeat(size)
         chosen = bins[:, None]
         if len(distribution.binned) > 1:
             noise = distribution.draw_noise(per_bin, generator).select(scenes)
             chosen = distribution.stratum(factor, bins, psi.float(), noise).bins
-        within = torch.randint(self.objects[label].per_cell, (per_bin,), generator=generator)
-        return self._taken(label, chosen, within[scenes])
+        within = torch.randint(self.per_cell, (per_bin,), generator=generator)
+        return self._taken(distribution, chosen, within[scenes])
 
-    def _taken(self, label: int, bins: Int[Tensor, "n factors"], within: Int[Tensor, "n"]) -> RenderedObject:
-        pool = self.objects[label]
+    def _taken(
+        self, distribution: SceneDistribution, bins: Int[Tensor, "n factors"], within: Int[Tensor, "n"]
+    ) -> RenderedObject:
         cell = torch.zeros(len(bins), dtype=torch.long)
-        for column, factor in zip(bins.unbind(1), self.scene.distribution.binned, strict=True):
+        for column, factor in zip(bins.unbind(1), distribution.binned, strict=True):
             cell = cell * factor.bins + column
-        index = cell * pool.per_cell + within
-        maps = pool.maps[index.to(pool.maps.device)].float() / 255
-        return RenderedObject(pool.draw.select(index), maps[..., :3], maps[..., 3])
+        index = cell * self.per_cell + within
+        maps = self.maps[index.to(self.device)].float() / 255
+        return RenderedObject(self.drawn.select(index), maps[..., :3], maps[..., 3])
+
+
+def pool_of(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
+    """Render at least ``per_bin`` maps of every bin of every factor and object, and return a scene that draws these.
+
+    Raises:
+        ValueError: for fewer than one, or a light that moves with psi.
+    """
+    if per_bin < 1:
+        raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
+    distribution = scene.distribution
+    if distribution.lights:
+        raise ValueError("outer.pool_per_bin: a pool has no images under a light that moves, want 0")
+    factors = distribution.binned
+    cells, per_cell = pool_cells(factors, per_bin)
+    every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
+    bins = every.repeat_interleave(per_cell, 0)
+    named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
+    subjects = []
+    for label, subject in enumerate(scene.fields):
+        # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
+        noise = distribution.draw_noise(per_cell, generator, subject.dtype)
+        noise = noise.select(torch.arange(per_cell).repeat(cells))
+        part = scene.render(label, distribution.at_bins(named, noise))
+        maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
+        pooled = (maps * 255).round().to(torch.uint8)
+        subjects.append(PooledSubject(subject.name, pooled, part.draw, per_cell))
+    return replace(scene, subjects=tuple(subjects))

@@ -19,8 +19,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.ranges import NonNegative, PositiveInt
 from neural_sim.renderer.rig import LightRig
-from neural_sim.renderer.subject import Subject
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import RenderedSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.classes import Unmatched
 from neural_sim.target.photographs import Photograph, read
 from neural_sim.target.split import Look, PartOfAll, Split
@@ -51,7 +51,7 @@ class Target(ABC):
     @abstractmethod
     def sets(
         self,
-        objects: Mapping[str, Subject],
+        objects: Mapping[str, RenderedSubject],
         distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,
@@ -183,7 +183,7 @@ class AnnotatedPhotographs(Photographs):
     @override
     def sets(
         self,
-        objects: Mapping[str, Subject],
+        objects: Mapping[str, RenderedSubject],
         distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,

@@ -19,8 +19,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.ranges import Fraction, PositiveInt
 from neural_sim.renderer.rig import LightRig
-from neural_sim.renderer.subject import Subject
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import RenderedSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Photographs
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.frames import Frame, FrameName, FrameReader, Listed, PosedObject
@@ -173,7 +173,7 @@ class PosedTarget(Photographs):
     @override
     def sets(
         self,
-        objects: Mapping[str, Subject],
+        objects: Mapping[str, RenderedSubject],
         distribution: SceneDistribution,
         camera: PinholeCamera,
         synthesizer: Synthesizer,

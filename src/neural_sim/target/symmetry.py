@@ -9,17 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.alpha import premultiplied
 from neural_sim.cameras import orbit
 from neural_sim.parameter.bins import BinNoise
 from neural_sim.parameter.factor import COORDINATES
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
-from neural_sim.renderer.subject import Subject
+from neural_sim.synthesis.subjects import RenderedSubject
 from neural_sim.types import PinholeCamera, SceneDraw
 
 
 def equivalent_bins(
-    item: Subject,
+    item: RenderedSubject,
     distribution: SceneDistribution,
     factor: str,
     camera: PinholeCamera,
@@ -47,7 +46,7 @@ def equivalent_bins(
 
 
 def _views(
-    item: Subject,
+    item: RenderedSubject,
     distribution: SceneDistribution,
     factor: str,
     camera: PinholeCamera,
@@ -66,7 +65,7 @@ def _views(
         for within, second, turn in aligned
     ]
     poses = torch.cat([orbit(draw.phi, draw.rho, draw.distance, radius=radius) for draw in draws])
-    return premultiplied(item.render(camera, poses)).unflatten(0, (bins, len(aligned), samples))
+    return item.maps(camera, poses).rgba.unflatten(0, (bins, len(aligned), samples))
 
 
 def _second_goes_round(distribution: SceneDistribution, factor: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -16,8 +16,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.cameras import reframed
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
-from neural_sim.renderer.nerf import Quality
+from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
 from neural_sim.stages.psi_file import psi_of_file
@@ -32,7 +33,7 @@ from neural_sim.synthesis.export.folder import ExportFolder
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.synthesis.export.records import opencv_entry
-from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.tasks.context import Context, Task
 
 _log = logging.getLogger(__name__)
@@ -117,12 +118,22 @@ class ExportTask(Task):
         psi, models = self._psi(context), models_of(graph.objects)
         stages = graph.fields if self.detail == "run" else finer_fields(graph, camera, self.largest_views)
         renderer = x.imaging.renderer if self.quality is None else x.imaging.renderer.at(self.quality)
-        scene = Scene(graph.names, (), renderer, graph.camera, synthesis, distribution, graph.radii)
-        source = ImageSource(scene, psi, camera, tuple(model.millimetres for model in models), x.run.seed)
-        identity = self._identity(source, [stage.key for stage in stages])
+        scene = graph.scene.showing(graph.subjects(stages, renderer))
+        millimetres = tuple(model.millimetres for model in models)
+        identity = {
+            "seed": x.run.seed,
+            "classes": list(graph.names),
+            "camera": opencv_entry(camera),
+            "psi": _rounded_probabilities(distribution, psi, graph.names),
+            "distribution": describe(distribution.drawn),
+            "millimetres_per_radius": list(millimetres),
+            "fields": [stage.key for stage in stages],
+            **self._look(renderer, synthesis),
+        }
         ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
-        fields = tuple(context.results(stage).field for stage in context.shown(stages, "field"))
-        source = replace(source, scene=replace(scene, fields=fields))
+        for stage in context.shown(stages, "field"):
+            context.results(stage)
+        source = ImageSource(context.results(scene), psi, camera, millimetres, x.run.seed)
         return DataSet(
             source, root, models, identity, self.count, cast(Sequence[Format], tuple(self.formats)),
             self.image_format, self.scene_size, farthest(source), workers,
@@ -144,28 +155,26 @@ class ExportTask(Task):
             raise ValueError(f"export.workers: want 0 or null with trainer=gpu, got {self.workers}")
         return self.workers
 
-    def _identity(self, source: ImageSource, fields: Sequence[str]) -> dict[str, Any]:
-        """Return all that an image depends on, except its number."""
-        scene = source.scene
-        described = {"renderer": describe(scene.renderer), "synthesis": describe(scene.synthesizer)}
-        p = scene.distribution.probabilities(source.psi.double())
-        psi = {
-            name: {factor: [round(v, 12) for v in p[factor][label].tolist()] for factor in p}
-            for label, name in enumerate(scene.names)
-        }
+    def _look(self, renderer: NerfRenderer, synthesizer: Synthesizer) -> dict[str, Any]:
+        """Return the part of an image's identity that says how it is rendered, composed and written."""
+        described = {"renderer": describe(renderer), "synthesis": describe(synthesizer)}
         return {
-            "seed": source.seed,
-            "classes": list(scene.names),
-            "camera": opencv_entry(source.camera),
-            "psi": psi,
-            "distribution": describe(scene.distribution.drawn),
-            "millimetres_per_radius": list(source.millimetres),
-            "fields": list(fields),
             **described,
             "image_format": self.image_format,
             "bop": {"scene_size": self.scene_size} if "bop" in self.formats else None,
             "code": code_version([ImageSource.__module__, *modules_of(described)]),
         }
+
+
+def _rounded_probabilities(
+    distribution: SceneDistribution, psi: Float[Tensor, "objects K"], names: Sequence[str]
+) -> dict[str, dict[str, list[float]]]:
+    """Return every object's probabilities by factor."""
+    p = distribution.probabilities(psi.double())
+    return {
+        name: {factor: [round(v, 12) for v in p[factor][label].tolist()] for factor in p}
+        for label, name in enumerate(names)
+    }
 
 
 def models_of(objects: Objects) -> list[Model]:
@@ -197,9 +206,8 @@ def farthest(source: ImageSource) -> float:
     scene, distribution = source.scene, source.scene.distribution
     factor = next((f for f in distribution.binned if f.coordinate == "distance"), None)
     reach = distribution.ranges["distance"][1] if factor is None else factor.high
-    radii = scene.radii or (1.0,) * len(scene.names)
-    reaches = [field.reach for field in scene.fields]
-    each = zip(radii, source.millimetres, reaches, strict=True)
+    reaches = [subject.field.reach for subject in scene.fields]
+    each = zip(scene.radii, source.millimetres, reaches, strict=True)
     return max((reach / radius + own) * millimetres for radius, millimetres, own in each)
 
 

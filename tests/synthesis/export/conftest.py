@@ -18,7 +18,8 @@ from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.export.bop import Model
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 CELL, STEP_CELLS, RAW = 0.125, 0.05, 20.0
@@ -63,11 +64,14 @@ def boxes() -> Callable[..., Boxes]:
         names: tuple[str, ...] = tuple(SIDES),
     ) -> Boxes:
         distribution = SceneDistribution.of([Pose()]) if distribution is None else distribution
-        fields = tuple(solid(SIDES[name], 1.0 - i) for i, name in enumerate(names))
+        renderer = NerfRenderer(termination=0.0)
+        subjects = tuple(
+            FieldSubject(name, solid(SIDES[name], 1.0 - i), renderer) for i, name in enumerate(names)
+        )
         synthesizer = Synthesizer(
             ProceduralClutter(octaves=1, shapes=2), shift=shift, minimum_area=4.0, objects_per_image=count
         )
-        scene = Scene(names, fields, NerfRenderer(termination=0.0), CAMERA, synthesizer, distribution)
+        scene = Scene(subjects, CAMERA, synthesizer, distribution)
         psi = torch.zeros(len(names), distribution.size, dtype=torch.float64)
         models = []
         for number, name in enumerate(names):

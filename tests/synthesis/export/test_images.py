@@ -62,14 +62,13 @@ def test_an_image_is_what_full_frames_of_its_layers_compose(boxes):
     for number in range(3):
         placed = source.drawn(number)
         frames = [
-            source.scene.renderer.render(
-                source.scene.fields[item.label], item.camera, item.camera_to_world[None].float()
-            )
-            for item in placed
+            source.scene.fields[item.label].maps(item.camera, item.camera_to_world[None]) for item in placed
         ]
         distance = torch.tensor([[float(o.draw.distance) * source.millimetres[o.label] for o in placed]])
         order = by_depth(distance, torch.tensor([[item.order for item in placed]]))[0]
-        rgb, opacity = (torch.stack([frames[i][part][0] for i in order.tolist()])[None] for part in (0, 1))
+        nearest = [frames[i] for i in order.tolist()]
+        rgb = torch.stack([maps.rgb[0] for maps in nearest])[None]
+        opacity = torch.stack([maps.opacity[0] for maps in nearest])[None]
         background = source.scene.synthesizer.background.draw(1, 48, 64, source.generator(number, "pixels"))
         wanted, visible = stacked(rgb, opacity, background)
         image = source.image(number)
@@ -135,9 +134,7 @@ def test_pixels_beyond_the_image_count_for_the_whole(boxes):
     )  # fmt: skip
     for item in cut:
         pose = item.placed
-        seen = wide.scene.renderer.render(
-            wide.scene.fields[pose.label], wide.camera, pose.camera_to_world[None].float()
-        )[1][0]
+        seen = wide.scene.fields[pose.label].maps(wide.camera, pose.camera_to_world[None]).opacity[0]
         mask = (seen > 0.5).numpy()
         assert item.pixels == mask.sum()
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))

@@ -27,7 +27,8 @@ from neural_sim.studies.stress.subjects import block, small_detector
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.draws import HardDraws
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 FLOOR, MAX_STEP = 0.005, 0.5
@@ -192,14 +193,8 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
     generator = scope.generator()
     camera = PinholeCamera(32, 32, math.radians(40.0))
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
-    scene = Scene(
-        ("x",),
-        (block(30.0, half=0.5, cells=4),),
-        NerfRenderer(),
-        camera,
-        synthesizer,
-        SceneDistribution.of([Pose(bins=4)]),
-    )
+    subject = FieldSubject("x", block(30.0, half=0.5, cells=4), NerfRenderer())
+    scene = Scene((subject,), camera, synthesizer, SceneDistribution.of([Pose(bins=4)]))
     network = small_detector(1)
     psi = torch.zeros(1, 4)
     validation = scene.training_set(psi, 2, generator).images

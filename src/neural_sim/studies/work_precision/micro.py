@@ -21,7 +21,8 @@ from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.hvp import Term
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.scene import Scene
-from neural_sim.synthesis.training_set import Synthesizer
+from neural_sim.synthesis.subjects import FieldSubject
+from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import LabelledImages, PinholeCamera
 
 BINS = 4
@@ -43,7 +44,8 @@ def small_scene() -> Scene:
     camera = PinholeCamera(SIZE, SIZE, math.radians(40.0))
     synthesizer = Synthesizer(ProceduralClutter(), shift=0.1)
     distribution = SceneDistribution.of([Pose(bins=BINS)])
-    return Scene(("a", "b"), (block(1), block(2)), NerfRenderer(), camera, synthesizer, distribution)
+    subjects = tuple(FieldSubject(name, block(seed), NerfRenderer()) for name, seed in (("a", 1), ("b", 2)))
+    return Scene(subjects, camera, synthesizer, distribution)
 
 
 def trained_problem(make: Callable[..., Detector], images: int = 40) -> tuple[InnerProblem, list[Term]]:

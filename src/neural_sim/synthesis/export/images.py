@@ -101,8 +101,7 @@ class ImageSource:
             if label < 0:
                 continue
             draw = scene.distribution.hard(self.psi[label].double(), noise)
-            if scene.radii is not None:
-                draw = replace(draw, distance=draw.distance / scene.radii[label])
+            draw = replace(draw, distance=draw.distance / scene.radii[label])
             own = camera if draw.magnification is None else magnified(camera, float(draw.magnification))
             pose = turned(own, orbit(draw.phi, draw.rho, draw.distance)[0], (shift[0], shift[1]))
             placed.append(DrawnObject(label, draw, (shift[0], shift[1]), own, pose, order))
@@ -112,7 +111,7 @@ class ImageSource:
     def image(self, number: int) -> ExportImage:
         """The image of that number."""
         height, width, placed = self.camera.height, self.camera.width, self.drawn(number)
-        device = self.scene.device(0)
+        device = self.scene.device
         layers = [self._layer(item) for item in placed]
         generator, synthesizer = self.generator(number, "pixels"), self.scene.synthesizer
         covers = synthesizer.distractors.draw(1, height, width, generator, device)
@@ -148,15 +147,11 @@ class ImageSource:
 
     def _layer(self, item: DrawnObject) -> Layer:
         """One object alone, on the part of the plane that it may reach."""
-        scene, field = self.scene, self.scene.fields[item.label]
-        left, top, right, bottom = reach_on_image(item.camera, item.camera_to_world, field.reach)
+        subject = self.scene.fields[item.label]
+        left, top, right, bottom = reach_on_image(item.camera, item.camera_to_world, subject.field.reach)
         camera = cropped(item.camera, left, top, max(right - left, 1), max(bottom - top, 1))
-        pose = item.camera_to_world[None].to(scene.device(item.label), scene.dtype(item.label))
-        if item.draw.weights is None:
-            maps = scene.renderer.render_surface(field, camera, pose)
-        else:
-            maps = scene.lit_renderer.render_surface(field, camera, pose, weights=item.draw.weights)
-        rgb, opacity, depth = (part[0].float() for part in maps)
+        maps, depth = subject.surface(camera, item.camera_to_world[None], item.draw.weights)
+        rgb, opacity, depth = (part[0].float() for part in (maps.rgb, maps.opacity, depth))
         return Layer(left, top, rgb, opacity, depth)
 
     def _shown(self, item: DrawnObject, layer: Layer, full: Tensor, visible: Tensor) -> ShownObject:

@@ -26,9 +26,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Nuisance:
-    """What varies between images and is never learned. ``shifts`` are (right, down) in pixels, on the CPU, one for each
-    object in an image; ``sensor`` is what the camera does to it (None: nothing); ``front`` is what hides the objects
-    (None: nothing).
+    """What varies between images and is never learned.
+
+    ``shifts`` are (right, down) in pixels, on the CPU, one for each object in an image; ``sensor`` is what the camera
+    does to it (None: nothing); ``front`` is what hides the objects (None: nothing).
     """
 
     backgrounds: Float[Tensor, "n 3 h w"]
@@ -40,6 +41,7 @@ class Nuisance:
         return self.backgrounds.shape[0]
 
     def select(self, index: Tensor | slice) -> Nuisance:
+        """Return those of some images."""
         sensor = None if self.sensor is None else self.sensor.select(index)
         front = None if self.front is None else self.front.select(index)
         return Nuisance(self.backgrounds[index], self.shifts[index], sensor, front)
@@ -98,8 +100,14 @@ class Synthesizer:
         device: torch.device | str = "cpu",
         objects: int | None = None,
     ) -> Nuisance:
-        """Backgrounds, on ``device``, and shifts of n images; independent of the scene parameters. ``objects`` is the
-        number of shifts of each image, None for one shift without that axis.
+        """Draw what varies between n images, independently of the scene parameters.
+
+        Args:
+            n: number of images.
+            camera: their camera.
+            generator: source of randomness.
+            device: device of backgrounds and covers.
+            objects: number of shifts of each image; None for one shift without that axis.
         """
         height, width = camera.height, camera.width
         backgrounds = self.background.draw(n, height, width, generator, device)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.training_set import Nuisance, Synthesizer, images_without_boxes
+from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer, images_without_boxes
 from neural_sim.types import PinholeCamera
 
 CAMERA = PinholeCamera(10, 8, 0.7)
