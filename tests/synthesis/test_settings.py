@@ -4,11 +4,11 @@ import math
 from functools import partial
 
 import pytest
-from neural_sim.synthesis.training_set import Synthesizer
 
 from neural_sim.synthesis.background import ProceduralClutter
 from neural_sim.synthesis.distractors import Distractors
 from neural_sim.synthesis.sensor import Sensor
+from neural_sim.synthesis.synthesizer import Synthesizer
 
 CLUTTERED = partial(Synthesizer, ProceduralClutter())
 CASES = [
