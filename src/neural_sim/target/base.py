@@ -18,7 +18,6 @@ from neural_sim.objects.files import content_digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.ranges import NonNegative, PositiveInt
-from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.subjects import RenderedSubject
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.classes import Unmatched
@@ -56,7 +55,6 @@ class Target(ABC):
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
-        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         """Read or render the parts. The same arguments give the same images.
 
@@ -66,7 +64,6 @@ class Target(ABC):
             camera: says the size of the images; a target that renders takes all of it.
             synthesizer: composes rendered views with backgrounds, as it does for training images.
             seed: of all random choices.
-            rig: the lights of rendered images; None: the renderer's own.
 
         Returns:
             ``val``, ``test`` and, if the target :attr:`trains`, ``train``; float32 on the CPU. They share no image.
@@ -188,7 +185,6 @@ class AnnotatedPhotographs(Photographs):
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
-        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         photographs, generator = self.photographs(list(objects), distribution), stream(seed, "target parts")
         images, placings = read(photographs, camera.height, camera.width, self.minimum_side, self.source)

@@ -18,7 +18,6 @@ from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.ranges import Fraction, PositiveInt
-from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.subjects import RenderedSubject
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Photographs
@@ -178,7 +177,6 @@ class PosedTarget(Photographs):
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
-        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         radii = {name: item.radius for name, item in objects.items()}
         size, names, made = (camera.height, camera.width), list(objects), {}

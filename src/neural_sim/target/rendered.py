@@ -12,7 +12,6 @@ from typing_extensions import override
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
-from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.layout import draw_layout, own_labels
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import RenderedSubject
@@ -54,7 +53,6 @@ class RenderedTarget(Target):
         camera: PinholeCamera,
         synthesizer: Synthesizer,
         seed: int,
-        rig: LightRig | None = None,
     ) -> dict[str, LabelledImages]:
         biased, target = set(distribution.biased), distribution.psi("target", list(objects)).float()
         scene = Scene(tuple(objects.values()), camera, synthesizer, distribution)
