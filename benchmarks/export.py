@@ -25,9 +25,8 @@ from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.report.provenance import machine
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.export.dataset import ImageWriter
+from neural_sim.synthesis.export.dataset import ImageWriter, each
 from neural_sim.synthesis.export.images import ImageSource
-from neural_sim.synthesis.export.workers import each
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject
 from neural_sim.synthesis.synthesizer import Synthesizer

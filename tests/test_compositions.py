@@ -11,9 +11,9 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
 from neural_sim.outer.inner import pooled
+from neural_sim.parameter.product import HardDraws
 from neural_sim.parameter.update import SGD, Mirror
 from neural_sim.stages.graph import Graph
-from neural_sim.synthesis.draws import HardDraws
 
 CONF = conf_directory()
 BASELINES = sorted(path.stem for path in (CONF / "baseline").glob("*.yaml"))

@@ -5,7 +5,7 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
-from neural_sim.synthesis.draws import RelaxedDraws
+from neural_sim.parameter.product import RelaxedDraws
 
 
 def experiment(*overrides):

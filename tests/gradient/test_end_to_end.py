@@ -14,7 +14,7 @@ from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import image_cotangents, scores
 from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents, psi_contributions
 from neural_sim.outer.binding import rendered_path
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import RelaxedDraws, SceneDistribution
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.renderer.nerf import NerfRenderer
@@ -25,7 +25,6 @@ from neural_sim.solver.damping import FixedDamping, LanczosDamping
 from neural_sim.solver.hvp import HessianOperator, gradient
 from neural_sim.solver.minres import MinimumResidual
 from neural_sim.solver.operator import Shifted, flatten, unflatten
-from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import moved_by
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject

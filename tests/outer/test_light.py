@@ -23,12 +23,11 @@ from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.draws import HARD
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject
 from neural_sim.synthesis.synthesizer import Synthesizer

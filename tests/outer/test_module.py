@@ -16,10 +16,9 @@ from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.outer.binding import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HardDraws, RelaxedDraws, SceneDistribution
 from neural_sim.parameter.update import Mirror
 from neural_sim.parameter.zoom import Zoom
-from neural_sim.synthesis.draws import HardDraws, RelaxedDraws
 from neural_sim.synthesis.pool import pool_of
 from neural_sim.types import PinholeCamera
 

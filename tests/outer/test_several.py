@@ -10,9 +10,8 @@ from neural_sim.gradient.base import Losses, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.outer.binding import object_images
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD
 from neural_sim.synthesis.synthesizer import Synthesizer
 
 DOUBLE = torch.float64

@@ -12,12 +12,11 @@ from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimat
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.settings import Trust
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, SceneDistribution
 from neural_sim.parameter.zoom import Zoom
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import FixedDamping
-from neural_sim.synthesis.draws import HARD
 
 PROXIMAL = 20.0  # past the negative curvature of an untrained detector
 NOTHING_WILL_DO = Trust(max_stationarity=0.0)

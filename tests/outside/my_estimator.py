@@ -6,7 +6,7 @@ import torch
 
 from neural_sim.gradient.base import from_contributions
 from neural_sim.gradient.mixed import scores
-from neural_sim.synthesis.draws import HardDraws
+from neural_sim.parameter.product import HardDraws
 
 
 @dataclass(frozen=True)

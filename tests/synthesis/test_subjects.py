@@ -9,11 +9,10 @@ import torch
 from neural_sim.cameras import orbit
 from neural_sim.field.grid import GridField
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import RelaxedDraws, SceneDistribution
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.pictures import PictureSubject
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import (

@@ -23,8 +23,8 @@ from neural_sim.gradient.mixed import ThetaMode, scores
 from neural_sim.gradient.significance import no_association, no_difference
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import BinnedFactor, Factor
+from neural_sim.parameter.product import Draws, HardDraws
 from neural_sim.ranges import PositiveInt, validated
-from neural_sim.synthesis.draws import Draws, HardDraws
 
 LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 

@@ -34,8 +34,8 @@ from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.significance import zero_mean
 from neural_sim.gradient.unrolled import Wanted
 from neural_sim.parameter.factor import COORDINATES
+from neural_sim.parameter.product import RelaxedDraws
 from neural_sim.ranges import PositiveInt, validated
-from neural_sim.synthesis.draws import RelaxedDraws
 from neural_sim.synthesis.motion import RIGID, moved_by, number_of
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 

@@ -21,10 +21,9 @@ from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, Draws, HardDraws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.synthesis.assembly import RenderedImages
-from neural_sim.synthesis.draws import HARD, Draws, HardDraws
 from neural_sim.synthesis.pool import pool_of
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages

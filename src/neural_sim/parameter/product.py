@@ -321,6 +321,44 @@ class SceneDistribution:
         )
 
 
+@dataclass(frozen=True)
+class RelaxedDraws:
+    """Draws that depend smoothly on psi, for the pathwise estimator.
+
+    ``tangents``: also render the maps' derivatives by the numbers that depend on psi.
+    """
+
+    tangents: bool = False
+
+    def noise(
+        self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
+    ) -> SceneNoise:
+        """Return the randomness of ``count`` draws of one object."""
+        return distribution.draw_noise(count, generator, dtype)
+
+
+@dataclass(frozen=True)
+class HardDraws:
+    """Exact samples of p_psi, balanced over the bins.
+
+    ``explore``: independent samples, and lights around psi's, for estimators that need the draws' joint density.
+    """
+
+    explore: bool = False
+
+    def noise(
+        self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
+    ) -> SceneNoise:
+        """Return the randomness of ``count`` draws of one object."""
+        return distribution.draw_noise(
+            count, generator, dtype, explore=self.explore, balanced=not self.explore
+        )
+
+
+Draws = HardDraws | RelaxedDraws
+HARD = HardDraws()
+
+
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
     """Join bins as columns of one table, [n, 0] without factors."""
     return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)

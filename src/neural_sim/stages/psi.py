@@ -21,13 +21,12 @@ from neural_sim.outer.records import IterationRecord, LearnedPsi, record_of
 from neural_sim.outer.response import ResponseLoop
 from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import Draws, HardDraws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
-from neural_sim.synthesis.draws import Draws, HardDraws
 
 Method = Fixed | HypergradientLoop | Response | RewardMethod
 

@@ -20,12 +20,12 @@ from neural_sim.documents import markdown_table
 from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
 from neural_sim.outer.binding import image_losses, rendered_path
+from neural_sim.parameter.product import HARD
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run
 from neural_sim.stages.stage import Stage
 from neural_sim.studies.frozen import FrozenLoop
 from neural_sim.synthesis.assembly import RenderedObject, one_each
-from neural_sim.synthesis.draws import HARD
 from neural_sim.tasks.context import Context, Task
 from neural_sim.types import Maps
 

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.parameter.product import SceneNoise
-from neural_sim.synthesis.draws import RelaxedDraws
+from neural_sim.parameter.product import RelaxedDraws, SceneNoise
 from neural_sim.synthesis.layout import Layout
 from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, SceneDraw

@@ -1,9 +1,9 @@
-"""Objects over backgrounds, and shifts within the image. Plain tensor algebra, differentiable any number of times."""
+"""Objects over backgrounds: shifts, layers in front of each other, and boxes of what stays visible."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -46,3 +46,75 @@ def apply_shift(image: Float[Tensor, "n h w *c"], shift: Int[Tensor, "n 2"]) -> 
     moved = pixels.gather(1, source.reshape(n, -1, 1).expand(-1, -1, pixels.shape[-1]))
     # where, not a product: a NaN at the image's edge must not enter from outside.
     return torch.where(inside.reshape(n, -1, 1), moved, 0.0).reshape(image.shape)
+
+
+def stacked(
+    rgb: Float[Tensor, "n layers h w 3"],
+    opacity: Float[Tensor, "n layers h w"],
+    background: Float[Tensor, "n 3 h w"],
+) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n layers h w"]]:
+    """Composite layers, the nearest first, over a background; ``rgb`` is premultiplied by ``opacity``.
+
+    Each object lies in a plane of its own: the nearer hides the farther, whole objects at a time.
+
+    Returns:
+        The images, and how much of each layer's opacity is visible: ``T_l o_l`` with ``T_l`` the product of ``1 - o``
+        of the layers before.
+    """
+    clear = torch.ones_like(opacity[:, :1])
+    before = torch.cat([clear, (1.0 - opacity).cumprod(1)], 1)
+    in_front, through = before[:, :-1], before[:, -1]
+    image = (in_front[..., None] * rgb).sum(1).movedim(-1, 1) + through[:, None] * background
+    return image, in_front * opacity
+
+
+def by_depth(
+    distance: Float[Tensor, "n layers"], order: Float[Tensor, "n layers"]
+) -> Int[Tensor, "n layers"]:
+    """Return the indices of the layers, the nearest first; among equal distances by ``order``."""
+    first = order.argsort(dim=1, stable=True)
+    return first.gather(1, distance.gather(1, first).argsort(dim=1, stable=True))
+
+
+def visible_boxes(
+    opacity: Float[Tensor, "n layers h w"],
+    visible: Float[Tensor, "n layers h w"],
+    threshold: float,
+    minimum_area: float,
+    min_visibility: float,
+) -> tuple[Float[Tensor, "n layers 4"], Bool[Tensor, "n layers"]]:
+    """Return the box round each layer's visible pixels, and whether it has one.
+
+    Fewer than ``minimum_area`` visible pixels, or a smaller part than ``min_visibility`` of those that the image would
+    show of the object alone, have none.
+    """
+    n, layers = opacity.shape[:2]
+    boxes, present = boxes_from_opacity(visible.flatten(0, 1), threshold, minimum_area)
+    alone, left = ((part > threshold).sum((-1, -2)) for part in (opacity, visible))
+    present = present.view(n, layers) & (left >= min_visibility * alone)
+    return boxes.view(n, layers, 4) * present[..., None], present
+
+
+def boxes_from_opacity(
+    opacity: Float[Tensor, "n h w"], threshold: float = 0.5, minimum_area: float = 1.0
+) -> tuple[Float[Tensor, "n 1 4"], Bool[Tensor, "n"]]:
+    """Return the tight box (x0, y0, x1, y1) round pixels of opacity above ``threshold``, and whether there is one.
+
+    Boxes run along pixel edges, so a single pixel gives a box of 1 x 1. An image whose mask has fewer than
+    ``minimum_area`` pixels (or none) has no box: zeros and False. No derivative passes through.
+    """
+    if opacity.ndim != 3:
+        raise ValueError(f"boxes_from_opacity: want opacity [n, h, w], got shape {tuple(opacity.shape)}")
+    mask = opacity.detach() > threshold
+    present = mask.sum((1, 2)) >= max(minimum_area, 1)
+    x0, x1 = _span(mask.any(1))
+    y0, y1 = _span(mask.any(2))
+    boxes = torch.stack([x0, y0, x1, y1], -1).to(opacity.dtype) * present[:, None]
+    return boxes[:, None], present
+
+
+def _span(occupied: Bool[Tensor, "n s"]) -> tuple[Tensor, Tensor]:
+    """First occupied index, and one past the last."""
+    first = occupied.int().argmax(-1)
+    last = occupied.shape[-1] - occupied.flip(-1).int().argmax(-1)
+    return first, last

@@ -11,9 +11,8 @@ from torch.nn.functional import pad
 from torchvision.transforms.v2.functional import resize
 
 from neural_sim.alpha import premultiplied
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, Draws, RelaxedDraws, SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD, Draws, RelaxedDraws
 from neural_sim.synthesis.subjects import not_differentiable
 from neural_sim.types import PinholeCamera, PosedViews, SceneDraw
 

@@ -15,9 +15,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from neural_sim.parameter.factor import BinnedFactor
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, Draws, HardDraws, SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD, Draws, HardDraws
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import PinholeCamera, SceneDraw
 

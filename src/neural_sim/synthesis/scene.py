@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HARD, Draws, SceneDistribution
 from neural_sim.renderer.nerf import Quality
 from neural_sim.synthesis.assembly import RenderedImages, RenderedObject, Shared, one_each
-from neural_sim.synthesis.draws import HARD, Draws
 from neural_sim.synthesis.layout import Layout, draw_layout, own_labels
 from neural_sim.synthesis.subjects import FieldSubject, RenderedSubject, Subject
 from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer

@@ -17,13 +17,12 @@ from typing_extensions import override
 from neural_sim.alpha import premultiplied
 from neural_sim.cameras import cameras_of, orbit
 from neural_sim.field.base import RadianceField
-from neural_sim.parameter.product import SceneDistribution, SceneNoise
+from neural_sim.parameter.product import HARD, Draws, RelaxedDraws, SceneDistribution, SceneNoise
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.renderer.rig import LightRig
 from neural_sim.synthesis.assembly import RenderedObject
-from neural_sim.synthesis.draws import HARD, Draws, RelaxedDraws
 from neural_sim.synthesis.motion import light_names, moved_by, pose_rates
 from neural_sim.types import Maps, PinholeCamera, Rays, SceneDraw
 

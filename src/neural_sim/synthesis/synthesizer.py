@@ -13,10 +13,16 @@ from torch import Tensor
 
 from neural_sim.ranges import Ascending, Fraction, NonNegative, NonNegativeInt, PositiveInt, validated
 from neural_sim.synthesis.background import Background
-from neural_sim.synthesis.boxes import boxes_from_opacity
-from neural_sim.synthesis.compositing import apply_shift, composite, draw_shift
+from neural_sim.synthesis.compositing import (
+    apply_shift,
+    boxes_from_opacity,
+    by_depth,
+    composite,
+    draw_shift,
+    stacked,
+    visible_boxes,
+)
 from neural_sim.synthesis.distractors import Cover, Distractors
-from neural_sim.synthesis.layers import by_depth, stacked, visible_boxes
 from neural_sim.synthesis.layout import Layout, ObjectCount
 from neural_sim.synthesis.sensor import Sensor, SensorDraw, seen_by
 from neural_sim.types import LabelledImages, PinholeCamera

@@ -28,11 +28,9 @@ from neural_sim.stages.version import code_version
 from neural_sim.stages.views import Meshes, Objects
 from neural_sim.synthesis.export.bop import Model
 from neural_sim.synthesis.export.dataset import DataSet, Format, ImageFormat
-from neural_sim.synthesis.export.files import write_json, write_whole
-from neural_sim.synthesis.export.folder import ExportFolder
+from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, write_json, write_whole
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
-from neural_sim.synthesis.export.records import opencv_entry
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.tasks.context import Context, Task
 

@@ -13,11 +13,11 @@ from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.outer.inner import pooled
+from neural_sim.parameter.product import HardDraws
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.stages.account import Omission
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Stage
-from neural_sim.synthesis.draws import HardDraws
 from neural_sim.tasks.context import Context, Task
 from neural_sim.tasks.report import ReportTask
 

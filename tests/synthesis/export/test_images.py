@@ -10,8 +10,8 @@ from posed_scenes import directions, z_buffer
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
+from neural_sim.synthesis.compositing import by_depth, stacked
 from neural_sim.synthesis.export.images import ImageSource, reach_on_image
-from neural_sim.synthesis.layers import by_depth, stacked
 
 STEP, DEEP = 0.125 * 0.05, np.log(2.0) * 0.125 / 40.0  # conftest.py
 

@@ -29,7 +29,7 @@ from neural_sim.studies.stress.subjects import (
     rounding_of,
     small_detector,
 )
-from neural_sim.synthesis.boxes import boxes_from_opacity
+from neural_sim.synthesis.compositing import boxes_from_opacity
 from neural_sim.types import LabelledImages, PinholeCamera, Rays
 
 OPAQUE = 1e8

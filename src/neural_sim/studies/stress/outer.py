@@ -18,14 +18,13 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import OnUntrusted, Outer
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
-from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.product import HardDraws, SceneDistribution
 from neural_sim.parameter.update import SGD, Mirror, Update, UpdateState
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.studies.stress.cases import DOUBLE, Check, Checks, Scope, case, eps, not_finite
 from neural_sim.studies.stress.subjects import block, small_detector
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.draws import HardDraws
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject
 from neural_sim.synthesis.synthesizer import Synthesizer

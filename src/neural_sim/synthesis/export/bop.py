@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 from trimesh.exchange.ply import export_ply
 
-from neural_sim.synthesis.export.files import same_file, write_json, write_whole
+from neural_sim.synthesis.export.folder import same_file, write_json, write_whole
 from neural_sim.synthesis.export.images import ExportImage
 
 SPLIT = "bop/train"

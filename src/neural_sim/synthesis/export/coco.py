@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from PIL import Image
 
-from neural_sim.synthesis.export.files import write_json
+from neural_sim.synthesis.export.folder import write_json
 from neural_sim.types import LabelledImages
 
 

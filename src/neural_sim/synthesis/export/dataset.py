@@ -5,21 +5,25 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import multiprocessing
+import os
+import pickle
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
+import torch
 from PIL import Image
 
 from neural_sim.synthesis.export import bop
 from neural_sim.synthesis.export.coco import coco_document
-from neural_sim.synthesis.export.files import write_json, write_whole
-from neural_sim.synthesis.export.folder import ExportFolder
+from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, record_of, write_json, write_whole
 from neural_sim.synthesis.export.images import ImageSource
-from neural_sim.synthesis.export.records import opencv_entry, record_of
-from neural_sim.synthesis.export.workers import each
 from neural_sim.synthesis.export.yolo import write_yolo
 
 _log = logging.getLogger(__name__)
@@ -31,8 +35,9 @@ FORMATS: tuple[Format, ...] = get_args(Format)
 
 @dataclass(frozen=True)
 class ImageWriter:
-    """Writes an image with all files that are its own, and gives its record; ``scene_size`` and ``scale`` are those of
-    BOP, None where it is not asked for. The image itself comes last.
+    """Writes an image with all files that are its own, the image itself last, and returns its record.
+
+    ``scene_size`` and ``scale`` are those of BOP; ``scene_size`` is None where it is not asked for.
     """
 
     source: ImageSource
@@ -42,6 +47,7 @@ class ImageWriter:
     scale: float
 
     def __call__(self, number: int) -> dict[str, Any]:
+        """Write the image of that number."""
         image = self.source.image(number)
         if self.scene_size is not None:
             files = bop.image_files(image, number, self.scene_size, self.scale)
@@ -117,3 +123,57 @@ class DataSet:
             write_yolo(self.root, records, names)
         if "bop" in self.formats:
             bop.write_bop(self.root, records, self.models, self.scene_size, scale)
+
+
+T = TypeVar("T")
+_task: Callable[[int], Any] | None = None
+
+
+def each(task: Callable[[int], T], numbers: Sequence[int], workers: int) -> Generator[T, None, None]:
+    """``task`` of each number, in their order.
+
+    Every process computes with one thread of torch's, so that results do not depend on how many there are. ``workers``
+    is their number, 0: this process alone. The task, which they get once, must be picklable.
+    """
+    if workers == 0:
+        yield from _here(task, numbers)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(
+        min(workers, max(len(numbers), 1)), context, initializer=_start, initargs=(pickle.dumps(task),)
+    )
+    try:
+        yield from pool.map(_run, numbers)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for number in numbers:
+            yield task(number)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _start(pickled: bytes) -> None:
+    global _task
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _task = pickle.loads(pickled)
+
+
+def _end_with_parent() -> None:
+    """End this worker with its parent: it would wait for its next number forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def _run(number: int) -> Any:
+    if _task is None:
+        raise RuntimeError("a worker without a task")
+    return _task(number)

@@ -1,18 +1,25 @@
-"""The folder of an exported data set: what it is of, what is done already, and one process at a time in it."""
+"""The folder of an exported data set: what it is of, a record of each image, files that are whole or not there."""
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.synthesis.export.files import remove_parts, write_json, write_whole
-from neural_sim.synthesis.export.records import FILE, line_of, read_records
+from neural_sim.cameras import focal_lengths, principal_point
+from neural_sim.synthesis.export.images import ExportImage, ShownObject
+from neural_sim.synthesis.export.masks import box_of, run_lengths
+from neural_sim.types import PinholeCamera
 
 MANIFEST = "manifest.json"
+RECORDS = "records.jsonl"
+PART = ".part"
+"""Suffix of a file that is being written."""
 LONGEST = 60
 """Characters of a value in a message."""
 
@@ -26,7 +33,7 @@ class ExportFolder:
 
     @contextmanager
     def opened(self) -> Iterator[dict[int, dict[str, Any]]]:
-        """The records of the images that are there, in a folder that is ready for more.
+        """Yield the records of the images that are there, in a folder that is ready for more.
 
         Raises:
             ValueError: a folder of something else, or of images with another identity; the message names the first
@@ -41,7 +48,7 @@ class ExportFolder:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Remember an image whose files are written."""
-        path = self.root / FILE
+        path = self.root / RECORDS
         try:
             with path.open("a", encoding="utf-8") as stream:
                 stream.write(line_of(record))
@@ -49,10 +56,11 @@ class ExportFolder:
             raise ValueError(f"export.folder: {path} cannot be written: {error.strerror or error}") from error
 
     def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
-        """The manifest with every image: its file and hash, and its objects' parameters and poses. The records get in
-        order, which they are not where an image was made again.
+        """Write the manifest: every image's file and hash, and its objects' parameters and poses.
+
+        The records are put in order, which they are not in where an image was made again.
         """
-        write_whole(self.root / FILE, "".join(line_of(record) for record in records))
+        write_whole(self.root / RECORDS, "".join(line_of(record) for record in records))
         images = [
             {
                 **{key: record[key] for key in ("number", "file", "sha256", "camera")},
@@ -66,7 +74,7 @@ class ExportFolder:
         write_json(self.root / MANIFEST, {"identity": dict(self.identity), "images": images})
 
     def check(self) -> None:
-        """Raises what :meth:`opened` raises, and writes nothing."""
+        """Raise what :meth:`opened` raises, and write nothing."""
         path = self.root / MANIFEST
         if self.root.exists() and not self.root.is_dir():
             raise ValueError(f"export.folder: {self.root} is a file, want a folder")
@@ -92,7 +100,7 @@ class ExportFolder:
 
 
 def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
-    """The first key, with dots, at which two JSON trees differ, and both values, shortened; None for equal trees."""
+    """Return the first key, with dots, at which two JSON trees differ, and both values, shortened; None if equal."""
     if isinstance(before, dict) and isinstance(now, dict):
         for name in [*before, *(name for name in now if name not in before)]:
             inner = f"{key}.{name}" if key else name
@@ -106,3 +114,153 @@ def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, st
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def record_of(
+    image: ExportImage, camera: PinholeCamera, number: int, file: str, digest: str
+) -> dict[str, Any]:
+    """Return an image's record, from which annotation files of any format are assembled.
+
+    Boxes are (x, y, width, height) in pixels along pixel edges; null where there is none.
+
+    ``camera`` is in OpenCV's convention: (0, 0) is the centre of the upper left pixel. ``digest`` is the SHA-256 of the
+    file's bytes.
+    """
+    shown = image.objects[0].placed.camera if image.objects else camera
+    return {
+        "number": number,
+        "file": file,
+        "sha256": digest,
+        "camera": opencv_entry(shown),
+        "objects": [_object(item, image) for item in image.objects],
+    }
+
+
+def opencv_entry(camera: PinholeCamera) -> dict[str, float]:
+    """Width, height and OpenCV's camera matrix in pixels."""
+    (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
+    size = {"width": camera.width, "height": camera.height}
+    return size | {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5}
+
+
+def _object(item: ShownObject, image: ExportImage) -> dict[str, Any]:
+    placed, draw = item.placed, item.placed.draw
+    visible = int(item.visible.sum())
+    numbers = {name: getattr(draw, name) for name in ("phi", "rho", "distance", "magnification", "weights")}
+    pose = {name: value[0].tolist() for name, value in numbers.items() if value is not None}
+    return {
+        "label": placed.label,
+        "labelled": item.labelled,
+        "visibility": visible / item.pixels if item.pixels else 0.0,
+        "pixels": {
+            "all": item.pixels,
+            "inside": int(item.full.sum()),
+            "valid": int((image.depth[item.full] > 0.0).sum()),
+            "visible": visible,
+        },
+        "box_visible": _sized(box_of(item.visible)),
+        "box_full": _sized(item.box),
+        "mask_visible": run_lengths(item.visible),
+        "mask_full": run_lengths(item.full),
+        "pose": {
+            **pose,
+            "bins": draw.bins[0].tolist(),
+            "shift": list(placed.shift),
+            "camera_to_world": placed.camera_to_world.tolist(),
+        },
+    }
+
+
+def _sized(box: tuple[int, int, int, int] | None) -> list[int] | None:
+    return None if box is None else [box[0], box[1], box[2] - box[0], box[3] - box[1]]
+
+
+def read_records(folder: Path) -> dict[int, dict[str, Any]]:
+    """Read the records of a folder by number, of images whose files are there.
+
+    A line that a killed process left unfinished is no record; the file is rewritten without such lines.
+
+    Raises:
+        ValueError: a file that cannot be read.
+    """
+    path = folder / RECORDS
+    if not path.is_file():
+        return {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"export.folder: {path} cannot be read ({error}); want the file as it was written"
+        ) from error
+    found = {}
+    for record in _parsed(lines):
+        if (folder / record["file"]).is_file():
+            found[record["number"]] = record
+    if len(found) < len(lines):
+        write_whole(path, "".join(line_of(record) for record in found.values()))
+    return found
+
+
+def line_of(record: Mapping[str, Any]) -> str:
+    """Return a record's line of the file."""
+    return json.dumps(record, allow_nan=False) + "\n"
+
+
+def _parsed(lines: list[str]) -> Iterator[dict[str, Any]]:
+    for line in lines:
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(record, dict) and {"number", "file", "objects"} <= record.keys():
+            yield record
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Write a file, with its folder, at once.
+
+    Raises:
+        ValueError: the system does not let it be written, with the file and the reason.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    part = path.with_name(f".{path.name}{PART}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(data)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise ValueError(f"export.folder: {path} cannot be written: {error.strerror or error}") from error
+
+
+def write_json(path: Path, document: Any, indent: int | None = None) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_whole(path, json.dumps(document, allow_nan=False, indent=indent) + "\n")
+
+
+def same_file(source: Path, path: Path) -> None:
+    """``path`` as another name of ``source``; as a copy where the file system has no such names."""
+    if path.exists():
+        return
+    part = path.with_name(f".{path.name}{PART}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.unlink(missing_ok=True)
+            try:
+                os.link(source, part)
+            except OSError:
+                shutil.copyfile(source, part)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise ValueError(f"export.folder: {path} cannot be written: {error.strerror or error}") from error
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what a killed process left unfinished."""
+    for path in folder.rglob(f".*{PART}"):
+        path.unlink(missing_ok=True)

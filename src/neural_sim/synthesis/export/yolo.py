@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neural_sim.synthesis.export.files import same_file, write_whole
+from neural_sim.synthesis.export.folder import same_file, write_whole
 from neural_sim.synthesis.export.masks import mask_of, polygon
 
 DATA = "dataset.yaml"
