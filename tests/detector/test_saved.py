@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import json
+import os
+import stat
 import sys
 from pathlib import Path
 
@@ -153,6 +155,26 @@ def test_a_document_is_refused_with_file_and_key(keys, value, message, folder):
     with pytest.raises(ValueError, match=message) as caught:
         SavedDetector.load(folder)
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_parameters_of_which_one_bit_has_flipped_are_refused(folder):
+    content = bytearray((folder / WEIGHTS).read_bytes())
+    content[-5] ^= 1
+    (folder / WEIGHTS).write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"is not the file that .*model\.json describes \(weights\.sha256 differs"
+    ):
+        SavedDetector.load(folder)
+
+
+def test_both_files_have_the_permissions_of_new_files(folder, tmp_path):
+    saved, before = SavedDetector.load(folder), os.umask(0o027)
+    try:
+        saved.save(tmp_path / "saved")
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "saved").iterdir()}
+    assert modes == {WEIGHTS: 0o640, DOCUMENT: 0o640}
 
 
 def test_files_that_are_missing_or_broken_are_refused(folder, tmp_path):

@@ -1,14 +1,19 @@
 """The store finds what was made, makes what was not, survives damage, and lets one process make at a time."""
 
+import hashlib
+import io
 import multiprocessing
 import os
 import signal
+import stat
 import time
+from pathlib import Path
+from random import Random
 
 import pytest
 import torch
 
-from neural_sim.stages.store import Store
+from neural_sim.stages.store import Store, _header
 
 
 def fetch(store, make, key="a"):
@@ -30,13 +35,124 @@ def test_made_once_then_found(tmp_path):
     assert len(calls) == 2
 
 
-@pytest.mark.parametrize("damage", [b"half written", b"", b"\x80\x04N."])
-def test_a_damaged_entry_is_made_again(tmp_path, caplog, damage):
+def _saved(content):
+    file = io.BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+def _summed(content):
+    """An entry whose hash fits, of other content."""
+    payload = _saved(content)
+    return _header(hashlib.sha256(payload).hexdigest(), len(payload)) + payload
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (b"half written", "no sum"),
+        (b"", "no sum"),
+        (b"\x80\x04N.", "no sum"),
+        (_saved({"value": 1, "seconds": 1.0}), "no sum of its content, as entries of older versions"),
+        (_summed([1]), "holds a list"),
+        (_summed(3.0), "holds a float"),
+        (_summed(torch.zeros(2)), "holds a Tensor"),
+        (_summed({"value": 1}), "holds a dict, want value and seconds"),
+        (_summed({"value": Path("a"), "seconds": 1.0}), "holds other than tensors"),
+        (_header(hashlib.sha256(b"").hexdigest(), 0), "cannot be read"),
+    ],
+)
+def test_a_damaged_entry_is_set_aside_and_made_again(tmp_path, caplog, damage, why):
     store = Store(tmp_path)
     fetch(store, lambda: 1)
-    (tmp_path / "field" / "a.pt").write_bytes(damage)
+    path = tmp_path / "field" / "a.pt"
+    path.write_bytes(damage)
     assert fetch(store, lambda: 2).value == 2
-    assert "made again" in caplog.text
+    assert fetch(store, lambda: 3).value == 2
+    assert path.with_name("a.damaged").read_bytes() == damage
+    (record,) = caplog.records
+    assert record.levelname == "WARNING" and "\n" not in record.getMessage()
+    assert why in record.getMessage() and "made again" in record.getMessage()
+
+
+def test_a_folder_in_the_place_of_an_entry_is_set_aside(tmp_path):
+    (tmp_path / "field" / "a.pt").mkdir(parents=True)
+    assert fetch(Store(tmp_path), lambda: 2).value == 2
+    assert (tmp_path / "field" / "a.damaged").is_dir()
+
+
+SHAPES = {
+    "tensors": {
+        "field": {"kind": "grid", "state": {"w": torch.linspace(0, 1, 300)}},
+        "history": [{"psnr": 1.5}],
+    },
+    "images": torch.arange(768, dtype=torch.uint8).reshape(1, 3, 16, 16),
+    "list": [torch.ones(3), "names", None, 2],
+    "number": 0.25,
+    "text": "one",
+    "mapping": {"ap": [0.5, 0.25], "labels": torch.tensor([1, 2])},
+}
+
+
+def _flip(content, random):
+    place, bit = random.randrange(len(content)), random.randrange(8)
+    return content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+
+
+def _truncate(content, random):
+    return content[: random.randrange(len(content))]
+
+
+def _append(content, random):
+    return content + random.randbytes(random.randrange(1, 9))
+
+
+def _clear(content, random):
+    place, size = random.randrange(len(content) - 64), random.randrange(64, 512)
+    return content[:place] + b"\0" * len(content[place : place + size]) + content[place + size :]
+
+
+@pytest.mark.parametrize(("change", "times"), [(_flip, 300), (_truncate, 100), (_append, 20), (_clear, 100)])
+def test_no_damage_is_used(tmp_path, caplog, change, times):
+    store, random = Store(tmp_path), Random(0)
+    for key, value in SHAPES.items():
+        fetch(store, lambda value=value: value, key)
+    whole = {key: (tmp_path / "field" / f"{key}.pt").read_bytes() for key in SHAPES}
+    damaged = 0
+    for _ in range(times):
+        key = random.choice(list(SHAPES))
+        path = tmp_path / "field" / f"{key}.pt"
+        content = change(whole[key], random)
+        damaged += content != whole[key]  # a block may have been zero before
+        path.write_bytes(content)
+        assert fetch(store, lambda: "again", key).reused == (content == whole[key])
+        assert len(caplog.records) == damaged
+    assert damaged > 0.9 * times
+
+
+def test_what_killed_runs_left_is_removed_where_no_run_writes(tmp_path, other):
+    folder = tmp_path / "field"
+    other(tmp_path, 600, "c")
+    for name in (".a.pt.x1y2", ".a.json.x1y2", ".b.pt.x1y2", ".c.pt.x1y2", ".c.json.x1y2"):
+        (folder / name).write_bytes(b"half")
+    fetch(Store(tmp_path), lambda: 1)
+    assert {path.name for path in folder.glob(".*")} == {".c.pt.x1y2", ".c.json.x1y2"}
+
+
+def test_entries_have_the_permissions_of_new_files(tmp_path):
+    before = os.umask(0o007)
+    try:
+        fetch(Store(tmp_path), lambda: 1)
+    finally:
+        os.umask(before)
+    modes = {path.suffix: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "field").iterdir()}
+    assert modes == {".pt": 0o660, ".json": 0o660, ".lock": 0o660}
+
+
+def test_a_store_that_cannot_be_written_is_a_users_error(tmp_path):
+    (tmp_path / "field").write_text("a file")
+    with pytest.raises(ValueError, match=r"paths\.store: .*field.* cannot be written"):
+        fetch(Store(tmp_path), lambda: 1)
 
 
 def test_a_failed_make_leaves_nothing_and_frees_the_lock(tmp_path):
@@ -46,14 +162,14 @@ def test_a_failed_make_leaves_nothing_and_frees_the_lock(tmp_path):
     assert fetch(Store(tmp_path), lambda: 3).value == 3
 
 
-def _slow(folder, begun, seconds):
+def _slow(folder, begun, seconds, key):
     def make():
         (folder / f"made by {os.getpid()}").touch()
         begun.set()
         time.sleep(seconds)
         return os.getpid()
 
-    fetch(Store(folder), make)
+    fetch(Store(folder), make, key)
 
 
 @pytest.fixture
@@ -61,9 +177,9 @@ def other():
     """A process that makes an entry, begun when the test goes on."""
     context, processes = multiprocessing.get_context("fork"), []
 
-    def start(folder, seconds):
+    def start(folder, seconds, key="a"):
         begun = context.Event()
-        processes.append(context.Process(target=_slow, args=(folder, begun, seconds)))
+        processes.append(context.Process(target=_slow, args=(folder, begun, seconds, key)))
         processes[-1].start()
         assert begun.wait(20)
         return processes[-1]

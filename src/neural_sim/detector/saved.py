@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from PIL import Image
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from neural_sim.detector.protocol import Detector, Parameters
@@ -81,14 +81,14 @@ class SavedDetector:
             "camera": None if self.camera is None else dataclasses.asdict(self.camera),
         }  # fmt: skip
         folder.mkdir(parents=True, exist_ok=True)
-        path, draft = folder / WEIGHTS, folder / f".{WEIGHTS}.part"
-        save_file({name: value.detach().cpu().contiguous() for name, value in self.params.items()}, draft)
-        os.replace(draft, path)
-        document["weights"] = {"file": WEIGHTS, "sha256": _sha256(path)}
-        draft = folder / f".{DOCUMENT}.part"
-        draft.write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
-        os.replace(draft, folder / DOCUMENT)
-        return path
+        weights = save({name: value.detach().cpu().contiguous() for name, value in self.params.items()})
+        document["weights"] = {"file": WEIGHTS, "sha256": hashlib.sha256(weights).hexdigest()}
+        text = json.dumps(document, indent=1, allow_nan=False)
+        for name, content in ((WEIGHTS, weights), (DOCUMENT, text.encode())):
+            draft = folder / f".{name}.part"
+            draft.write_bytes(content)  # by Python, so that it has the permissions that new files have
+            os.replace(draft, folder / name)
+        return folder / WEIGHTS
 
     @staticmethod
     def load(path: Path) -> SavedDetector:

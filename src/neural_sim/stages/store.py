@@ -3,27 +3,35 @@
 Entries are written to a temporary name and moved into place, so that a killed run leaves none half written. Computation
 is locked between processes: concurrent runs wait for a result that one of them is computing. A lock ends with its
 process.
+
+An entry is a line of text, which has the SHA-256 and the size of all that follows, and then what ``torch.save`` wrote.
+Both are checked whenever it is read: one that a disk or a copy has changed is set aside and made again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
 import pickle
-import tempfile
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
 _log = logging.getLogger(__name__)
+
+DAMAGED = ".damaged"
+"""Suffix, in the place of ``.pt``, of an entry that was not what had been written."""
+_HEADER = "neural-sim entry 1, sha256 {sha256:64}, bytes {size:20d}\n"
 
 
 @dataclass(frozen=True)
@@ -45,24 +53,33 @@ class Store:
         """Return the result ``key``, from the store or from ``make``.
 
         ``make`` returns tensors, numbers, strings and lists and dicts of these: all that is read back is read
-        with ``weights_only``, so that a shared store cannot run code. An unreadable entry is computed again, with
-        a warning.
+        with ``weights_only``, so that a shared store cannot run code. An entry that cannot be read, or that is not
+        what was written, is set aside and made again, with a warning.
+
+        Raises:
+            ValueError: a store that cannot be written to, with its path.
         """
         path = self._path(kind, key)
-        entry = _read(path)
-        if entry is not None:
-            return entry
-        path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(_Damage):  # looked at again under the lock
+            if (entry := _read(path)) is not None:
+                return entry
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path):
-            entry = _read(path)  # another process may have written it meanwhile
+            try:
+                entry = _read(path)  # another process may have written it meanwhile
+            except _Damage as damage:
+                _set_aside(path, damage)
+                entry = None
             if entry is not None:
                 return entry
+            _sweep(path)
             begin = time.perf_counter()
             value = make()
             seconds = time.perf_counter() - begin
             text = json.dumps(description, indent=1, sort_keys=True)
-            _write(path.with_suffix(".json"), lambda name: Path(name).write_text(text))
-            _write(path, lambda name: torch.save({"value": value, "seconds": seconds}, name))
+            _write(path.with_suffix(".json"), lambda file: file.write(text.encode()))
+            _write(path, lambda file: _save({"value": value, "seconds": seconds}, file))
         return Entry(value, seconds, reused=False)
 
     def has(self, kind: str, key: str) -> bool:
@@ -73,41 +90,112 @@ class Store:
         return self.root / kind / f"{key}.pt"
 
 
+class _Damage(Exception):
+    """A file that is not the entry that was written; its message says why."""
+
+
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Alone with an entry. The operating system frees the lock when its holder ends, however that ends."""
-    lock = FileLock(path.with_suffix(".lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        _log.info("store: waiting for another run, which is making %s", path)
-        lock.acquire()
+    lock = _lock(path)
+    with _writing(path):
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            _log.info("store: waiting for another run, which is making %s", path)
+            lock.acquire()
     try:
         yield
     finally:
         lock.release()
 
 
+def _lock(path: Path) -> FileLock:
+    return FileLock(path.with_suffix(".lock"))
+
+
 def _read(path: Path) -> Entry | None:
-    if not path.is_file():
-        return None
+    """Return an entry, None where there is none. Raises :class:`_Damage`."""
     try:
-        stored = torch.load(path, weights_only=True)
-        return Entry(stored["value"], stored["seconds"], reused=True)
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError) as error:
-        _log.warning("store: %s cannot be read (%s); it is made again", path, error)
+        with path.open("rb") as file:
+            header = file.readline(len(_header("", 0)))
+            if not header.startswith(_HEADER[:16].encode()):
+                raise _Damage("it has no sum of its content, as entries of older versions")
+            if header != _header(_sha256(file), file.tell() - len(header)):
+                raise _Damage("its content is not what its first line says")
+            file.seek(len(header))
+            stored = torch.load(file, weights_only=True)
+    except FileNotFoundError:
         return None
+    except pickle.UnpicklingError as error:  # its message advises to read with weights_only=False
+        raise _Damage("it holds other than tensors, numbers, strings, lists and mappings") from error
+    except (OSError, RuntimeError, EOFError, ValueError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise _Damage(f"it cannot be read: {reason}") from error
+    if not isinstance(stored, dict) or stored.keys() != {"value", "seconds"}:
+        raise _Damage(f"it holds a {type(stored).__name__}, want value and seconds")
+    return Entry(stored["value"], stored["seconds"], reused=True)
 
 
-def _write(path: Path, write: Callable[[str], object]) -> None:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
+def _save(content: Mapping[str, Any], file: BinaryIO) -> None:
+    begin = len(_header("", 0))
+    file.seek(begin)
+    torch.save(content, file)
+    size = file.tell() - begin
+    file.seek(begin)
+    sha256 = _sha256(file)
+    file.seek(0)
+    file.write(_header(sha256, size))
+
+
+def _header(sha256: str, size: int) -> bytes:
+    return _HEADER.format(sha256=sha256, size=size).encode()
+
+
+def _sha256(file: BinaryIO) -> str:
+    """Hash what follows, to the end of the file."""
+    return hashlib.file_digest(file, "sha256").hexdigest()  # pyright: ignore[reportArgumentType]
+
+
+def _set_aside(path: Path, damage: _Damage) -> None:
+    aside = path.with_suffix(DAMAGED)
+    with _writing(path):
+        os.replace(path, aside)
+    _log.warning("store: %s is damaged (%s); it is now %s and is made again", path, damage, aside.name)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed runs left half written in the folder of ``path``, whose lock is held."""
+    for kind in (".pt", ".json"):
+        for left in path.parent.glob(f".*{kind}.*"):
+            key = left.name[1:].rpartition(kind)[0]
+            if key == path.stem:
+                left.unlink(missing_ok=True)
+                continue
+            # Left alone: what another run is writing, and what another user owns.
+            with suppress(Timeout, OSError), _lock(path.with_name(f"{key}.pt")).acquire(timeout=0):
+                left.unlink()
+
+
+def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file, whole or not at all, with the permissions that new files have."""
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    with _writing(path):
+        try:
+            with draft.open("x+b") as file:
+                write(file)
+            os.replace(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Name the path where the system does not let it be written."""
     try:
-        write(name)
-        os.replace(name, path)
-    finally:
-        if os.path.exists(name):
-            os.unlink(name)
+        yield
+    except OSError as error:
+        raise ValueError(f"paths.store: {path} cannot be written: {error.strerror or error}") from error
 
 
 def to_bytes(images: Tensor) -> Tensor:
