@@ -6,17 +6,21 @@ device. Fields, images, features and targets live on the run's device; what leav
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
 from collections.abc import Callable, Sequence
 
 import torch
 from lightning.pytorch import Trainer
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.profiler import ProfilerActivity, profile
 
 # Read when the profiler first runs, which otherwise writes lines of its own to the screen.
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")
+# A line on SIGTERM, which `interruption` has said already.
+logging.getLogger("lightning.pytorch.trainer.connectors.signal_connector").setLevel(logging.WARNING)
 
 DEVICES = {"cpu": "cpu", "gpu": "cuda"}
 """torch's device type by ``trainer.accelerator``."""
@@ -62,12 +66,16 @@ class Resident(SingleDeviceStrategy):
 
 
 def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False) -> Trainer:
-    """A Trainer for modules that lie on ``device``, with everything off that writes files or talks."""
+    """A Trainer for modules that lie on ``device``, with everything off that writes files or talks.
+
+    It leaves signals to ``interruption``: under SLURM it would otherwise ignore SIGTERM and requeue the job itself.
+    """
     on_cpu = device.type == "cpu"
     return Trainer(
         accelerator=device.type,
         devices=1 if on_cpu else [device.index or 0],
         strategy="auto" if on_cpu else Resident(device),
+        plugins=[LightningEnvironment()],
         max_epochs=max_epochs,
         logger=False,
         enable_checkpointing=False,

@@ -1,6 +1,7 @@
 """The command line. The only module that reads a DictConfig: it turns each group into the object it names.
 
-User errors become one line and exit status 2; inside a sweep a failed job raises, so that the others go on.
+User errors become one line and exit status 2; inside a sweep a failed job raises, so that the others go on. SIGTERM and
+Ctrl-C end the command, a sweep too, see ``interruption``.
 Heavy imports happen inside functions, so that ``--help`` answers at once.
 """
 
@@ -33,6 +34,7 @@ from neural_sim.configuration import (
     own_folder,
     updated,
 )
+from neural_sim.interruption import interruptible
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, check
 
 if TYPE_CHECKING:
@@ -292,13 +294,14 @@ def _refuse(error: Exception) -> NoReturn:
 
 def main() -> None:
     """Entry point of ``neural-sim`` and ``python -m src.main``."""
-    try:
-        sys.argv[1:], notes = updated(sys.argv[1:])
-    except UserError as error:
-        _refuse(error)
-    for note in notes:
-        print(f"neural-sim: {note}", file=sys.stderr)
-    _task()
+    with interruptible():
+        try:
+            sys.argv[1:], notes = updated(sys.argv[1:])
+        except UserError as error:
+            _refuse(error)
+        for note in notes:
+            print(f"neural-sim: {note}", file=sys.stderr)
+        _task()
 
 
 if __name__ == "__main__":

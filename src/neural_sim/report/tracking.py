@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neural_sim.interruption import Interrupted, last_act
 from neural_sim.report.provenance import commit
 
 _log = logging.getLogger(__name__)
@@ -159,7 +160,7 @@ def opened(
     begun: float | None = None,
     clock: Callable[[], float] = time.time,
 ) -> Iterator[Run]:
-    """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after Ctrl-C.
+    """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after SIGTERM or Ctrl-C.
 
     A new SQLite store is created, and every store written to, under a lock, so that workers of a sweep can share it.
 
@@ -189,8 +190,9 @@ def opened(
             raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error
     run = Run(client, uri, created.info, clock)
     try:
-        run.parameters(parameters)
-        yield run
+        with last_act(lambda error: run.close("KILLED", error)):
+            run.parameters(parameters)
+            yield run
     except BaseException as error:
         run.close("KILLED" if _interrupted(error) else "FAILED", error)
         raise
@@ -215,8 +217,9 @@ def _allowed(name: str) -> str:
 
 
 def _interrupted(error: BaseException) -> bool:
-    """Ctrl-C, or the SystemExit that Lightning makes of it."""
-    return any(isinstance(e, KeyboardInterrupt) for e in (error, error.__context__, error.__cause__))
+    """Whether it is a signal's exception, or Ctrl-C's, or the SystemExit that Lightning makes of that."""
+    kinds = (Interrupted, KeyboardInterrupt)
+    return any(isinstance(each, kinds) for each in (error, error.__context__, error.__cause__))
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,7 @@ from typing import Annotated, Any
 from annotated_types import Ge, Le
 from typing_extensions import override
 
+from neural_sim.interruption import ctrl_c_as_exception
 from neural_sim.ranges import NonNegative, validated
 from neural_sim.report.viewer import Shots, Viewer
 from neural_sim.stages.graph import Psi
@@ -53,11 +55,9 @@ class ViewerTask(Task):
 
     def _wait(self) -> None:
         ends = None if self.seconds is None else time.monotonic() + self.seconds
-        try:
+        with suppress(KeyboardInterrupt), ctrl_c_as_exception():
             while ends is None or time.monotonic() < ends:
                 time.sleep(0.2)
-        except KeyboardInterrupt:
-            pass
 
     def shots(self, context: Context) -> Shots:
         """Return the scene, the known distributions, and the detector trained on ``psi``.

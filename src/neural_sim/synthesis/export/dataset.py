@@ -8,6 +8,7 @@ import logging
 import multiprocessing
 import os
 import pickle
+import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -160,6 +161,7 @@ def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None
 
 def _start(pickled: bytes) -> None:
     global _task
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, with which a worker ends
     torch.set_num_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _task = pickle.loads(pickled)
