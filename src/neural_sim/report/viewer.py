@@ -19,6 +19,7 @@ from torchvision.utils import draw_bounding_boxes
 
 from neural_sim import cameras
 from neural_sim.detector.protocol import Detector, Parameters
+from neural_sim.documents import markdown_table
 from neural_sim.synthesis.compositing import composite
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import PinholeCamera, SceneDraw
@@ -229,9 +230,7 @@ class Viewer:
         most = max(each.p for each in shown)
         self.frustums = [self._frustum(i, each, most) for i, each in enumerate(shown)]
         rows = {each.bin + 1: each.p for each in shown}
-        self.bins.content = "| bin | p |\n|---|---|\n" + "\n".join(
-            f"| {b} | {p:.3f} |" for b, p in rows.items()
-        )
+        self.bins.content = markdown_table(("bin", "p"), [(b, f"{p:.3f}") for b, p in rows.items()])
 
     def _frustum(self, number: int, each: BinCamera, most: float) -> Any:
         camera = self.shots.scene.camera
