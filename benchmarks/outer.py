@@ -25,7 +25,7 @@ from machine import add_device, forget_peak
 
 from neural_sim.devices import placed, synchronise
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.report.provenance import gpu, machine
 from neural_sim.synthesis.scene import Scene
@@ -64,11 +64,10 @@ def loop(context: Context, count: int, images: int) -> SimulatorModule:
         dataclasses.replace(context.experiment.loop.outer, images_per_object=images),
         context.experiment.training,
     )
-    inner = InnerLoop(
-        scene, detector, placed(detector.init(generator), context.graph.device), validation, settings,
-        training, generator, context.experiment.loop.gradient.draws,
-    )  # fmt: skip
-    return SimulatorModule(inner, psi, context.experiment.loop.gradient, context.experiment.loop.solver)
+    estimator, solver = context.experiment.loop.gradient, context.experiment.loop.solver
+    inputs = LoopInputs(detector, placed(detector.init(generator), context.graph.device), validation)
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
+    return SimulatorModule(inner, psi, estimator, solver, generator)
 
 
 def measure(module: SimulatorModule, repeats: int) -> dict[str, float]:
@@ -132,7 +131,7 @@ def main() -> None:
         forget_peak(context.graph.device)
         module = loop(context, count, images)
         row = {"objects": count, "images": images, **measure(module, arguments.repeats)}
-        row["steps"] = module.records[-1].certificate.solver_steps
+        row["steps"] = module.records[-1].products
         row |= gpu(context.graph.device)
         rows.append(row)
         shown = "".join(f"{row[phase]:11.2f}" for phase in PHASES)

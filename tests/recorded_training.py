@@ -10,8 +10,8 @@ from neural_sim.detector.protocol import Detector
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.trajectory import Recording, train
-from neural_sim.gradient.accumulated import Unrolled
-from neural_sim.gradient.unrolled import Examples
+from neural_sim.gradient.reversal import Examples, RecordedTraining
+from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.solver.operator import flatten, unflatten
 from neural_sim.types import LabelledImages
 
@@ -71,7 +71,8 @@ class Micro:
         examples = examples or self.examples
         made = self.trained(examples, recording, rule)
         generator = torch.Generator().manual_seed(0)
-        return how.accumulate(made, examples, self.like, self.slope(made.end), generator, **wanted)
+        training = RecordedTraining(made, examples, self.like)
+        return how.accumulate(training, self.slope(made.end), generator, **wanted)
 
 
 def _noise(count, generator):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params, Probes
 from neural_sim.gradient.estimators import importance_weights
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.solver.hvp import Term
 

@@ -4,10 +4,17 @@ import torch
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
+from neural_sim.detector.smooth_scores import SmoothAP
 from neural_sim.detector.training import Training
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.outer.certificate import Trust
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.module import SimulatorModule
+from neural_sim.outer.objective import Loss
 from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import FreeSteps
+from neural_sim.outer.trust_region import TrustRegion
 from neural_sim.parameter.update import Mirror
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
@@ -21,13 +28,21 @@ MICRO = {"backbone": Backbone("micro"), "anchors": Anchors(sizes=((14,), (28,)),
 
 
 FREE = {
-    "objective": "loss",
-    "steps": "free",
-    "adjoint": "implicit",
+    "objective": Loss(),
+    "steps": FreeSteps(Mirror()),
+    "adjoint": Implicit(curvature_images=6),
     "train_first": False,
-    "on_untrusted": "shrink",
+    "trust": Trust(on_untrusted="shrink"),
 }
 """The paper's: steps as they come, of the loss, by the implicit derivative."""
+CHECKED = {
+    "objective": SmoothAP(),
+    "steps": TrustRegion(),
+    "adjoint": Unrolled(),
+    "train_first": True,
+    "trust": Trust(level=None, on_untrusted="shrink"),
+}
+"""The default's, whose steps are taken whether significant or not."""
 
 
 def small_loop(
@@ -37,7 +52,6 @@ def small_loop(
     solver=SOLVER,
     detector=None,
     psi=None,
-    update=None,
     shown=slice(None),
     **outer,
 ):
@@ -45,22 +59,8 @@ def small_loop(
     detector = RetinaNet(**(TINY | (detector or {})))
     psi = torch.zeros(2, 4) if psi is None else psi
     validation = scene.training_set(psi, 3, generator).images.select(shown)  # three of each object
-    settings = Outer(
-        update or Mirror(),
-        iterations=iterations,
-        images_per_object=6,
-        epochs=1,
-        curvature_images=6,
-        **(FREE | outer),
-    )
-    inner = InnerLoop(
-        scene,
-        detector,
-        detector.init(generator),
-        validation,
-        settings,
-        Training(batch_size=4, weight_decay=0.0),
-        generator,
-        estimator.draws,
-    )
-    return SimulatorModule(inner, psi, estimator, solver)
+    settings = Outer(iterations=iterations, images_per_object=6, epochs=1, **(FREE | outer))
+    inputs = LoopInputs(detector, detector.init(generator), validation)
+    training = Training(batch_size=4, weight_decay=0.0)
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
+    return SimulatorModule(inner, psi, estimator, solver, generator)

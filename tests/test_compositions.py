@@ -8,9 +8,13 @@ from hydra import compose, initialize_config_dir
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.main import UserError, build, conf_directory
+from neural_sim.outer.certificate import Trust
 from neural_sim.outer.inner import pooled
+from neural_sim.outer.objective import Loss
+from neural_sim.outer.steps import FreeSteps
 from neural_sim.parameter.product import HardDraws
 from neural_sim.parameter.update import SGD, Mirror
 from neural_sim.stages.graph import Graph
@@ -71,11 +75,11 @@ def test_auto_sim_differs_from_neural_sim_by_its_estimator_and_steps_alone():
     for group in ("solver", "detector", "training", "parameter", "synthesis"):
         assert plain.config[group] == auto_sim.config[group]
     steps = {
-        "objective": "loss", "adjoint": "implicit", "steps": "free", "on_untrusted": "shrink",
-        "update": Mirror(2.0, max_step=1.0),
+        "objective": Loss(), "adjoint": Implicit(), "steps": FreeSteps(Mirror(2.0, max_step=1.0)),
+        "trust": Trust(on_untrusted="shrink"),
     }  # fmt: skip
     assert auto_sim.loop.outer == dataclasses.replace(plain.loop.outer, **steps)
-    assert experiment("baseline=auto_sim", "outer.update.max_step=2").loop.outer.update == Mirror(
+    assert experiment("baseline=auto_sim", "outer.steps.update.max_step=2").loop.outer.steps.update == Mirror(
         2.0, max_step=2.0
     )
 
@@ -124,17 +128,22 @@ def test_the_papers_method_is_what_the_paper_says_at_every_scale(scale):
     assert all(factor.temperature == 0.1 for factor in made.imaging.distribution.binned)
     assert made.imaging.distribution.factor("illumination").constraint == "affine"
     outer = made.loop.outer
-    assert (outer.epochs, outer.start, outer.train_first, outer.final_step) == (2, "previous", True, 1.0)
-    assert (outer.curvature_images, outer.pool_per_bin, outer.on_untrusted) == (0, 0, "keep")
+    assert (outer.epochs, outer.start, outer.train_first, outer.steps.final_step) == (
+        2,
+        "previous",
+        True,
+        1.0,
+    )
+    assert (outer.adjoint.curvature_images, outer.pool_per_bin, outer.trust.on_untrusted) == (0, 0, "keep")
     assert outer.images_per_object == (6 if scale == "smoke" else 50)
-    for update in (outer.update, outer.light_update):
+    for update in (outer.steps.update, outer.steps.light_update):
         assert isinstance(update, SGD) and (update.momentum, update.max_step) == (0.9, None)
 
 
 @pytest.mark.parametrize("key", ["update", "light_update"])
 def test_a_bad_step_is_refused_with_its_place(key):
-    with pytest.raises(UserError, match=f"outer.{key}.learning_rate: want more than 0, got 0"):
-        experiment(f"outer.{key}.learning_rate=0")
+    with pytest.raises(UserError, match=f"outer.steps.{key}.learning_rate: want more than 0, got 0"):
+        experiment("outer/steps=free", f"outer.steps.{key}.learning_rate=0")
 
 
 def test_lights_are_explored_where_a_method_scores_its_draws_alone():

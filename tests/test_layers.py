@@ -7,7 +7,7 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
-    "types", "alpha", "checks", "digests", "documents", "extras", "interruption", "randomness", "configuration",
+    "types", "alpha", "digests", "documents", "extras", "interruption", "randomness", "configuration",
     "ranges", "cameras", "devices", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector",
     "solver", "gradient", "baseline", "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip

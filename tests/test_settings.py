@@ -25,7 +25,7 @@ CONF = conf_directory()
 OVERRIDES = {"experiment", "scale", "variant", "hydra", "paper"}
 # Classes whose ranges are still checked by hand, or that take no settings; the list only shrinks.
 BY_HAND = (
-    "neural_sim.main.", "neural_sim.outer.", "neural_sim.gradient.accumulated.", "neural_sim.studies.work_precision.",
+    "neural_sim.main.", "neural_sim.outer.", "neural_sim.gradient.unrolled.", "neural_sim.studies.work_precision.",
 )  # fmt: skip
 CHOICES = sorted(
     path.relative_to(CONF).with_suffix("").as_posix()

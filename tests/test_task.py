@@ -11,7 +11,9 @@ from hydra import compose, initialize_config_dir
 from made_photographs import photographs_by_class
 
 from neural_sim.detector.classifier import Classifier
+from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.main import UserError, build, conf_directory
+from neural_sim.outer.objective import Loss
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,7 +40,7 @@ def test_a_task_chooses_detector_score_and_objective():
     chosen = {task: made(f"task={task}") for task in ("detection", "classification")}
     assert {task: x.score for task, x in chosen.items()} == {"detection": "AP", "classification": "accuracy"}
     objectives = {task: x.loop.outer.objective for task, x in chosen.items()}
-    assert objectives == {"detection": "average_precision", "classification": "accuracy"}
+    assert objectives == {"detection": SmoothAP(), "classification": SmoothAccuracy()}
     assert isinstance(chosen["classification"].detector(num_classes=2, image_size=32), Classifier)
     assert made().config == chosen["detection"].config
 
@@ -46,12 +48,12 @@ def test_a_task_chooses_detector_score_and_objective():
 @pytest.mark.parametrize("baseline", ["neural_sim_paper", "auto_sim", "lts", "response"])
 def test_every_kind_of_method_takes_it(baseline):
     x = made("task=classification", f"baseline={baseline}", "+experiment=pose_gap")
-    assert x.score == "accuracy" and x.loop.outer.objective in ("accuracy", "loss")
+    assert x.score == "accuracy" and isinstance(x.loop.outer.objective, (SmoothAccuracy, Loss))
 
 
 def test_the_command_line_goes_before_the_task():
-    x = made("task=classification", "detector=classifier_resnet18", "outer.objective=loss")
-    assert x.config["detector"]["backbone"]["architecture"] == "resnet18" and x.loop.outer.objective == "loss"
+    x = made("task=classification", "detector=classifier_resnet18", "outer/objective=loss")
+    assert x.config["detector"]["backbone"]["architecture"] == "resnet18" and x.loop.outer.objective == Loss()
 
 
 @pytest.mark.parametrize(
@@ -63,10 +65,10 @@ def test_the_command_line_goes_before_the_task():
             ["task=classification", "+variant=paper"],
             "task=classification and a detector that is scored by AP",
         ),
-        (["outer.objective=accuracy"], "outer.objective: want average_precision or loss for task=detection"),
+        (["outer/objective=smooth_accuracy"], "outer/objective: want smooth_ap or loss for task=detection"),
         (
-            ["task=classification", "outer.objective=average_precision"],
-            "outer.objective: want accuracy or loss for task=classification, got average_precision",
+            ["task=classification", "outer/objective=smooth_ap"],
+            "outer/objective: want smooth_accuracy or loss for task=classification, got SmoothAP",
         ),
         (
             ["task=classification", "synthesis.objects_per_image=[1,2]"],

@@ -66,7 +66,26 @@ GONE: dict[str, str] = {
 }
 """What to say of keys and choices (``key=value``) that no longer exist. A key stands for all keys below it, too."""
 
-MOVED: dict[str, str] = {}
+MOVED: dict[str, str] = {
+    "outer.steps=checked": "outer/steps=trust_region",
+    "outer.steps=free": "outer/steps=free",
+    "outer.checks": "outer.steps",
+    "outer.update": "outer.steps.update",
+    "outer.light_update": "outer.steps.light_update",
+    "outer.final_step": "outer.steps.final_step",
+    "outer.adjoint": "outer/adjoint",
+    "outer.unrolled": "outer.adjoint",
+    "outer.curvature_images": "outer.adjoint.curvature_images",
+    "outer.trust.max_residual": "outer.adjoint.max_residual",
+    "outer.trust.max_stationarity": "outer.adjoint.max_stationarity",
+    "outer.trust.max_sensitivity": "outer.adjoint.max_sensitivity",
+    "outer.on_untrusted": "outer.trust.on_untrusted",
+    "outer.objective=average_precision": "outer/objective=smooth_ap",
+    "outer.objective=accuracy": "outer/objective=smooth_accuracy",
+    "outer.objective=loss": "outer/objective=loss",
+    "outer.smooth_ap": "outer.objective",
+    "outer.smooth_accuracy": "outer.objective",
+}
 """Today's names of keys and choices (``key=value``) that have moved.
 
 A key stands for all keys below it, too, unless it has become a group, whose name has a slash:

@@ -18,7 +18,6 @@ STREAMS: dict[str, tuple[int, int]] = {
     # Streams of a psi loop, derived from its generator: numbers common to trainings that differ by psi alone.
     "common images": (2_000_003, 0),
     "common training": (2_000_003, 1),
-    "certificate": (1, 0),  # images that check a hypergradient, drawn apart so that checking changes no run
 }
 """Multiplier m and offset o of every stream, whose generator is seeded with m (seed + 1) + o.
 

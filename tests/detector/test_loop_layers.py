@@ -12,7 +12,6 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone
 from neural_sim.detector.training import Optimisation, train_detector
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.update import SGD
 from neural_sim.types import LabelledImages
 
 KINDS = {
@@ -86,8 +85,8 @@ def test_a_backbone_with_one_stage_at_least_is_left():
 
 
 def test_a_negative_number_is_refused_before_any_stage():
-    with pytest.raises(ValueError, match=r"outer\.loop_layers must be at least 0, got -1"):
-        Outer(SGD(1.0), loop_layers=-1)
+    with pytest.raises(ValueError, match=r"Outer\.loop_layers: want at least 0 or null, got -1"):
+        Outer(loop_layers=-1)
 
 
 def test_published_weights_have_no_layers_for_the_loop(tmp_path):

@@ -6,7 +6,7 @@ import torch
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.module import Optimisation
 from neural_sim.detector.training import train_detector
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.solver.hvp import HessianOperator
 from neural_sim.solver.operator import flatten, unflatten
 

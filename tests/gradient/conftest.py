@@ -13,7 +13,7 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Losses, ObjectImages, RenderedPath
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.gradient.pathwise import PathwiseEstimator
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution

@@ -10,10 +10,10 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from neural_sim import cameras
-from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.implicit import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import image_cotangents, scores
 from neural_sim.gradient.pathwise import contract, draw_cotangents, map_cotangents, psi_contributions
-from neural_sim.outer.binding import rendered_path
+from neural_sim.outer.derivative import rendered_path
 from neural_sim.parameter.product import RelaxedDraws, SceneDistribution
 from neural_sim.parameter.unlearned import Unlearned
 from neural_sim.parameter.zoom import Zoom
@@ -171,17 +171,17 @@ def test_adjoint_of_the_detector_at_the_damping_that_lanczos_chose(pipeline, pat
         ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-4, retain_graph=True
     )
     result = hypergradient(inner, validation, estimates, solver, torch.Generator().manual_seed(0))
-    assert result.solution.status is Status.CONVERGED and result.solution.products <= 40
-    assert result.damping.spectrum.smallest < 0.0 < result.damping.value
+    assert result.adjoint.solution.status is Status.CONVERGED and result.adjoint.solution.products <= 40
+    assert result.adjoint.damping.spectrum.smallest < 0.0 < result.adjoint.damping.value
     operator = Shifted(
-        HessianOperator(inner.terms(), pipeline.trainable, retain_graph=True), result.damping.value
+        HessianOperator(inner.terms(), pipeline.trainable, retain_graph=True), result.adjoint.damping.value
     )
     tight = MinimumResidual().solve(
         operator, gradient(validation, pipeline.trainable), rtol=1e-8, max_steps=200
     )
     assert tight.status is Status.CONVERGED
     expected = -estimates["can"](unflatten(tight.value, pipeline.trainable)).value
-    error = (result.psi_gradients["can"] - expected).norm() / expected.norm()
+    error = (result.gradients["can"] - expected).norm() / expected.norm()
     assert float(error) < 1e-2
 
 
@@ -245,7 +245,7 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(pipeline, pathw
     result = hypergradient(
         inner_problem(params, batch.images), [validation], estimates, solver, torch.Generator().manual_seed(0)
     )
-    assert result.solution.status is Status.CONVERGED and result.stationarity < 1e-10
+    assert result.adjoint.solution.status is Status.CONVERGED and result.adjoint.stationarity < 1e-10
     slopes = []
     for direction in 1e-4 * torch.eye(4, dtype=DOUBLE):
         ends = []
@@ -255,5 +255,5 @@ def test_hypergradient_of_a_detector_is_the_retrained_derivative(pipeline, pathw
             ends.append(validation(minimiser(images, params)))
         slopes.append(float(ends[0] - ends[1]) / 2e-4)
     reference = torch.tensor(slopes, dtype=DOUBLE)
-    error = float((result.psi_gradients["can"] - reference).norm() / reference.norm())
+    error = float((result.gradients["can"] - reference).norm() / reference.norm())
     assert error < 1e-5

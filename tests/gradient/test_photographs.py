@@ -8,9 +8,10 @@ import pytest
 import torch
 from recorded_training import DOUBLE, EXACT, STEP, Micro, extrapolated
 
-from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.base import ObjectImages, Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.gradient.reversal import RecordedTraining
+from neural_sim.gradient.unrolled import ProbeGroups, Unrolled
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.types import SceneDraw
@@ -57,8 +58,8 @@ def test_the_stratified_derivative_counts_photographs_in_the_training_alone(prox
     order = BINS.argsort(stable=True).view(3, 2)
     how = dataclasses.replace(EXACT, probes_per_step=0)
     sums = how.accumulate(
-        made, examples, problem.like, problem.slope(made.end), torch.Generator(),
-        ProbeGroups(problem.cached.losses, [order]), "probes",
+        RecordedTraining(made, examples, problem.like), problem.slope(made.end), torch.Generator(), "probes",
+        ProbeGroups(problem.cached.losses, [order]),
     )  # fmt: skip
     probes = {"pose": Probes(order.flatten(), BINS[order.flatten()])}
     found = StratifiedEstimator(2).accumulated(sums, images_of_object(PSI), probes).value

@@ -10,9 +10,10 @@ import torch
 
 from neural_sim.gradient.base import Losses, ObjectImages, Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
-from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.certificate import certify, line, untrusted
-from neural_sim.outer.settings import Trust
+from neural_sim.gradient.hypergradient import Hypergradient, ImplicitAdjoint, UnrolledAdjoint
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.outer.certificate import Trust, certify, line, untrusted
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.solver.base import Solution, Status
@@ -21,23 +22,25 @@ from neural_sim.solver.lanczos import Spectrum
 from neural_sim.types import SceneDraw
 
 SPECTRUM = Spectrum(-1.0, 9.0, 0.1, 0.1, 12, True)
-STRICT = Trust(max_stationarity=2.0, max_sensitivity=0.5, min_cosine=0.5)
+STRICT = Implicit(max_stationarity=2.0, max_sensitivity=0.5)
+FREE = Implicit(max_residual=None)
 
 
 def result(gradient=(1.0, -1.0), p_values=(0.01, 0.04), status=Status.CONVERGED, residual=0.01, **changes):
     names = ("a", "b")
-    made = Hypergradient(
-        psi_gradients={name: torch.tensor(gradient) for name in names},
-        standard_errors={name: torch.ones(2) for name in names},
+    solution = Solution(torch.ones(3), status, 7, residual, (0.1, 9.0), 8, False)
+    adjoint = ImplicitAdjoint(solution, Damped(3.0, SPECTRUM), 1, 1.5, 2.5, 0.2)
+    return Hypergradient(
+        gradients={name: torch.tensor(gradient) for name in names},
+        errors={name: torch.ones(2) for name in names},
+        adjoint=dataclasses.replace(adjoint, **changes),
         p_values={name: {"pose": p} for name, p in zip(names, p_values, strict=True)},
-        solution=Solution(torch.ones(3), status, 7, residual, (0.1, 9.0), 8, False),
-        damping=Damped(3.0, SPECTRUM), sensitivity=0.2, stationarity=1.5, validation_norm=2.5, damping_raises=1,
-    )  # fmt: skip
-    return dataclasses.replace(made, **changes)
+    )
 
 
-def judge(found, cosine=math.nan, trust=STRICT, on_untrusted="shrink"):
-    return certify(found, found.p_values, ("a", "b"), ("pose",), cosine, trust, on_untrusted)
+def judge(found, cosine=None, on_untrusted="shrink", level=0.1, min_cosine=0.5, adjoint=STRICT):
+    trust = Trust(level, min_cosine, on_untrusted)
+    return certify(found, found.p_values, ("a", "b"), ("pose",), trust, adjoint, cosine)
 
 
 def actions(certificate):
@@ -48,24 +51,21 @@ def test_a_good_step_is_kept_with_everything_recorded():
     certificate = judge(result(), cosine=0.8)
     assert certificate.doubts == [] and actions(certificate) == ["kept", "kept"]
     assert not certificate.stopped and not certificate.void
-    assert (
-        certificate.solver_status == "CONVERGED"
-        and certificate.solver_steps == 7
-        and certificate.damping_raises == 1
-    )
-    assert (certificate.curvature_min, certificate.curvature_max, certificate.damping) == (-1.0, 9.0, 3.0)
-    assert certificate.condition == pytest.approx(12.0 / 2.0)
+    adjoint = certificate.adjoint
+    assert (adjoint.solver_status, adjoint.solver_steps, adjoint.damping_raises) == ("CONVERGED", 7, 1)
+    assert (adjoint.curvature_min, adjoint.curvature_max, adjoint.damping) == (-1.0, 9.0, 3.0)
+    assert adjoint.condition == pytest.approx(12.0 / 2.0)
     assert certificate.p_values == {"a": {"pose": 0.01}, "b": {"pose": 0.04}}
-    assert (certificate.cosine, certificate.sensitivity, certificate.stationarity) == (0.8, 0.2, 1.5)
+    assert (certificate.cosine, adjoint.sensitivity, adjoint.stationarity) == (0.8, 0.2, 1.5)
 
 
 @pytest.mark.parametrize(
     ("found", "cosine", "doubt"),
     [
-        (result(residual=0.2, status=Status.MAX_STEPS), math.nan, "residual"),
-        (result(status=Status.NEGATIVE_CURVATURE), math.nan, "solver"),
-        (result(stationarity=2.1), math.nan, "stationarity"),
-        (result(sensitivity=0.6), math.nan, "sensitivity"),
+        (result(residual=0.2, status=Status.MAX_STEPS), None, "residual"),
+        (result(status=Status.NEGATIVE_CURVATURE), None, "solver"),
+        (result(stationarity=2.1), None, "stationarity"),
+        (result(sensitivity=0.6), None, "sensitivity"),
         (result(), 0.4, "cosine"),
     ],
 )
@@ -81,8 +81,8 @@ def test_a_doubt_about_all_is_named_and_handled_as_configured_for_every_object(
     assert certificate.stopped == (action == "stopped") and certificate.void == (
         action not in ("shrunk", "kept")
     )
-    free = Trust(None, None, None, None, None)
-    assert judge(found, cosine, free).doubts == (["solver"] if doubt == "solver" else [])
+    free = judge(found, cosine, level=None, min_cosine=None, adjoint=FREE)
+    assert free.doubts == (["solver"] if doubt == "solver" else [])
 
 
 @pytest.mark.parametrize(
@@ -101,13 +101,13 @@ def test_an_object_without_signal_holds_up_no_other(p_values, on_untrusted, expe
     certificate = judge(result(p_values=p_values), on_untrusted=on_untrusted)
     assert certificate.doubts == [] and actions(certificate) == expected
     assert certificate.stopped == certificate.void == ("stopped" in expected)
-    assert actions(judge(result(p_values=p_values), trust=Trust(level=None))) == ["kept", "kept"]
+    assert actions(judge(result(p_values=p_values), level=None)) == ["kept", "kept"]
 
 
 def test_each_factor_is_judged_by_itself():
     found = result()
     found.p_values["a"]["zoom"], found.p_values["b"]["zoom"] = 0.5, 0.02
-    certificate = certify(found, found.p_values, ("a", "b"), ("pose", "zoom"), math.nan, STRICT, "skip")
+    certificate = certify(found, found.p_values, ("a", "b"), ("pose", "zoom"), Trust(), STRICT)
     assert certificate.actions == {
         "a": {"pose": "kept", "zoom": "skipped"},
         "b": {"pose": "kept", "zoom": "kept"},
@@ -116,7 +116,7 @@ def test_each_factor_is_judged_by_itself():
 
 def test_only_objects_that_move_have_actions_and_what_was_not_tested_is_kept():
     found = dataclasses.replace(result(), p_values={})
-    certificate = certify(found, found.p_values, ("b",), ("pose",), math.nan, STRICT, "shrink")
+    certificate = certify(found, found.p_values, ("b",), ("pose",), Trust(), STRICT)
     assert certificate.actions == {"b": {"pose": "kept"}} and certificate.p_values == {}
 
 
@@ -148,10 +148,10 @@ def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(gene
         ]
         found = dataclasses.replace(
             result(),
-            psi_gradients={name: part.value for name, part in zip(names, estimates, strict=True)},
+            gradients={name: part.value for name, part in zip(names, estimates, strict=True)},
             p_values={name: part.p_values for name, part in zip(names, estimates, strict=True)},
         )
-        certificate = certify(found, found.p_values, names, ("pose",), math.nan, Trust(level=level), "shrink")
+        certificate = certify(found, found.p_values, names, ("pose",), Trust(level), STRICT)
         assert certificate.doubts == []
         kept.update(name for name in names if certificate.actions[name]["pose"] == "kept")
     wrongly = sum(kept[name] for name in names[:-1])
@@ -160,10 +160,22 @@ def test_of_six_objects_that_know_nothing_and_one_that_does_the_one_is_kept(gene
 
 
 def test_what_does_not_exist_is_not_doubted():
-    certificate = judge(result(sensitivity=math.nan, damping=Damped(3.0, None)))
-    assert certificate.doubts == [] and math.isnan(certificate.condition) and math.isnan(certificate.cosine)
+    certificate = judge(result(sensitivity=None, damping=Damped(3.0, None)))
+    assert certificate.doubts == [] and certificate.adjoint.condition is None and certificate.cosine is None
     assert judge(result(status=Status.APPROXIMATE, residual=5.0)).doubts == []
-    assert judge(result(), cosine=math.nan).doubts == []
+
+
+def test_each_adjoint_has_a_record_of_its_own_and_what_was_compared_has_none():
+    unrolled = dataclasses.replace(result(), adjoint=UnrolledAdjoint(60, True, 2.5))
+    certificate = judge(unrolled, adjoint=Unrolled())
+    assert certificate.doubts == [] and dataclasses.asdict(certificate.adjoint) == {
+        "validation_norm": 2.5, "reversed_steps": 60,
+    }  # fmt: skip
+    assert "reversed 60 steps" in line(certificate, 1, 2, 0.1)
+    broken = dataclasses.replace(result(), adjoint=UnrolledAdjoint(60, False, 2.5))
+    assert judge(broken, adjoint=Unrolled()).doubts == ["solver"]
+    compared = judge(dataclasses.replace(result(), adjoint=None))
+    assert compared.doubts == [] and compared.adjoint is None
 
 
 def test_a_gradient_that_is_not_finite_is_never_followed():
@@ -211,13 +223,18 @@ def test_steps_that_were_not_trusted_are_counted():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"max_residual": -1.0}, "outer.trust.max_residual"),
-        ({"min_cosine": 2.0}, "outer.trust.min_cosine"),
-        ({"shrink": 1.0}, "outer.trust.shrink"),
-        ({"level": 1.0}, "outer.trust.level"),
-        ({"level": 1e-6}, "outer.trust.level"),
+        ({"min_cosine": 2.0}, "Trust.min_cosine"),
+        ({"shrink": 1.0}, "Trust.shrink"),
+        ({"level": 1.0}, "Trust.level"),
+        ({"level": 1e-6}, "Trust.level"),
     ],
 )
 def test_thresholds_that_make_no_sense_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         Trust(**changes)
+
+
+@pytest.mark.parametrize("key", ["curvature_images", "max_residual", "max_stationarity", "max_sensitivity"])
+def test_limits_of_the_adjoint_that_make_no_sense_are_refused(key):
+    with pytest.raises(ValueError, match=f"Implicit.{key}"):
+        Implicit(**{key: -1})

@@ -1,17 +1,18 @@
 """The loop of checked steps: what is trained on, under which random numbers, and what is differentiated."""
 
+import dataclasses
+
 import pytest
 import torch
-from small_loop import SOLVER, small_loop
+from small_loop import CHECKED, small_loop
 
-from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.outer.descent import learned_objects
+from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.settings import Checks, Outer, Trust
-from neural_sim.parameter.update import Mirror
-
-CHECKED = {"steps": "checked", "adjoint": "unrolled", "train_first": True, "objective": "average_precision"}
+from neural_sim.outer.settings import Outer
+from neural_sim.outer.trust_region import TrustRegion
 
 
 def checked_loop(scene, iterations=3, **outer):
@@ -20,30 +21,39 @@ def checked_loop(scene, iterations=3, **outer):
     )
 
 
+def watch(monkeypatch, cls, name):
+    """The arguments of every call of a method, which is called all the same."""
+    calls, original = [], getattr(cls, name)
+
+    def watched(self, *arguments, **keywords):
+        calls.append((self, arguments, keywords))
+        return original(self, *arguments, **keywords)
+
+    monkeypatch.setattr(cls, name, watched)
+    return calls
+
+
 def test_checked_trainings_differ_by_psi_alone(scene):
-    inner = checked_loop(scene).inner
+    module = checked_loop(scene)
+    inner, numbers = module.inner, module.numbers
     psi = torch.zeros(2, 4)
-    first, second = (inner.draw(psi).images.images for _ in range(2))
+    first, second = (inner.draw(psi, numbers).images.images for _ in range(2))
     assert torch.equal(first, second)
-    moved = inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]])).images.images
+    moved = inner.draw(torch.tensor([[0.0] * 4, [5.0, 0.0, 0.0, 0.0]]), numbers).images.images
     assert torch.equal(moved[:6], first[:6]) and not torch.equal(moved[6:], first[6:])
-    thetas = []
-    for _ in range(2):
-        inner.train(CachedSet.of(inner.detector, inner.backbone, inner.draw(psi).images))
-        thetas.append(inner.trainable)
-    assert all(torch.equal(thetas[0][name], value) for name, value in thetas[1].items())
-    inner.renew()
-    assert not torch.equal(inner.draw(psi).images.images, first)
+    one, other = (inner.train(psi, numbers).trainable for _ in range(2))
+    assert all(torch.equal(one[name], value) for name, value in other.items())
+    assert not torch.equal(inner.draw(psi, numbers.renewed()).images.images, first)
 
 
 def test_methods_that_are_not_checked_get_new_random_numbers(scene):
-    inner = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2).inner
-    first, second = (inner.draw(torch.zeros(2, 4)).images.images for _ in range(2))
+    module = small_loop(scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2)
+    first, second = (module.inner.draw(torch.zeros(2, 4), module.numbers).images.images for _ in range(2))
     assert not torch.equal(first, second)
 
 
 def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
+    module = checked_loop(scene)
     learned = learn_psi(module, progress=False)
     first, middle, last = learned.records
     assert first.verdicts == {} and first.certificate and middle.certificate
@@ -67,9 +77,7 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
 
 
 def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
-    learned = learn_psi(
-        checked_loop(scene, trust=Trust(level=None), checks=Checks(waits_below=1.0)), progress=False
-    )
+    learned = learn_psi(checked_loop(scene, steps=TrustRegion(waits_below=1.0)), progress=False)
     first, second, _ = learned.records
     assert first.certificate
     actions = {name: by_factor["pose"] for name, by_factor in first.certificate.actions.items()}
@@ -77,20 +85,21 @@ def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
     assert [name for name, action in actions.items() if action == "kept"] == list(second.verdicts)
 
 
-def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene):
-    module = checked_loop(scene, trust=Trust(level=None), checks=Checks(trainings=2))
-    trained, inner = [], module.inner
-    train = inner.train
+def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene, monkeypatch):
+    module = checked_loop(scene, steps=TrustRegion(trainings=2))
+    calls, psis = watch(monkeypatch, InnerLoop, "train"), []
+    train_on = module.train_on
 
-    def watched(images, recording=None):
-        trained.append((inner._numbers, recording is not None, module.psi.detach().clone()))
-        return train(images, recording)
+    def noted(psi, recording=None):
+        psis.append(psi.detach().clone())
+        return train_on(psi, recording)
 
-    inner.train = watched
+    module.train_on = noted
     learned = learn_psi(module, progress=False)
+    trained = [(numbers.index, recording is not None) for _, (_, numbers, _, recording), _ in calls]
     # Two derivatives before the first step; then a verdict and a derivative an iteration; then a verdict.
-    assert [part[:2] for part in trained] == [(0, True), (1, True), (1, False), (2, True), (2, False)]
-    start, again, tried, accepted, last = (psi for _, _, psi in trained)
+    assert trained == [(0, True), (1, True), (1, False), (2, True), (2, False)]
+    start, again, tried, accepted, last = psis
     assert torch.equal(start, again) and bool((tried != start).any(1).all())
     assert torch.equal(tried, learned.trajectory[1]) and torch.equal(last, learned.trajectory[2])
     rose = [learned.records[1].verdicts[name].accepted for name in ("a", "b")]
@@ -100,16 +109,11 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
     assert learned.records[0].products == 2 * learned.records[1].products > 0
 
 
-def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene):
-    module = checked_loop(scene, 4, trust=Trust(level=None), checks=Checks(trainings=2))
-    seen, derivative = [], module._derivative
-
-    def watched(*arguments):
-        seen.append(module.inner.differentiated.images.images)
-        return derivative(*arguments)
-
-    module._derivative = watched
+def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene, monkeypatch):
+    module = checked_loop(scene, 4, steps=TrustRegion(trainings=2))
+    calls = watch(monkeypatch, SimulatorModule, "_derivative")
     learn_psi(module, progress=False)
+    seen = [objective.images.images for _, (_, objective), _ in calls]
     assert [len(part) for part in seen] == [3] * 4
     for first, second in (seen[:2], seen[2:]):
         both = torch.cat([first, second]).flatten(1)
@@ -118,23 +122,18 @@ def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(sc
         )
 
 
-def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene):
-    module = checked_loop(scene, 3, trust=Trust(level=None), checks=Checks(trainings=2), certify_every=2)
-    seen, derivative = [], module._derivative
-
-    def watched(*arguments):
-        seen.append(len(module.inner.differentiated.images))
-        return derivative(*arguments)
-
-    module._derivative = watched
+def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene, monkeypatch):
+    module = checked_loop(scene, 3, steps=TrustRegion(trainings=2), certify_every=2)
+    calls = watch(monkeypatch, SimulatorModule, "_derivative")
     learn_psi(module, progress=False)
-    assert seen == [3, 3, 6]
+    assert [len(objective.images) for _, (_, objective), _ in calls] == [3, 3, 6]
 
 
-def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
-    module = checked_loop(scene, trust=Trust(level=None))
+def test_a_loop_whose_steps_never_help_ends_where_it_began(scene, monkeypatch):
+    module = checked_loop(scene)
     falling = iter(range(10))
-    module.inner.scores = lambda: torch.full((2, 6), -float(next(falling)))
+    scores = property(lambda trained: torch.full((2, 6), -float(next(falling))))
+    monkeypatch.setattr(Trained, "scores", scores)
     learned = learn_psi(module, progress=False)
     assert any(record.verdicts for record in learned.records)
     assert not any(v.accepted for record in learned.records for v in record.verdicts.values())
@@ -144,21 +143,23 @@ def test_a_loop_whose_steps_never_help_ends_where_it_began(scene):
 @pytest.mark.parametrize("bad", [{"train_first": False}, {"start": "previous"}, {"epochs": 0}])
 def test_checked_steps_want_trainings_that_can_be_compared(scene, bad):
     with pytest.raises(ValueError, match="outer"):
-        Outer(Mirror(), **bad)
+        Outer(**bad)
 
 
 def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
-    module = checked_loop(scene, shown=slice(3, 6), trust=Trust(level=None))
+    module = checked_loop(scene, shown=slice(3, 6))
     assert "no validation image shows: a" in caplog.text
     learned = learn_psi(module, progress=False)
     assert not learned.last[0].any() and set(learned.records[1].verdicts) == {"b"}
     assert all(set(record.certificate.actions) == {"b"} for record in learned.records[:2])
-    both = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"), trust=Trust(level=None))
+    both = checked_loop(scene, shown=slice(3, 6), learned=("a", "b"))
     assert set(learn_psi(both, progress=False).records[1].verdicts) == {"a", "b"}
 
 
 def test_validation_without_an_object_is_refused(scene):
-    inner = checked_loop(scene).inner
-    inner.shown = set()
+    module = checked_loop(scene)
+    images = module.inner.objective.images
+    empty = dataclasses.replace(images, labels=torch.full_like(images.labels, -1))
+    objective = dataclasses.replace(module.inner.objective, images=empty)
     with pytest.raises(ValueError, match="show none of the objects"):
-        SimulatorModule(inner, torch.zeros(2, 4), StratifiedEstimator(probes_per_bin=2), SOLVER)
+        learned_objects(dataclasses.replace(module.inner, objective=objective))

@@ -5,22 +5,22 @@ import dataclasses
 
 import pytest
 import torch
-from small_loop import FREE
+from small_loop import CHECKED, FREE
 from trips import counted
 
 from neural_sim import devices
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.detector.training import Training
-from neural_sim.gradient.accumulated import ProbeGroups, Unrolled
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.gradient.unrolled import Examples
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.reversal import Examples, RecordedTraining
+from neural_sim.gradient.unrolled import ProbeGroups, Unrolled
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.settings import Outer, Trust
-from neural_sim.parameter.update import Mirror
+from neural_sim.outer.settings import Outer
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.cg import ConjugateGradient
 from neural_sim.solver.damping import LanczosDamping
@@ -47,28 +47,15 @@ def _module(scene, estimator, device, epochs=1, iterations=1, **outer):
         synthesizer=Synthesizer(ProceduralClutter(octaves=1, shapes=1), shift=0.1),
     )
     validation = scene.training_set(psi, 3, generator).images.to("cpu")
+    free = FREE | {"adjoint": Implicit(curvature_images=4)}
     settings = Outer(
-        Mirror(),
-        iterations=iterations,
-        images_per_object=4,
-        epochs=epochs,
-        curvature_images=4,
-        pool_per_bin=2,
-        **(FREE | outer),
+        iterations=iterations, images_per_object=4, epochs=epochs, pool_per_bin=2, **(free | outer)
     )
     params = devices.placed(detector.init(generator), torch.device(device))
-    inner = InnerLoop(
-        scene,
-        detector,
-        params,
-        validation,
-        settings,
-        Training(batch_size=4, weight_decay=0.0),
-        generator,
-        estimator.draws,
-    )
+    inputs, training = LoopInputs(detector, params, validation), Training(batch_size=4, weight_decay=0.0)
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(lanczos_steps=2), max_steps=3)
-    return SimulatorModule(inner, psi, estimator, solver)
+    return SimulatorModule(inner, psi, estimator, solver, generator)
 
 
 ESTIMATORS = [
@@ -83,7 +70,7 @@ def test_the_loop_is_the_cpus(scene, pretend, monkeypatch, estimator):
     for device in ("cpu", "pretend"):
         module = _module(scene, estimator, device)
         found.append(learn_psi(module, progress=False))
-        assert {value.device.type for value in module.inner.theta.values()} == {device}
+        assert {value.device.type for value in module.theta.values()} == {device}
         assert module.psi.device.type == "cpu"
     # Up to the rounding of second derivatives, which the device takes by formulas where the CPU has kernels.
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
@@ -96,9 +83,9 @@ def test_the_loop_on_the_trainings_derivative_is_the_cpus(scene, pretend, monkey
     monkeypatch.setattr(devices, "CACHES", 1)
     found = []
     for device in ("cpu", "pretend"):
-        module = _module(scene, estimator, device, epochs=2, adjoint="unrolled", train_first=True)
+        module = _module(scene, estimator, device, epochs=2, adjoint=Unrolled(), train_first=True)
         found.append(learn_psi(module, progress=False))
-        assert module.inner.trajectory.end.device.type == device
+        assert next(iter(module.theta.values())).device.type == device
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
 
 
@@ -107,17 +94,16 @@ def test_steps_walked_back_through_wait_for_nothing(scene, pretend, scored):
     """Scores of probes bring their columns there and wait twice, for a difference's length; steps alone do neither."""
     trips = {}
     for epochs in (1, 3):
-        module = _module(scene, ReinforceEstimator(), "pretend", epochs, adjoint="unrolled", train_first=True)
-        inner, cached = module.inner, module.inner.validation
-        inner.train(cached, module.settings.unrolled.recording)
+        module = _module(scene, ReinforceEstimator(), "pretend", epochs, adjoint=Unrolled(), train_first=True)
+        trained = module.train_on(module.psi, module.settings.adjoint.recording)
+        cached = trained.examples
         examples = Examples(cached.inputs, cached.losses_from)
+        recorded = RecordedTraining(trained.trajectory, examples, trained.trainable)
         probes = ProbeGroups(cached.losses, [torch.arange(6).view(2, 3)]) if scored else None
-        slope = torch.ones_like(inner.trajectory.end)
+        slope = torch.ones_like(trained.trajectory.end)
         with counted() as ledger:
-            Unrolled(scored_steps=0).accumulate(
-                inner.trajectory, examples, inner.trainable, slope, torch.Generator(), probes
-            )
-        trips[len(inner.trajectory)] = ledger.count()
+            Unrolled(scored_steps=0).accumulate(recorded, slope, torch.Generator(), probes=probes)
+        trips[recorded.steps] = ledger.count()
     assert trips == {2: trips[2], 6: trips[2] + 4 * (2 + 1) * scored}
 
 
@@ -126,9 +112,8 @@ def test_detector_steps_wait_for_nothing(scene, pretend):
     trips = {}
     for epochs in (1, 5):
         module = _module(scene, StratifiedEstimator(probes_per_bin=1), "pretend", epochs)
-        cached = dataclasses.replace(module.inner.validation)
         with counted() as ledger:
-            module.inner.train(cached)
+            module.train_on(module.psi)
         trips[epochs] = ledger
     assert trips[5].count("to_device") - trips[1].count("to_device") == 4
     assert trips[5].count("wait", "to_host") == trips[1].count("wait", "to_host")
@@ -137,7 +122,7 @@ def test_detector_steps_wait_for_nothing(scene, pretend):
 def test_a_product_of_conjugate_gradients_waits_twice(scene, pretend):
     module = _module(scene, StratifiedEstimator(probes_per_bin=1), "pretend")
     inner, generator = module.inner, torch.Generator().manual_seed(0)
-    operator = HessianOperator(inner.validation.mean_terms(), inner.trainable, retain_graph=True)
+    operator = HessianOperator(inner.objective.cached.mean_terms(), inner.warm_start, retain_graph=True)
     b = torch.randn(operator.size, generator=generator).to("pretend")
     trips = {}
     for steps in (2, 6):
@@ -159,12 +144,9 @@ def test_images_and_features_stay_on_the_device(scene, pretend):
 
 def test_the_checked_loop_of_average_precision_is_the_cpus(scene, pretend, monkeypatch):
     monkeypatch.setattr(devices, "CACHES", 1)
-    found, checked = [], {"steps": "checked", "objective": "average_precision", "adjoint": "unrolled"}
+    found = []
     for device in ("cpu", "pretend"):
-        module = _module(
-            scene, StratifiedEstimator(probes_per_bin=1), device, epochs=2, train_first=True, trust=Trust(level=None),
-            **checked,
-        )  # fmt: skip
+        module = _module(scene, StratifiedEstimator(probes_per_bin=1), device, epochs=2, **CHECKED)
         found.append(learn_psi(module, progress=False))
     assert found[1].last == pytest.approx(found[0].last, rel=1e-3, abs=1e-4)
     scores = [[record.scores for record in learned.records] for learned in found]

@@ -6,7 +6,7 @@ from small_loop import small_loop
 
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.binding import object_images
+from neural_sim.outer.derivative import object_images
 
 
 @pytest.mark.parametrize(
@@ -20,18 +20,18 @@ from neural_sim.outer.binding import object_images
     ],
 )
 def test_few_images_are_trained_on_for_more_epochs(scene, least, start, steps):
-    inner = small_loop(
+    module = small_loop(
         scene, StratifiedEstimator(probes_per_bin=2), pool_per_bin=2, least_steps=least, start=start
-    ).inner
-    inner.train(inner.training_set(inner.draw(torch.zeros(2, 4)).images))
-    assert inner.steps == steps
+    )
+    assert module.train_on(torch.zeros(2, 4)).cost.detector_steps == steps
 
 
 @pytest.mark.parametrize(
     "estimator", [StratifiedEstimator(probes_per_bin=2), PathwiseEstimator(mode="forward")]
 )
 def test_maps_of_objects_are_kept_only_where_a_derivative_goes_through_them(scene, estimator):
-    rendered = small_loop(scene, estimator).inner.draw(torch.zeros(2, 4))
+    module = small_loop(scene, estimator)
+    rendered = module.inner.draw(torch.zeros(2, 4), module.numbers)
     relaxed = isinstance(estimator, PathwiseEstimator)
     assert len(rendered) == 12 and [len(part.draw) for part in rendered.objects] == [6, 6]
     assert [len(part.rgb) for part in rendered.objects] == [6 * relaxed] * 2

@@ -13,14 +13,17 @@ from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
+from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.binding import bound_losses, image_losses, object_images
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.outer.derivative import bound_losses, image_losses, object_images
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import FreeSteps
 from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import HARD, SceneDistribution
@@ -139,7 +142,9 @@ def test_the_derivative_across_lights_is_that_of_a_mixture():
         assert bool((found.standard_error > 0.0).all())
 
 
-@pytest.mark.parametrize("adjoint", ["implicit", "unrolled"])
+@pytest.mark.parametrize(
+    "adjoint", [Implicit(curvature_images=4), Unrolled()], ids=lambda a: type(a).__name__
+)
 @pytest.mark.parametrize(
     "estimator",
     [StratifiedEstimator(2), PathwiseEstimator(), PathwiseEstimator("reverse"), ReinforceEstimator()],
@@ -150,23 +155,17 @@ def test_the_loop_learns_pose_and_light_and_keeps_weights_on_their_simplex(estim
     generator, start = torch.Generator().manual_seed(0), scene.distribution.psi("initial", ["a", "b"])
     detector = RetinaNet(2, 32, **DETECTOR)
     validation = scene.training_set(start.float(), 3, generator, HARD).images
-    light_update = Mirror(0.6, max_step=1.0, shrink=False)
-    settings = Outer(
-        Mirror(shrink=False), 2, 4, epochs=1, curvature_images=4, light_update=light_update,
-        **FREE | {"train_first": adjoint == "unrolled", "adjoint": adjoint},
-    )  # fmt: skip
-    inner = InnerLoop(
-        scene,
-        detector,
-        detector.init(generator),
-        validation,
-        settings,
+    steps = FreeSteps(Mirror(shrink=False), Mirror(0.6, max_step=1.0, shrink=False))
+    chosen = {"train_first": isinstance(adjoint, Unrolled), "adjoint": adjoint, "steps": steps}
+    settings = Outer(2, 4, epochs=1, **FREE | chosen)
+    inputs, training = (
+        LoopInputs(detector, detector.init(generator), validation),
         Training(batch_size=4, weight_decay=0.0),
-        generator,
-        estimator.draws,
     )
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
     assert inner.pool is None  # a light that moves makes stored images stale
-    learned = learn_psi(SimulatorModule(inner, start, estimator, AdjointSolver(max_steps=4)), progress=False)
+    module = SimulatorModule(inner, start, estimator, AdjointSolver(max_steps=4), generator)
+    learned = learn_psi(module, progress=False)
     parts = scene.distribution.split(learned.last)
     assert (parts["pose"].abs().amax(-1) > 0.0).all()
     weights = parts["illumination"]

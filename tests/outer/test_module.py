@@ -13,8 +13,9 @@ from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.binding import bound_losses, object_images
+from neural_sim.outer.derivative import bound_losses, object_images
 from neural_sim.outer.loop import learn_psi
+from neural_sim.outer.steps import FreeSteps
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import HardDraws, RelaxedDraws, SceneDistribution
 from neural_sim.parameter.update import Mirror
@@ -40,18 +41,19 @@ def test_the_loop_records_every_iteration_and_moves_psi(scene, estimator):
     first = learned.records[0]
     assert first.probabilities["pose"] == [[0.25] * 4] * 2
     assert first.entropies["pose"] == pytest.approx([math.log(4)] * 2)
-    assert math.isfinite(first.validation_loss) and first.certificate.damping > 0
+    assert math.isfinite(first.validation_loss) and first.certificate.adjoint.damping > 0
     assert {"render", "train", "hypergradient", "hypergradient_solve"} <= set(first.seconds)
     assert all(record.cpu_seconds > 0.0 for record in learned.records)
     assert torch.isfinite(learned.last).all() and (learned.last != 0).any()
-    assert (learned.last.abs() <= 2 * module.settings.update.max_step).all()
+    assert (learned.last.abs() <= 2 * module.settings.steps.update.max_step).all()
 
 
 @pytest.mark.parametrize("start", ["fresh", "previous"])
 @pytest.mark.parametrize("train_first", [False, True])
 def test_the_first_hypergradient_is_taken_at_the_warm_start_unless_it_trains_first(scene, start, train_first):
     module = small_loop(scene, StratifiedEstimator(probes_per_bin=2), start=start, train_first=train_first)
-    at_warm_start = module.inner.validation_loss()
+    warm, objective = module.inner.warm_start, module.inner.objective
+    at_warm_start = float(objective.of_outputs(objective.outputs(warm)))
     first, second = learn_psi(module, progress=False).records
     batches = 12 // 4
     assert (first.detector_steps, second.detector_steps) == (batches * train_first, batches)
@@ -66,11 +68,9 @@ def test_the_same_seed_gives_the_same_psi_bit_for_bit(scene):
 
 def test_the_backbone_stays_frozen(scene):
     module = small_loop(scene, ReinforceEstimator())
-    before = {
-        name: value.clone() for name, value in module.inner.detector.split(module.inner.theta)[0].items()
-    }
+    before = {name: value.clone() for name, value in module.inner.detector.split(module.theta)[0].items()}
     learn_psi(module, False)
-    after = module.inner.detector.split(module.inner.theta)[0]
+    after = module.inner.detector.split(module.theta)[0]
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
@@ -135,7 +135,8 @@ def test_training_sets_have_the_expected_number_of_images_of_every_bin_unless_dr
 
 def test_the_mode_says_whether_the_first_render_carries_tangents(scene):
     for mode, carried in (("forward", True), ("reverse", False)):
-        drawn = small_loop(scene, PathwiseEstimator(mode=mode)).inner.draw(torch.zeros(2, 4))
+        module = small_loop(scene, PathwiseEstimator(mode=mode))
+        drawn = module.inner.draw(torch.zeros(2, 4), module.numbers)
         assert all((part.tangents is not None) is carried for part in drawn.objects)
 
 
@@ -176,7 +177,7 @@ def test_every_factor_of_a_product_is_learned(scene, estimator):
     joint = SceneDistribution.of([Pose(bins=3), Zoom(bins=2)])
     scene = dataclasses.replace(scene, distribution=joint)
     module = small_loop(
-        scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2, update=Mirror(shrink=False)
+        scene, estimator, 1, psi=torch.zeros(2, 5), pool_per_bin=2, steps=FreeSteps(Mirror(shrink=False))
     )
     learned = learn_psi(module, progress=False)
     assert set(learned.records[0].probabilities) == {"pose", "zoom"}

@@ -8,7 +8,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.classifier import Classifier
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
-from neural_sim.outer.objective import Objective
+from neural_sim.outer.objective import Loss, Objective
 from neural_sim.solver.hvp import gradient
 from neural_sim.solver.operator import flatten, unflatten
 
@@ -25,9 +25,8 @@ def made(scene, generator):
             k: v.double() + 0.05 * torch.randn(v.shape, generator=generator).double()
             for k, v in trainable.items()
         }
-        smooth = SmoothAccuracy() if kind == "accuracy" else SmoothAP()
-        objective = Objective(CachedSet.of(detector, backbone, images), images, kind, smooth)
-        return objective.double(), noisy
+        score = {"loss": Loss(), "average_precision": SmoothAP(), "accuracy": SmoothAccuracy()}[kind]
+        return Objective(CachedSet.of(detector, backbone, images).double(), images, score), noisy
 
     return make
 
@@ -67,9 +66,7 @@ def test_a_class_without_a_box_has_no_score_and_stays_out_of_the_mean(made):
     objective, params = made("average_precision")
     first = objective.images.labels[:, 0] == 0
     rows = first.nonzero().flatten()
-    fewer = Objective(
-        objective.cached.select(rows), objective.images.select(rows), "average_precision", SmoothAP()
-    )
+    fewer = Objective(objective.cached.select(rows), objective.images.select(rows), SmoothAP())
     scores = fewer.scores(fewer.outputs(params)).sum(1)
     assert bool(scores[1].isnan()) and bool(scores[0].isfinite())
     with torch.no_grad():

@@ -16,11 +16,13 @@ from neural_sim.detector.training import Training
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Probes
 from neural_sim.gradient.estimators import StratifiedEstimator
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import FreeSteps
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.update import Mirror
@@ -102,22 +104,17 @@ def test_the_loop_draws_a_part_of_its_probes_anew(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(1, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = scene.training_set(torch.zeros(1, 4), 2, generator).images
+    adjoint = {"adjoint": Implicit(curvature_images=2)}
     settings = Outer(
-        Mirror(), images_per_object=2, epochs=0, curvature_images=2, refresh=0.5, pool_per_bin=2,
-        learned=scene.names, **FREE,
-    )  # fmt: skip
-    inner = InnerLoop(
-        scene,
-        detector,
-        detector.init(generator),
-        validation,
-        settings,
+        images_per_object=2, epochs=0, refresh=0.5, pool_per_bin=2, learned=scene.names, **FREE | adjoint
+    )
+    inputs, training = (
+        LoopInputs(detector, detector.init(generator), validation),
         Training(batch_size=2, weight_decay=0.0),
-        generator,
     )
-    module = SimulatorModule(
-        inner, torch.zeros(1, 4), StratifiedEstimator(probes_per_bin=4), AdjointSolver(max_steps=2)
-    )
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator)
+    estimator, solver = StratifiedEstimator(probes_per_bin=4), AdjointSolver(max_steps=2)
+    module = SimulatorModule(inner, torch.zeros(1, 4), estimator, solver, generator)
     drawn = []
     for step in range(3):
         module.training_step(step, step)
@@ -135,19 +132,15 @@ def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
     generator, psi = torch.Generator().manual_seed(0), torch.zeros(2, 4)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = two.training_set(psi, 2, generator).images
-    settings = Outer(
-        Mirror(shrink=False), 2, 2, epochs=1, curvature_images=2, pool_per_bin=2, learned=("b",), **FREE
-    )
-    inner = InnerLoop(
-        two,
-        detector,
-        detector.init(generator),
-        validation,
-        settings,
+    chosen = {"adjoint": Implicit(curvature_images=2), "steps": FreeSteps(Mirror(shrink=False))}
+    settings = Outer(2, 2, epochs=1, pool_per_bin=2, learned=("b",), **FREE | chosen)
+    inputs, training = (
+        LoopInputs(detector, detector.init(generator), validation),
         Training(batch_size=2, weight_decay=0.0),
-        generator,
     )
-    module = SimulatorModule(inner, psi, StratifiedEstimator(probes_per_bin=2), AdjointSolver(max_steps=2))
+    inner = InnerLoop.prepare(two, inputs, settings, training, generator)
+    estimator, solver = StratifiedEstimator(probes_per_bin=2), AdjointSolver(max_steps=2)
+    module = SimulatorModule(inner, psi, estimator, solver, generator)
     learned = learn_psi(module, progress=False)
     assert module._probes is not None and not module._probes.probes[0] and module._probes.probes[1]
     assert not learned.last[0].any() and learned.last[1].any()
@@ -159,5 +152,5 @@ def test_objects_whose_psi_is_fixed_get_no_probes_and_do_not_move(scene):
 
 @pytest.mark.parametrize("refresh", [0.0, 1.5, math.nan])
 def test_a_part_outside_its_range_is_refused(refresh):
-    with pytest.raises(ValueError, match=r"outer\.refresh"):
-        Outer(Mirror(), refresh=refresh)
+    with pytest.raises(ValueError, match=r"Outer\.refresh"):
+        Outer(refresh=refresh)

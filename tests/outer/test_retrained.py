@@ -8,7 +8,7 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
 from neural_sim.gradient.base import Probes
-from neural_sim.gradient.hypergradient import hypergradient
+from neural_sim.gradient.implicit import hypergradient
 from neural_sim.outer.response import centred_cosine
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Status
@@ -79,10 +79,10 @@ def test_retraining_ends_at_a_stationary_point(problem):
 
 def test_the_oracle_is_the_retrained_derivative(problem, oracle):
     binned, terms, minimum = problem
-    assert oracle.stationarity < 1e-9 and oracle.solution.residual < 1e-12
+    assert oracle.adjoint.stationarity < 1e-9 and oracle.adjoint.solution.residual < 1e-12
     found = finite_difference(binned, terms, PSI, 0, minimum.params, step=1e-2, tolerance=1e-10)
     assert found.converged and found.trainings == 2 * (BINS - 1)
-    exact = oracle.psi_gradients["0"]
+    exact = oracle.gradients["0"]
     # step^2 / 6 of a third derivative of order one, in logits
     assert (found.gradient - exact).norm() < 1e-3 * exact.norm()
     assert centred_cosine(found.gradient, exact) > 1 - 1e-6
@@ -90,11 +90,11 @@ def test_the_oracle_is_the_retrained_derivative(problem, oracle):
 
 def test_conjugate_gradients_reach_the_oracle_inside_40_products(problem, oracle):
     found = implicit(problem, ConjugateGradient(), 1e-2, 40)
-    assert found.solution.status is Status.CONVERGED and found.solution.products <= 40
-    exact, close = (torch.cat(list(h.psi_gradients.values())) for h in (oracle, found))
+    assert found.adjoint.solution.status is Status.CONVERGED and found.adjoint.solution.products <= 40
+    exact, close = (torch.cat(list(h.gradients.values())) for h in (oracle, found))
     assert (close - exact).norm() < 1e-2 * exact.norm()
     tight = implicit(problem, ConjugateGradient(), 1e-11, 400)
-    assert (torch.cat(list(tight.psi_gradients.values())) - exact).norm() < 1e-9 * exact.norm()
+    assert (torch.cat(list(tight.gradients.values())) - exact).norm() < 1e-9 * exact.norm()
 
 
 def test_weights_are_the_bins_probabilities_shared_by_their_images(problem):

@@ -8,7 +8,7 @@ import torch
 
 from neural_sim.gradient.base import Losses, Probes
 from neural_sim.gradient.estimators import ReinforceEstimator, StratifiedEstimator
-from neural_sim.outer.binding import object_images
+from neural_sim.outer.derivative import object_images
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import HARD, SceneDistribution
 from neural_sim.synthesis.assembly import RenderedObject

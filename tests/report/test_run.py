@@ -25,8 +25,11 @@ def results():
         "verdicts": {"a": {"accepted": False, "expected_gain": 0.1, "measured_gain": -0.01, "error": 0.02}},
         "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9, "cpu_seconds": 0.4,
         "certificate": {
-            "stationarity": 1.0, "solver_steps": 3, "solver_residual": 0.01, "damping": 2.0, "curvature_min": -1.0,
-            "curvature_max": 9.0, "condition": 11.0, "sensitivity": float("nan"), "cosine": 0.9, "doubts": [],
+            "adjoint": {
+                "stationarity": 1.0, "solver_status": "CONVERGED", "solver_steps": 3, "solver_residual": 0.01,
+                "damping": 2.0, "curvature_min": -1.0, "curvature_max": 9.0, "condition": 11.0, "sensitivity": None,
+            },
+            "cosine": 0.9, "doubts": [],
             "p_values": {"a": {"pose": 0.3}, "b": {"pose": 0.01}},
             "actions": {"a": {"pose": "shrunk"}, "b": {"pose": "kept"}},
         },

@@ -49,8 +49,8 @@ class Recording:
         least = (math.ceil(count / length) + length) * state_bytes + length * vector_bytes
         if least > self.max_memory_mb * MEGABYTE:
             raise ValueError(
-                f"unrolled.max_memory_mb: {count} steps take {least / MEGABYTE:.0f} MB at least, got "
-                f"{self.max_memory_mb:g}; raise it, or lower unrolled.part"
+                f"outer.adjoint.max_memory_mb: {count} steps take {least / MEGABYTE:.0f} MB at least, got "
+                f"{self.max_memory_mb:g}; raise it, or lower outer.adjoint.part"
             )
         return least + count * vector_bytes <= self.max_memory_mb * MEGABYTE
 

@@ -1,6 +1,6 @@
 """Inputs and result of the estimators of ``d/dpsi <dL_train/dtheta, v>``.
 
-The implicit function theorem's minus sign is not theirs: it is applied once, in ``hypergradient.py``.
+The implicit function theorem's minus sign is not theirs: it is applied once, in ``implicit.py``.
 """
 
 from __future__ import annotations

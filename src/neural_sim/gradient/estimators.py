@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import (
     Losses,
     MixedDerivative,
@@ -20,8 +19,9 @@ from neural_sim.gradient.base import (
     from_contributions,
 )
 from neural_sim.gradient.mixed import ThetaMode, scores
+from neural_sim.gradient.reversal import Wanted
 from neural_sim.gradient.significance import no_association, no_difference
-from neural_sim.gradient.unrolled import Wanted
+from neural_sim.gradient.unrolled import Accumulated
 from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.parameter.product import Draws, HardDraws
 from neural_sim.ranges import PositiveInt, validated

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from neural_sim import cameras
 from neural_sim.devices import moved
-from neural_sim.gradient.accumulated import Accumulated
 from neural_sim.gradient.base import (
     Losses,
     MixedDerivative,
@@ -31,8 +30,9 @@ from neural_sim.gradient.base import (
     from_contributions,
 )
 from neural_sim.gradient.mixed import image_cotangents
+from neural_sim.gradient.reversal import Wanted
 from neural_sim.gradient.significance import zero_mean
-from neural_sim.gradient.unrolled import Wanted
+from neural_sim.gradient.unrolled import Accumulated
 from neural_sim.parameter.factor import COORDINATES
 from neural_sim.parameter.product import RelaxedDraws
 from neural_sim.ranges import PositiveInt, validated

@@ -1,227 +1,268 @@
-"""The derivative of the training that was run: reverse mode through its optimiser's steps.
+"""The hypergradient of the training that was run.
 
-The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of
-L_val by the state before step t (theta and the optimiser's moments), each step back takes
-
-    a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
-    lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
-
-where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta,
-a_t>``. Summed over the steps, this score replaces ``-<dl/dtheta, v>``, the minus sign included (Baydin and Pearlmutter
-2014; Maclaurin et al. 2015, with stored states instead of states recomputed backwards).
+Its steps are reversed (:mod:`gradient.reversal`). Estimators read sums over these steps: scores of images and probes,
+and derivatives by the training's inputs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.detector.optimiser import pulled_back
-from neural_sim.detector.trajectory import Trajectory
-from neural_sim.gradient.base import Params
-from neural_sim.solver.operator import flatten, plain_norm, unflatten
-
-Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
-Wanted = Literal["probes", "weights", "inputs"]
-"""Sums that an estimator reads: probes' scores only, also derivatives by the training images' weights, or also those by
-the images' inputs."""
-InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
-
-
-class LossesFrom(Protocol):
-    """Losses of the training images ``rows``, differentiable twice in parameters and in those rows of the inputs."""
-
-    def __call__(
-        self, params: Params, inputs: tuple[Tensor, ...], rows: Int[Tensor, "n"], /
-    ) -> Float[Tensor, "n"]: ...
+from neural_sim.detector.real import shuffled_passes
+from neural_sim.detector.trajectory import Recording
+from neural_sim.gradient.base import IndexedLoss, MixedDerivative
+from neural_sim.gradient.hypergradient import Hypergradient, UnrolledAdjoint
+from neural_sim.gradient.mixed import scores
+from neural_sim.gradient.reversal import (
+    InputsOf,
+    Product,
+    RecordedTraining,
+    ReversedStep,
+    Wanted,
+    reversed_steps,
+)
+from neural_sim.ranges import (
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveFraction,
+    PositiveInt,
+    validated,
+)
+from neural_sim.solver.hvp import Term, gradient
+from neural_sim.solver.operator import norm
 
 
 @dataclass(frozen=True)
-class Examples:
-    """A training's examples and their losses.
+class Accumulated:
+    """Sums over the reversed steps; a_t is that of :mod:`gradient.reversal`.
 
-    ``inputs`` [N, ...] are those by which losses are differentiated where images move. Each step's objective was its
-    batch's mean loss plus ``proximal / 2 |theta - anchor|^2``. ``inputs_of`` computes these inputs from images and
-    their rows. The first ``drawn`` rows were drawn from p_psi, the others (photographs)
-    do not depend on it; None: all were drawn.
+    Attributes:
+        images: derivatives of L_val by the training images' weights (1 in the means of its batches); empty unless
+            wanted.
+        inputs: derivatives by the training images' inputs; empty unless wanted.
+        probes: every probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
+            unbiased for ``sum_t f_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group; f_t is
+            the fraction of step t's batch that was drawn from p_psi.
+        scored: number of scored pairs of a probe and a step.
+        inputs_of: computes the inputs from images and their rows.
     """
 
+    images: Float[Tensor, "N"]
     inputs: tuple[Tensor, ...]
-    losses: LossesFrom
-    proximal: float = 0.0
-    anchor: Params | None = None
+    probes: Float[Tensor, "m"]
+    scored: int
     inputs_of: InputsOf | None = None
-    drawn: int | None = None
 
-    def __post_init__(self) -> None:
-        if self.proximal < 0.0 or (self.proximal > 0.0 and self.anchor is None):
-            raise ValueError(
-                f"unrolled: proximal must be at least 0 and wants its anchor, got {self.proximal}, "
-                f"{'no anchor' if self.anchor is None else 'an anchor'}"
-            )
+    def cotangents(
+        self, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], chunk_size: int = 16
+    ) -> Float[Tensor, "n 3 h w"]:
+        """Compute derivatives of L_val by images: the vector-Jacobian product of ``inputs_of``.
 
-    def of(self, rows: Int[Tensor, "n"]) -> tuple[Tensor, ...]:
-        """These rows of the inputs."""
-        return tuple(values[rows] for values in self.inputs)
+        ``images`` are those of the rows ``index``; ``chunk_size`` of them are differentiated at a time.
 
-    def drawn_part(self, rows: Int[Tensor, "batch"]) -> Tensor | float:
-        """The fraction of a batch that was drawn from p_psi."""
-        return 1.0 if self.drawn is None else (rows < self.drawn).double().mean()
-
-    def gradient(
-        self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]
-    ) -> Float[Tensor, "n"]:
-        """Gradient of one step's objective."""
-        point = theta.detach().requires_grad_()
-        with torch.enable_grad():
-            loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
-        (slope,) = torch.autograd.grad(loss, point)
-        return slope + self.proximal_gradient(theta, like)
-
-    def proximal_gradient(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
-        """The proximal term's gradient."""
-        if self.anchor is None or self.proximal == 0.0:
-            return 0.0
-        return self.proximal * (theta - flatten({name: self.anchor[name] for name in like}))
+        Raises:
+            ValueError: no derivatives by the inputs were accumulated.
+        """
+        if not self.inputs or self.inputs_of is None:
+            raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
+        parts = []
+        for rows, chunk in zip(index.split(chunk_size), images.split(chunk_size), strict=True):
+            rows = rows.to(self.inputs[0].device)
+            leaf = chunk.detach().requires_grad_()
+            with torch.enable_grad():
+                inputs = self.inputs_of(leaf, rows)
+            # Targets of boxes depend on no image.
+            moved = [
+                (x, pulled[rows]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
+            ]
+            values, pulled = zip(*moved, strict=True)
+            parts.append(torch.autograd.grad(values, leaf, pulled, materialize_grads=True)[0])
+        return torch.cat(parts)
 
 
 @dataclass(frozen=True)
-class ReversedStep:
-    """One reversed step.
+class ProbeGroups:
+    """The probes, of which each step scores a sample.
 
-    ``params`` is theta before it, ``along`` a_t. ``rows`` is its batch, ``scores`` these images' <dl/dtheta, a_t>, and
-    ``inputs`` the derivative of the mean score by these rows of the inputs; both are empty unless wanted.
-    """
-
-    step: int
-    params: Params
-    along: Params
-    rows: Int[Tensor, "batch"]
-    scores: Float[Tensor, "batch"]
-    inputs: tuple[Tensor, ...]
-
-
-@dataclass(frozen=True)
-class _Curved:
-    """A batch's curvature along a: ``product`` is H a, the rest as in ``ReversedStep``."""
-
-    product: Float[Tensor, "n"]
-    scores: Float[Tensor, "batch"]
-    inputs: tuple[Tensor, ...]
-
-
-def reversed_steps(
-    trajectory: Trajectory,
-    examples: Examples,
-    like: Params,
-    slope: Float[Tensor, "n"],
-    product: Product = "central_difference",
-    wanted: Wanted = "weights",
-    floor: float = 0.0,
-) -> Iterator[ReversedStep]:
-    """The steps of a training in reverse, from the last to the first recorded one.
-
-    ``like`` gives the parameters' names and shapes, ``slope`` is ``dL_val/dtheta`` after the last step. ``product`` is
-    how a batch's Hessian is multiplied: ``forward_difference``, the gradient at ``theta + h a`` minus the step's
-    recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as ``central_difference``);
-    ``central_difference``, two gradients at ``theta +- h a``, of relative error eps^(2/3); ``reverse_over_reverse``,
-    exact, at the time of three and a half gradients and the memory of a second derivative. ``floor`` is the fraction of
-    :meth:`detector.optimiser.AdamW.floored`; at 0 the derivative is that of the training.
+    Attributes:
+        losses: of probes by row.
+        groups: tables [strata, per_bin] of rows: one object's images of one factor's bins, or of the same scenes
+            (columns) under each light. All have the same number of columns.
 
     Raises:
-        ValueError: an unknown product, or a slope of another length than theta.
+        ValueError: tables of other shapes.
     """
-    if product not in get_args(Product):
-        raise ValueError(f"unrolled.product must be one of {get_args(Product)}, got {product!r}")
-    if slope.shape != trajectory.end.shape:
-        raise ValueError(
-            f"unrolled: got a slope of shape {tuple(slope.shape)}, want {tuple(trajectory.end.shape)}"
+
+    losses: IndexedLoss
+    groups: Sequence[Int[Tensor, "strata per_bin"]]
+
+    def __post_init__(self) -> None:
+        widths = {table.shape[-1] for table in self.groups}
+        if len(widths) != 1 or 0 in widths or any(table.ndim != 2 for table in self.groups):
+            shapes = [tuple(table.shape) for table in self.groups]
+            raise ValueError(f"probes: want tables [strata, per_bin] of one per_bin above 0, got {shapes}")
+
+    @property
+    def per_bin(self) -> int:
+        """Columns of every table."""
+        return self.groups[0].shape[-1]
+
+    @property
+    def count(self) -> int:
+        """One above the largest row of any group."""
+        return 1 + max(int(table.max()) for table in self.groups)
+
+
+@validated
+@dataclass(frozen=True)
+class Unrolled:
+    """``outer.adjoint``: the derivative of the training that was run.
+
+    Args:
+        product: how a batch's Hessian is multiplied, see :func:`gradient.reversal.reversed_steps`.
+        part: fraction of the steps, the last ones, that are reversed; 1 is exact.
+        max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
+        probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them. With
+            one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
+        scored_steps: about the number of steps that score probes; 0: all. A longer training is divided into blocks, of
+            which one step, drawn at random, scores probes with the block's weight, see :func:`step_weights`. More
+            objects have more probes and more steps: were all scored, the cost would grow with their square.
+        chunk_size: probes whose losses are computed at a time.
+        floor: least denominator of an entry of theta in AdamW's steps, as a fraction of what is usual for it and for
+            its tensor, see :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
+    """
+
+    product: Product = "forward_difference"
+    part: PositiveFraction = 1.0
+    max_memory_mb: Positive = 2048.0
+    probes_per_step: NonNegativeInt = 1
+    scored_steps: NonNegativeInt = 60
+    chunk_size: PositiveInt = 64
+    floor: NonNegative = 0.3
+
+    @property
+    def recording(self) -> Recording:
+        """What a training must record for it."""
+        return Recording(self.part, self.max_memory_mb)
+
+    def doubts(self, adjoint: UnrolledAdjoint) -> list[str]:
+        """Name what speaks against a reversed training."""
+        return [] if adjoint.finite else ["solver"]
+
+    def derivative(
+        self,
+        training: RecordedTraining,
+        validation: Sequence[Term],
+        estimates: Mapping[str, Estimate],
+        generator: torch.Generator,
+        wanted: Wanted = "weights",
+        probes: ProbeGroups | None = None,
+    ) -> Hypergradient[UnrolledAdjoint]:
+        """Compute the derivative of L_val through a training, for every object.
+
+        Args:
+            training: the training.
+            validation: the terms of L_val as functions of the parameters.
+            estimates: by object, its estimator as a function of the sums over the steps.
+            generator: of the choice of steps and probes.
+            wanted: which sums the estimators read.
+            probes: what the steps score.
+        """
+        began = time.perf_counter()
+        slope = gradient(validation, training.params)
+        validated = time.perf_counter()
+        sums = self.accumulate(training, slope, generator, wanted, probes)
+        walked = time.perf_counter()
+        parts = {name: estimate(sums) for name, estimate in estimates.items()}
+        finite = bool(sums.images.isfinite().all() and sums.probes.isfinite().all())
+        return Hypergradient(
+            gradients={name: part.value for name, part in parts.items()},
+            errors={name: part.standard_error for name, part in parts.items()},
+            p_values={name: part.p_values for name, part in parts.items()},
+            seconds={
+                "validation": validated - began,
+                "unrolled": walked - validated,
+                "mixed": time.perf_counter() - walked,
+            },
+            adjoint=UnrolledAdjoint(training.steps, finite, norm(slope)),
         )
-    one_sided = product == "forward_difference" and wanted == "probes"
-    curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
-    rule = trajectory.rule
-    cotangents = list(rule.begin(slope))  # L_val does not depend on the buffers after the last step
-    for segment in trajectory.segments():
-        replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
-        for step in reversed(segment):
-            state, gradient = replayed.pop()
-            rate = trajectory.rates[step]
-            if step + 1 == len(trajectory):
-                sizes = [part.numel() for part in like.values()]
-                rule = rule.floored(rule.step(state, gradient, rate, step), len(trajectory), floor, sizes)
-            cotangents, along = pulled_back(rule, state, gradient, rate, step, cotangents)
-            rows = trajectory.rows[step]
-            if one_sided:
-                of_batch = gradient - examples.proximal_gradient(state[0], like)
-                curvature = _from_one_side(examples, state[0], like, rows, along, of_batch)
-            else:
-                curvature = curved(examples, state[0], like, rows, along, wanted == "inputs")
-            cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
-            yield ReversedStep(
-                step,
-                unflatten(state[0], like),
-                unflatten(along, like),
-                rows,
-                curvature.scores,
-                curvature.inputs,
-            )
+
+    def accumulate(
+        self,
+        training: RecordedTraining,
+        slope: Float[Tensor, "n"],
+        generator: torch.Generator,
+        wanted: Wanted = "weights",
+        probes: ProbeGroups | None = None,
+    ) -> Accumulated:
+        """Reverse a training from ``slope``, ``dL_val/dtheta`` after its last step; see :meth:`derivative`."""
+        examples = training.examples
+        steps = reversed_steps(training, slope, self.product, wanted, self.floor)
+        scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)
+        per_bin = probes.per_bin if probes else 1
+        columns = shuffled_passes(per_bin, min(self.probes_per_step or per_bin, per_bin), generator)
+        every = math.ceil(training.steps / self.scored_steps) if self.scored_steps else 1
+        weights = step_weights(training.steps, every, generator)
+        images = slope.new_zeros(0 if wanted == "probes" else len(examples.inputs[0]))
+        inputs = tuple(torch.zeros_like(values) for values in examples.inputs) if wanted == "inputs" else ()
+        for step in steps:
+            if wanted != "probes":
+                images.index_add_(0, step.rows, step.scores / len(step.rows))
+            for into, part in zip(inputs, step.inputs, strict=True):
+                into.index_add_(0, step.rows, part)
+            if scoring is not None and (weight := next(weights)):
+                scoring.add(step, next(columns), weight * examples.drawn_part(step.rows))
+        total, scored = (slope.new_zeros(0), 0) if scoring is None else (scoring.total, scoring.scored)
+        return Accumulated(images, inputs, total, scored, examples.inputs_of)
 
 
-def _doubly_reversed(
-    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
-) -> _Curved:
-    """<gradient, a> differentiated once more, by theta, the images' weights and their inputs at once."""
-    point = theta.detach().requires_grad_()
-    weights = theta.new_full((len(rows),), 1.0 / len(rows)).requires_grad_()
-    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
-    with torch.enable_grad():
-        loss = examples.losses(unflatten(point, like), inputs, rows) @ weights
-        (slope,) = torch.autograd.grad(loss, point, create_graph=True)
-    leaves = (point, weights, *(inputs if with_inputs else ()))
-    product, scores, *moved = torch.autograd.grad(slope, leaves, along, materialize_grads=True)
-    return _Curved(product, scores, tuple(moved))
+Estimate = Callable[[Accumulated], MixedDerivative]
+"""One object's derivative from the sums over the steps."""
 
 
-def _differenced(
-    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
-) -> _Curved:
-    """Central differences of losses and gradients, without waiting for a device."""
-    unit, scale = _displacement(theta, along, torch.finfo(theta.dtype).eps ** (1 / 3))
-    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
-    sides = []
-    for point in (theta + unit, theta - unit):
-        leaf = point.detach().requires_grad_()
-        with torch.enable_grad():
-            losses = examples.losses(unflatten(leaf, like), inputs, rows)
-            loss = losses.mean()
-        leaves = (leaf, *(inputs if with_inputs else ()))
-        sides.append((losses.detach(), *torch.autograd.grad(loss, leaves, materialize_grads=True)))
-    scores, product, *moved = ((above - below) * (0.5 * scale) for above, below in zip(*sides, strict=True))
-    return _Curved(product, scores, tuple(moved))
+class _Scoring:
+    """Running sums of the probes' scores."""
+
+    def __init__(self, probes: ProbeGroups, like: Tensor, chunk_size: int) -> None:
+        self.losses, self.per_bin, self.chunk_size = probes.losses, probes.per_bin, chunk_size
+        self.tables = [table.to(like.device) for table in probes.groups]
+        self.total, self.scored = like.new_zeros(probes.count), 0
+        self._levels: list[Tensor] = []
+
+    def add(self, step: ReversedStep, chosen: Int[Tensor, "columns"], weight: Tensor | float) -> None:
+        """Add one step's scores of the probes in some columns, scaled to all columns and ``weight`` steps."""
+        columns = chosen.to(self.total.device)
+        rows = [table[:, columns].reshape(-1) for table in self.tables]
+        along = scores(
+            self.losses, step.params, step.along, torch.cat(rows), self.chunk_size, "central_difference"
+        )
+        parts = along.split([part.numel() for part in rows])
+        means = [part.mean() for part in parts]
+        scale = weight * self.per_bin / len(columns)
+        # An offset common to a group has no effect, but adds noise where probes are scored unequally often. It is
+        # subtracted as estimated at the step before: the mean of these same scores would correlate with their noise.
+        for into, part, level in zip(rows, parts, self._levels or means, strict=True):
+            self.total.index_add_(0, into, scale * (part - level))
+        self._levels, self.scored = means, self.scored + len(along)
 
 
-def _from_one_side(
-    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, at_theta: Tensor
-) -> _Curved:
-    """Forward difference of gradients; ``at_theta``, the one at theta, is the training's."""
-    # At eight times the root of eps, rounding and third derivatives contribute about equally.
-    unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
-    leaf = (theta + unit).detach().requires_grad_()
-    with torch.enable_grad():
-        loss = examples.losses(unflatten(leaf, like), examples.of(rows), rows).mean()
-    (beside,) = torch.autograd.grad(loss, leaf)
-    return _Curved((beside - at_theta) * scale, theta.new_zeros(0), ())
+def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
+    """Yield each step's weight, from the last step to the first.
 
-
-def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """A vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device. For a = 0 all
-    differences are zero.
+    It is the block's length for one random step of each block and 0 for others. Blocks are 1 to ``2 every - 1`` steps
+    long, longer the later in the training, where scores scatter less.
     """
-    size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
-    length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
-    return (along.double() / size).to(theta) * length.to(theta), (size / length).to(theta)
+    left = steps
+    while left:
+        block = min(left, 1 + (2 * every - 1) * (left - 1) // steps)
+        chosen = int(torch.randint(block, (), generator=generator))
+        yield from (block if step == chosen else 0 for step in range(block))
+        left -= block

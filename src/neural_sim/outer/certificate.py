@@ -10,12 +10,17 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.settings import OnUntrusted, Trust
-from neural_sim.solver.base import Status
+from annotated_types import Ge, Gt, Le, Lt
 
+from neural_sim.gradient.hypergradient import Hypergradient, ImplicitAdjoint, UnrolledAdjoint
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.gradient.significance import SMALLEST
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.ranges import validated
+
+OnUntrusted = Literal["shrink", "keep", "skip", "stop"]
 Action = Literal["kept", "shrunk", "waited", "skipped", "stopped"]
 _ACTIONS: Mapping[OnUntrusted, Action] = {
     "shrink": "shrunk", "keep": "kept", "skip": "skipped", "stop": "stopped"
@@ -26,19 +31,36 @@ Actions = dict[str, dict[str, Action]]
 """What happens to the steps, by object and factor. A trusted step waits where a checked loop does not take it yet."""
 
 
+@validated
 @dataclass(frozen=True)
-class Certificate:
-    """Quality of one iteration's hypergradient.
+class Trust:
+    """``outer.trust``: when a psi step is trusted, and what happens to one that is not.
 
-    ``stationarity`` is ``|dL_train/dtheta|`` (nan where none was assumed) and ``validation_norm`` ``|dL_val/dtheta|``.
+    The adjoint's own conditions are ``outer.adjoint``'s.
+
+    Args:
+        level: significance level of the test that an object's derivative by a factor is zero (see
+            ``gradient.significance``); None: not tested.
+        min_cosine: smallest cosine of the hypergradient with the response of training (wants ``outer.certify_every``);
+            None: no limit.
+        on_untrusted: what happens to steps that fail: those of one factor of one object where its derivative is not
+            significant, all of them where the whole hypergradient fails. ``keep`` takes them whole, as the paper does;
+            ``stop`` skips the former, and ends the loop at the latter or where no step is left.
+        shrink: fraction of an untrusted step that is taken under ``on_untrusted=shrink``.
+    """
+
+    level: Annotated[float, Ge(SMALLEST), Lt(1)] | None = 0.1
+    min_cosine: Annotated[float, Ge(-1), Le(1)] | None = 0.0
+    on_untrusted: OnUntrusted = "skip"
+    shrink: Annotated[float, Gt(0), Lt(1)] = 0.25
+
+
+@dataclass(frozen=True)
+class ImplicitQuality:
+    """The numbers of an :class:`ImplicitAdjoint` that are recorded, None where one was not measured.
+
     ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` the damped
-    operator's condition number (nan without an estimated spectrum, inf where it is not positive definite).
-    ``sensitivity`` is the hypergradient's relative change from lambda to 2 lambda (nan unless ``solver.sensitivity``).
-    ``cosine`` is with the response of training, nan where that was not measured. ``doubts`` names the
-    conditions on the whole hypergradient that fail. ``p_values``, by object and factor, are those of the null that a
-    derivative is zero: this iteration's, or, for checked steps, of the average over iterations that steps follow.
-    ``actions`` has the learned objects; a step is kept if no condition fails and its derivative is significant. What
-    waited is recorded by :meth:`waiting`.
+    operator's condition number (inf where it is not positive definite), both of an estimated spectrum.
     """
 
     stationarity: float
@@ -48,11 +70,75 @@ class Certificate:
     solver_residual: float
     damping: float
     damping_raises: int
-    curvature_min: float
-    curvature_max: float
-    condition: float
-    sensitivity: float
-    cosine: float
+    curvature_min: float | None
+    curvature_max: float | None
+    condition: float | None
+    sensitivity: float | None
+
+    @staticmethod
+    def of(adjoint: ImplicitAdjoint) -> ImplicitQuality:
+        """Summarise a solve."""
+        solution, damping = adjoint.solution, adjoint.damping
+        return ImplicitQuality(
+            stationarity=adjoint.stationarity,
+            validation_norm=adjoint.validation_norm,
+            solver_status=solution.status.name,
+            solver_steps=solution.steps,
+            solver_residual=solution.residual,
+            damping=damping.value,
+            damping_raises=adjoint.damping_raises,
+            curvature_min=damping.spectrum.smallest if damping.spectrum else None,
+            curvature_max=damping.spectrum.largest if damping.spectrum else None,
+            condition=damping.condition if damping.spectrum else None,
+            sensitivity=adjoint.sensitivity,
+        )
+
+    def parts(self) -> list[str]:
+        """Describe the solve for the log."""
+        spectrum = ""
+        if self.curvature_min is not None:
+            spectrum = f"H [{self.curvature_min:.2g}, {self.curvature_max:.3g}] "
+        condition = "" if self.condition is None else f" cond {self.condition:.3g}"
+        return [
+            f"|dval| {self.validation_norm:.2g}",
+            f"|dtrain| {self.stationarity:.2g}",
+            f"{self.solver_status} {self.solver_steps} steps res {self.solver_residual:.1g}",
+            f"{spectrum}lambda {self.damping:.2g}{condition}",
+            *([] if self.sensitivity is None else [f"2 lambda {self.sensitivity:.0%}"]),
+        ]
+
+
+@dataclass(frozen=True)
+class UnrolledQuality:
+    """The numbers of an :class:`UnrolledAdjoint` that are recorded."""
+
+    validation_norm: float
+    reversed_steps: int
+
+    def parts(self) -> list[str]:
+        """Describe the reversed training for the log."""
+        return [f"|dval| {self.validation_norm:.2g}", f"reversed {self.reversed_steps} steps"]
+
+
+Quality = ImplicitQuality | UnrolledQuality
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Quality of one iteration's hypergradient.
+
+    Attributes:
+        adjoint: how the adjoint went; None where trainings were compared.
+        cosine: with the response of training, None where that was not measured.
+        doubts: names of the conditions on the whole hypergradient that fail.
+        p_values: by object and factor, of the null that a derivative is zero: this iteration's, or, for trust-region
+            steps, of the average over iterations that steps follow.
+        actions: what happens to the learned objects' steps: one is kept if no condition fails and its derivative is
+            significant. What waited is recorded by :meth:`waiting`.
+    """
+
+    adjoint: Quality | None
+    cosine: float | None
     doubts: list[str]
     p_values: dict[str, dict[str, float]]
     actions: Actions
@@ -68,7 +154,7 @@ class Certificate:
         return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
-        """This certificate with the trusted ones among ``steps``, of an object and a factor, as waited."""
+        """Record the trusted ones among ``steps``, of an object and a factor, as waited."""
         actions: Actions = {
             name: {
                 factor: "waited" if action == "kept" and (name, factor) in steps else action
@@ -88,11 +174,11 @@ def certify(
     p_values: Mapping[str, Mapping[str, float]],
     names: Sequence[str],
     factors: Sequence[str],
-    cosine: float,
     trust: Trust,
-    on_untrusted: OnUntrusted,
+    adjoint: Unrolled | Implicit,
+    cosine: float | None = None,
 ) -> Certificate:
-    """The certificate of an iteration's hypergradient.
+    """Certify an iteration's hypergradient.
 
     No step follows a gradient that is not finite. A derivative is insignificant where its p-value is above
     ``trust.level``; one that was not tested counts as significant.
@@ -100,32 +186,27 @@ def certify(
     Args:
         result: the hypergradient.
         p_values: of the derivatives that steps follow, by object and factor.
-        names, factors: the learned objects and the factors of psi.
-        cosine: with the response of training, nan if not measured.
-        trust, on_untrusted: the conditions, and what happens where they fail.
+        names: the learned objects.
+        factors: the factors of psi.
+        trust: the conditions, and what happens where they fail.
+        adjoint: the adjoint's own conditions.
+        cosine: with the response of training, None if not measured.
     """
-    finite = all(bool(gradient.isfinite().all()) for gradient in result.psi_gradients.values())
-    doubts = _doubts(result, cosine, trust) + ([] if finite else ["not finite"])
+    finite = all(bool(gradient.isfinite().all()) for gradient in result.gradients.values())
+    doubts = _adjoint_doubts(result, adjoint)
+    if cosine is not None and trust.min_cosine is not None and cosine < trust.min_cosine:
+        doubts.append("cosine")
+    if not finite:
+        doubts.append("not finite")
     if doubts:
-        action = _ACTIONS[on_untrusted]
+        action = _ACTIONS[trust.on_untrusted]
         if not finite and action in ("shrunk", "kept"):
             action = "skipped"
         actions: Actions = {name: dict.fromkeys(factors, action) for name in names}
     else:
-        actions = _by_signal(p_values, names, factors, trust.level, on_untrusted)
-    spectrum, solution = result.damping.spectrum, result.solution
+        actions = _by_signal(p_values, names, factors, trust)
     return Certificate(
-        stationarity=result.stationarity,
-        validation_norm=result.validation_norm,
-        solver_status=solution.status.name,
-        solver_steps=solution.steps,
-        solver_residual=solution.residual,
-        damping=result.damping.value,
-        damping_raises=result.damping_raises,
-        curvature_min=spectrum.smallest if spectrum else math.nan,
-        curvature_max=spectrum.largest if spectrum else math.nan,
-        condition=result.damping.condition,
-        sensitivity=result.sensitivity,
+        adjoint=_quality(result),
         cosine=cosine,
         doubts=doubts,
         p_values={name: dict(by_factor) for name, by_factor in p_values.items()},
@@ -133,80 +214,64 @@ def certify(
     )
 
 
+def _adjoint_doubts(result: Hypergradient, settings: Unrolled | Implicit) -> list[str]:
+    adjoint = result.adjoint
+    if isinstance(adjoint, ImplicitAdjoint) and isinstance(settings, Implicit):
+        return settings.doubts(adjoint)
+    if isinstance(adjoint, UnrolledAdjoint) and isinstance(settings, Unrolled):
+        return settings.doubts(adjoint)
+    return []
+
+
+def _quality(result: Hypergradient) -> Quality | None:
+    adjoint = result.adjoint
+    if isinstance(adjoint, ImplicitAdjoint):
+        return ImplicitQuality.of(adjoint)
+    return None if adjoint is None else UnrolledQuality(adjoint.validation_norm, adjoint.steps)
+
+
 def _by_signal(
-    p_values: Mapping[str, Mapping[str, float]],
-    names: Sequence[str],
-    factors: Sequence[str],
-    level: float | None,
-    on_untrusted: OnUntrusted,
+    p_values: Mapping[str, Mapping[str, float]], names: Sequence[str], factors: Sequence[str], trust: Trust
 ) -> Actions:
-    """Keep the steps of significant derivatives. An object at its optimum has none, and is no reason to stop the
-    others: ``stop`` skips its step, and ends the loop where no step is left.
+    """Keep the steps of significant derivatives.
+
+    An object at its optimum has none, and is no reason to stop the others: ``stop`` skips its step, and ends the loop
+    where no step is left.
     """
-    otherwise: Action = "skipped" if on_untrusted == "stop" else _ACTIONS[on_untrusted]
-    limit = math.inf if level is None else level
+    stops = trust.on_untrusted == "stop"
+    otherwise: Action = "skipped" if stops else _ACTIONS[trust.on_untrusted]
+    limit = math.inf if trust.level is None else trust.level
     actions: Actions = {
         name: {f: "kept" if p_values.get(name, {}).get(f, 0.0) <= limit else otherwise for f in factors}
         for name in names
     }
-    if on_untrusted == "stop" and not any("kept" in by_factor.values() for by_factor in actions.values()):
+    if stops and not any("kept" in by_factor.values() for by_factor in actions.values()):
         return {name: dict.fromkeys(factors, "stopped") for name in names}
     return actions
 
 
-def _doubts(result: Hypergradient, cosine: float, trust: Trust) -> list[str]:
-    """Names of the conditions that the whole hypergradient fails; nan fails none."""
-    solution = result.solution
-    # solver=identity never iterates: whoever chooses it accepts its residual.
-    residual = 0.0 if solution.status is Status.APPROXIMATE else solution.residual
-    failed = {
-        "solver": solution.status in (Status.NEGATIVE_CURVATURE, Status.NON_FINITE),
-        "residual": _above(residual, trust.max_residual),
-        "stationarity": _above(result.stationarity, trust.max_stationarity),
-        "sensitivity": _above(result.sensitivity, trust.max_sensitivity),
-        "cosine": _above(-cosine, None if trust.min_cosine is None else -trust.min_cosine),
-    }
-    return [name for name, holds in failed.items() if holds]
-
-
-def _above(value: float, limit: float | None) -> bool:
-    return limit is not None and value > limit
-
-
 def line(certificate: Certificate, iteration: int, iterations: int, validation_loss: float) -> str:
-    """One line for the log, p-values by factor, object by object."""
+    """Describe an iteration in one line for the log, p-values by factor, object by object."""
     c = certificate
     tested = {factor: [p[factor] for p in c.p_values.values()] for p in c.p_values.values() for factor in p}
     actions = Counter(action for by_factor in c.actions.values() for action in by_factor.values())
     parts = [
         f"psi {iteration}/{iterations} val {validation_loss:.4f}",
-        f"|dval| {c.validation_norm:.2g}",
-        *_adjoint(c),
-        *([] if math.isnan(c.sensitivity) else [f"2 lambda {c.sensitivity:.0%}"]),
+        *([] if c.adjoint is None else c.adjoint.parts()),
         *(f"p {factor} {'/'.join(f'{p:.2g}' for p in values)}" for factor, values in tested.items()),
-        *([] if math.isnan(c.cosine) else [f"cos {c.cosine:.2f}"]),
+        *([] if c.cosine is None else [f"cos {c.cosine:.2f}"]),
         ", ".join(f"{action} {count}" for action, count in actions.items())
         + (f" ({', '.join(c.doubts)})" if c.doubts else ""),
     ]
     return "; ".join(parts)
 
 
-def _adjoint(c: Certificate) -> list[str]:
-    """The adjoint, for the log; only a solve has a residual and a spectrum."""
-    method = f"{c.solver_status} {c.solver_steps} steps"
-    if math.isnan(c.stationarity):
-        return [method]
-    return [
-        f"|dtrain| {c.stationarity:.2g}",
-        f"{method} res {c.solver_residual:.1g}",
-        f"H [{c.curvature_min:.2g}, {c.curvature_max:.3g}] lambda {c.damping:.2g} cond {c.condition:.3g}",
-    ]
-
-
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Counts over recorded iterations: steps (one for each object and factor), trusted ones that waited, untrusted
-    ones, what happened to these and why (failed conditions, or ``signal``: no significance), objects' steps that were
-    judged, and those that were rejected; and every measured cosine.
+    """Count over recorded iterations what happened to steps.
+
+    Counted are steps (one for each object and factor), trusted ones that waited, untrusted ones, what happened to these
+    and why (failed conditions, or ``signal``: no significance), objects' steps that were judged, and those that were
+    rejected. Every measured cosine is listed.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
@@ -225,5 +290,5 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),
         "judged": len(accepted),
         "rejected": accepted.count(False),
-        "cosines": [c["cosine"] for c in certificates if not math.isnan(c["cosine"])],
+        "cosines": [c["cosine"] for c in certificates if c["cosine"] is not None],
     }

@@ -3,168 +3,172 @@
 from __future__ import annotations
 
 import logging
-import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.trajectory import Recording
 from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.certificate import certify
-from neural_sim.outer.checked import CheckedSteps
-from neural_sim.outer.inner import InnerLoop, timed
+from neural_sim.outer.certificate import Certificate, certify
+from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.objective import Objective
-from neural_sim.outer.steps import FreeSteps, Steps, Verdict
-from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.outer.records import Cost
+from neural_sim.outer.steps import LearnedObjects, PValues, Steps, Verdict
+from neural_sim.outer.trust_region import TrustRegion
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Derived:
+    """The derivative of a training at psi; p-values are of all derivatives that steps follow."""
+
+    trained: Trained
+    result: Hypergradient
+    p_values: PValues
 
 
 class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
 
-    Where steps are checked, an iteration begins with a training that accepts or rejects the last step; the last
-    iteration ends with it.
+    In a trust region, consecutive trainings have common random numbers, an iteration begins with a training that
+    accepts or rejects the last step, and the last iteration ends with it.
     """
 
-    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> None:
-        super().__init__(inner, psi, inner.settings.iterations)
-        self._learned = _learned(inner)
-        self._names = [self.scene.names[label] for label in self._learned]
-        self.steps = self._begin()
+    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], generator: torch.Generator) -> None:
+        super().__init__(inner, psi, inner.settings.iterations, generator)
+        self.objects = learned_objects(inner)
+        self._labels = list(self.objects.labels)
+        self._judges = isinstance(self.settings.steps, TrustRegion)
+        self.numbers = replace(self.numbers, common=self._judges)
+        start = self.psi[self._labels]
+        self.steps: Steps = self.settings.steps.begin(self.objects, start, self.settings.iterations)
         self._recording: Recording | None = None
         self._before = psi.new_zeros(0, 0)
         self._folds: list[Objective] = []
         self._stopped = False
 
-    def _begin(self) -> Steps:
-        psi, distribution = self.psi[self._learned], self.scene.distribution
-        if self.settings.steps == "free":
-            return FreeSteps(self.settings, distribution, self._names, psi)
-        self.inner.common_numbers = True
-        shrink = self.settings.trust.shrink
-        return CheckedSteps(self.settings.checks, shrink, distribution, self._names, self._learned, psi)
-
+    @override
     def training_step(self, batch: int, batch_idx: int) -> None:
-        seconds: dict[str, float] = {}
-        verdicts: dict[str, Verdict] = {}
-        last = self.settings.steps == "checked" and len(self.records) + 1 == self.rounds
-        if self.steps.pending or last:
-            rendered, _, training_loss = self._trained(seconds)
-            with timed(seconds, "judge", self.inner.device):
-                scores = self.inner.scores()
-                if self.steps.pending:
-                    verdicts = self.steps.judge(self._before, scores)
-        if last:
-            by_class = scores.sum(1)
-            self.record(self.psi, rendered.images, training_loss, seconds, scores=by_class, verdicts=verdicts)
-            self._go_to(self.steps.reported)
-            return
-        self.psi.data[self._learned] = self.steps.reported
-        checks, first, every = self.settings.steps == "checked", not self.records, self.settings.certify_every
-        due = every > 0 and (len(self.records) + 1) % every == 0
-        products = 0
-        for trial in range(self.settings.checks.trainings if checks and first else 1):
-            if trial or not first:
-                self.inner.renew()  # what is peculiar to one training averages out of the derivatives
-            rendered, result, training_loss = self._differentiated(seconds, whole=due)
-            products += _products(result)
-            p_values = self.steps.observe(result)
-        with timed(seconds, "certify", self.inner.device):
-            cosine = self._cosine(result) if due else math.nan
-        factors = self.scene.distribution.names
-        trust, otherwise = self.settings.trust, self.settings.on_untrusted
-        certificate = certify(result, p_values, self._names, factors, cosine, trust, otherwise)
-        by_class, images = self._before.sum(1), rendered.images
-        after = self.steps.next(certificate)
-        certificate = certificate.waiting(self.steps.waiting)
-        self.record(
-            self.psi, images, training_loss, seconds, certificate, result, products, by_class, verdicts
-        )
-        self._stopped = certificate.stopped
-        self._go_to(after)
+        """Judge the last step, differentiate a training, and take the next step."""
+        if self._judges and len(self.records) + 1 == self.rounds:
+            trained, verdicts = self._judge()
+            self.record(trained, trained.scores.sum(1), verdicts)
+        else:
+            verdicts = self._judge()[1] if self.steps.pending else {}
+            self.psi.data[self._labels] = self.steps.reported
+            derived = self._derive()
+            certificate = self._step(derived)
+            self.record(derived.trained, self._before.sum(1), verdicts, certificate, derived.result)
+            self._stopped = certificate.stopped
+        self.psi.data[self._labels] = self.steps.reported
+        self.trajectory.append(self.psi.detach().clone())
 
-    def _differentiated(
-        self, seconds: dict[str, float], whole: bool
-    ) -> tuple[RenderedImages, Hypergradient, float]:
-        """Images at psi, the derivative of a training on them, and its loss. ``whole``: of L_val on all images, as the
-        reference of a certificate is.
+    def _judge(self) -> tuple[Trained, dict[str, Verdict]]:
+        """Train at psi, and accept or reject the step that led there."""
+        trained, verdicts = self.train_on(self.psi), {}
+        with self.timed("judge"):
+            scores = trained.scores
+            if self.steps.pending:
+                self.steps, verdicts = self.steps.judge(self._before, scores)
+        return trained, verdicts
+
+    def _derive(self) -> Derived:
+        """Take the derivative at psi: of one training, in a trust region's first iteration of several."""
+        first = not self.records
+        for trial in range(self.settings.steps.trainings if first else 1):
+            if trial or not first:
+                self.renew()  # what is peculiar to one training averages out of the derivatives
+            trained, result = self._differentiated()
+            self.steps, p_values = self.steps.observe(result)
+        return Derived(trained, result, p_values)
+
+    def _differentiated(self) -> tuple[Trained, Hypergradient]:
+        """Train at psi, and take the derivative of that training.
+
+        A derivative that is compared with the response is of L_val on all images, as the response is.
         """
-        with timed(seconds, "probes", self.inner.device):
+        with self.timed("probes"):
             self._prepare()
-        rendered, cached, training_loss = self._trained(seconds, self._recording)
-        with timed(seconds, "judge", self.inner.device):
-            self._before = self.inner.scores()
-        self.inner.differentiated = self.inner.objective if whole else self._fold()
-        with timed(seconds, "hypergradient", self.inner.device):
-            result = self._derivative(rendered, cached)
+        if not self.records and not self.settings.train_first:
+            # The warm start has trained at this psi, on more images and for more steps than an iteration.
+            trained = self.charged(self.inner.untrained(self.psi, self.numbers, self.theta))
+        else:
+            trained = self.train_on(self.psi, self._recording)
+        with self.timed("judge"):
+            self._before = trained.scores
+        objective = self.inner.objective if self._certifies else self._fold()
+        with self.timed("hypergradient"):
+            result = self._derivative(trained, objective)
         for phase, spent in result.seconds.items():
             name = f"hypergradient_{phase}"
-            seconds[name] = seconds.get(name, 0.0) + spent
-        return rendered, result, training_loss
+            self._seconds[name] = self._seconds.get(name, 0.0) + spent
+        self.charge(Cost(products=result.products))
+        return trained, result
+
+    def _step(self, derived: Derived) -> Certificate:
+        """Certify the derivative, and step psi as far as its certificate allows."""
+        cosine, trust = None, self.settings.trust
+        with self.timed("certify"):
+            if self._certifies:
+                cosine = self._cosine(derived.result)
+        certificate = certify(
+            derived.result,
+            derived.p_values,
+            self.objects.names,
+            self.scene.distribution.names,
+            trust,
+            self.settings.adjoint,
+            cosine,
+        )
+        self.steps = self.steps.propose(certificate, trust.shrink)
+        return certificate.waiting(self.steps.waiting)
+
+    @property
+    def _certifies(self) -> bool:
+        """Whether this iteration's derivative is compared with the response of training."""
+        every = self.settings.certify_every
+        return every > 0 and (len(self.records) + 1) % every == 0
 
     def _fold(self) -> Objective:
-        """The next part of L_val. The scatter of derivatives then has that of the validation images in it."""
-        if self.settings.steps != "checked" or self.settings.checks.folds == 1:
+        """Take the next part of L_val. The scatter of derivatives then has that of the validation images in it."""
+        count = self.settings.steps.folds
+        if count == 1:
             return self.inner.objective
         if not self._folds:
-            self._folds = self.inner.objective.folds(self.settings.checks.folds, self.inner.generator)
+            self._folds = self.inner.objective.folds(count, self.numbers.generator)
         return self._folds.pop()
 
-    def _trained(
-        self, seconds: dict[str, float], recording: Recording | None = None
-    ) -> tuple[RenderedImages, CachedSet, float]:
-        """Images at psi, and the loss of a training on them."""
-        with timed(seconds, "render", self.inner.device):
-            rendered = self.inner.draw(self.psi)
-        with timed(seconds, "features", self.inner.device):
-            cached = self.inner.training_set(rendered.images)
-        with timed(seconds, "train", self.inner.device):
-            if not self.records and not self.settings.train_first:
-                # The warm start has trained at this psi, on more images and for more steps than an iteration.
-                return rendered, cached, self.inner.loss(cached)
-            return rendered, cached, self.inner.train(cached, recording)
-
     def derivative(self) -> Hypergradient:
-        """The derivative at psi as an iteration takes it, by new images and a training on them; psi does not move."""
+        """Take the derivative at psi as an iteration does, by new images and a training on them; psi does not move."""
         self._prepare()
-        rendered = self.inner.draw(self.psi)
-        cached = self.inner.training_set(rendered.images)
-        self.inner.train(cached, self._recording)
-        return self._derivative(rendered, cached)
+        trained = self.inner.train(self.psi, self.numbers, self.theta, self._recording)
+        self.theta = trained.theta
+        return self._derivative(trained, self.inner.objective)
 
-    def _go_to(self, psi: Float[Tensor, "learned K"]) -> None:
-        self.psi.data[self._learned] = psi
-        reported = self.psi.detach().clone()
-        reported[self._learned] = self.steps.reported
-        self.trajectory.append(reported)
-
+    @override
     def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
         return -1 if self._stopped else None
 
     def _prepare(self) -> None:
-        """Draw what the derivative needs beside the training images."""
+        """Draw what the derivative needs in addition to the training images."""
 
     @abstractmethod
-    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
-        """dL_val/dpsi of the learned objects, zeros for the others."""
+    def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:
+        """Compute d objective/dpsi of the learned objects, zeros for the others."""
 
-    def _cosine(self, result: Hypergradient) -> float:
-        """Cosine of the derivative with an independent reference; nan without one."""
-        return math.nan
-
-
-def _products(result: Hypergradient) -> int:
-    """Hessian products of the solve and of the damping before it."""
-    spectrum = result.damping.spectrum
-    return result.solution.products + (spectrum.products if spectrum else 0)
+    def _cosine(self, result: Hypergradient) -> float | None:
+        """Compare the derivative with an independent reference; None without one."""
+        return None
 
 
-def _learned(inner: InnerLoop) -> list[int]:
-    """Classes of the objects whose psi moves: those that were asked for, else all that validation images show.
+def learned_objects(inner: InnerLoop) -> LearnedObjects:
+    """Choose the objects whose psi moves: those that were asked for, else all that validation images show.
 
     Of an object that they do not show they measure only where it is taken for another, whatever its own best psi is.
 
@@ -173,12 +177,16 @@ def _learned(inner: InnerLoop) -> list[int]:
     """
     names, wanted = inner.scene.names, inner.settings.learned
     if wanted is not None:
-        return [label for label, name in enumerate(names) if name in wanted]
-    if not inner.shown:
+        labels = [label for label, name in enumerate(names) if name in wanted]
+    elif not inner.shown:
         raise ValueError(
             "the target's validation images show none of the objects, so that psi cannot be learned"
         )
-    unseen = [name for label, name in enumerate(names) if label not in inner.shown]
-    if unseen:
-        _log.warning("psi stays as it is of objects that no validation image shows: %s", ", ".join(unseen))
-    return sorted(inner.shown)
+    else:
+        labels = sorted(inner.shown)
+        unseen = [name for label, name in enumerate(names) if label not in inner.shown]
+        if unseen:
+            _log.warning(
+                "psi stays as it is of objects that no validation image shows: %s", ", ".join(unseen)
+            )
+    return LearnedObjects([names[label] for label in labels], labels, inner.scene.distribution)

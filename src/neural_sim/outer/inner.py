@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -16,10 +16,11 @@ from torch import Tensor
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Outputs, Parameters
 from neural_sim.detector.real import Sampling
-from neural_sim.detector.training import Training, train_detector
+from neural_sim.detector.training import Training, TrainingHistory, train_detector
 from neural_sim.detector.trajectory import Recording, Trajectory
 from neural_sim.devices import placed, synchronise
 from neural_sim.outer.objective import Objective
+from neural_sim.outer.records import Cost
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import HARD, Draws, HardDraws, SceneDistribution
 from neural_sim.randomness import stream
@@ -43,138 +44,258 @@ def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bo
     return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
-class InnerLoop:
-    """The inner problem of Eq. 1: ``theta`` after training on images of one psi.
+@dataclass(frozen=True)
+class Numbers:
+    """The random numbers of trainings.
 
-    The backbone is that of ``params``, frozen but for its last ``settings.loop_layers`` stages. These, pyramid and
-    head are trained for ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them, on
-    the device of ``params``, where the scene's fields are too. Relaxed draws, and images under a light that moves,
-    are always rendered anew; all others come from a pool of poses of every bin.
-
-    Args:
-        scene: what images are drawn from.
-        detector, params: the detector and its warm start.
-        validation: the labelled target set, on any device; the loop sees no other images of the target.
-        settings: of the psi loop.
-        training: batch size and weight decay.
-        generator: of all draws.
-        draws: how the method draws images.
-        photographs: labelled ones that every training has beside the drawn images, as ``training.real`` says.
-
-    With ``common_numbers`` all draws and trainings use the same random numbers, so that they differ by psi alone.
-    ``objective`` is L_val, ``differentiated`` the part of it whose derivative is taken: all, unless it was replaced.
-    ``shown`` are the classes of which a validation image shows an object. ``images`` and ``steps`` count labelled
-    images and optimiser steps; ``cpu_begun`` is the processor time before the pool was rendered.
+    Attributes:
+        generator: the loop's.
+        common: whether all draws and trainings use the same random numbers, so that they differ by psi alone.
+        index: number of the common ones.
     """
 
-    def __init__(
-        self,
+    generator: torch.Generator
+    common: bool = False
+    index: int = 0
+
+    def of(self, purpose: str) -> torch.Generator:
+        """Return the generator of a training's ``images``, or of the ``training`` itself."""
+        return stream(self.index, f"common {purpose}", self.generator) if self.common else self.generator
+
+    def renewed(self) -> Numbers:
+        """Return other common random numbers."""
+        return replace(self, index=self.index + 1)
+
+
+@dataclass(frozen=True)
+class LoopInputs:
+    """What a psi loop begins with.
+
+    Attributes:
+        detector: the detector.
+        params: its warm start, on the device where the loop trains and the scene's fields are.
+        validation: the labelled target set, on any device; the loop sees no other images of the target.
+        photographs: labelled ones that train with the drawn images, as ``training.real`` says.
+    """
+
+    detector: Detector
+    params: Parameters
+    validation: LabelledImages
+    photographs: LabelledImages | None = None
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A detector after a training on images of one psi, or one that was trained elsewhere and these images.
+
+    Attributes:
+        psi: of which the images were drawn.
+        rendered: the drawn images.
+        examples: the training set: these images and the photographs, under the backbone.
+        theta: the detector's parameters.
+        trainable: their trained part.
+        loss: of the last epoch; nan for no epochs.
+        trajectory: the steps, where they were recorded.
+        objective: L_val.
+        cost: images and steps.
+        seconds: by phase: render, features, train.
+    """
+
+    psi: Float[Tensor, "objects K"]
+    rendered: RenderedImages
+    examples: CachedSet
+    theta: Parameters
+    trainable: Parameters
+    loss: float
+    trajectory: Trajectory | None
+    objective: Objective
+    cost: Cost
+    seconds: Mapping[str, float]
+
+    @cached_property
+    def _outputs(self) -> Outputs:
+        with torch.no_grad():
+            return self.objective.outputs(self.trainable)
+
+    @property
+    def validation_loss(self) -> float:
+        """L_val."""
+        return float(self.objective.of_outputs(self._outputs))
+
+    @property
+    def scores(self) -> Float[Tensor, "classes images"]:
+        """Each validation image's contribution to the score of each class, more is better."""
+        return self.objective.scores(self._outputs)
+
+
+@dataclass(frozen=True)
+class InnerLoop:
+    """The inner problem of Eq. 1: theta after training on images of one psi.
+
+    The backbone is that of ``params``, frozen but for its last ``settings.loop_layers`` stages. These, pyramid and
+    head are trained for ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them.
+    Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a pool of poses
+    of every bin.
+
+    Attributes:
+        scene: what images are drawn from.
+        detector: the detector as the loop trains it.
+        params: its warm start.
+        start: where a training begins that does not go on from the one before.
+        objective: L_val.
+        photographs: those that train with the drawn images.
+        settings: of the psi loop.
+        training: batch size and weight decay.
+        draws: how the method draws images.
+        pool: the scene of poses that are rendered once, where there is one.
+        preparation: cost of rendering the pool.
+    """
+
+    scene: Scene
+    detector: Detector
+    params: Parameters
+    start: Parameters
+    objective: Objective
+    photographs: CachedSet | None
+    settings: Outer
+    training: Training
+    draws: Draws = HARD
+    pool: Scene | None = None
+    preparation: Cost = field(default_factory=Cost)
+
+    @staticmethod
+    def prepare(
         scene: Scene,
-        detector: Detector,
-        params: Parameters,
-        validation: LabelledImages,
+        inputs: LoopInputs,
         settings: Outer,
         training: Training,
         generator: torch.Generator,
         draws: Draws = HARD,
-        photographs: LabelledImages | None = None,
-    ) -> None:
-        detector = detector.in_loop(settings.loop_layers)
-        self.scene, self.detector, self.theta, self.settings = scene, detector, params, settings
-        self.training, self.generator = training, generator
-        self.backbone, self.warm_start = detector.split(params)
-        self.validation = CachedSet.of(detector, self.backbone, validation)
-        self.shown = set(validation.labels[validation.labels >= 0].tolist())
-        self.draws, self.device = draws, self.validation.device
-        self.photographs = None
-        if photographs is not None:
-            self.photographs = CachedSet.of(detector, self.backbone, photographs)
-        self.pool: Scene | None = None
-        began, self.cpu_begun = time.perf_counter(), time.process_time()
+    ) -> InnerLoop:
+        """Render the pool, and draw the initial parameters of trainings."""
+        detector, params = inputs.detector.in_loop(settings.loop_layers), inputs.params
+        backbone, _ = detector.split(params)
+        validation = CachedSet.of(detector, backbone, inputs.validation)
+        photographs = None
+        if inputs.photographs is not None:
+            photographs = CachedSet.of(detector, backbone, inputs.photographs)
+        pool, began, cpu_began = None, time.perf_counter(), time.process_time()
         if pooled(settings, draws, scene.distribution):
-            self.pool = pool_of(scene, settings.pool_per_bin, generator)
-        synchronise(self.device)
-        self.pool_seconds = time.perf_counter() - began
-        self._start = params
+            pool = pool_of(scene, settings.pool_per_bin, generator)
+        synchronise(validation.device)
+        spent = Cost(seconds=time.perf_counter() - began, cpu_seconds=time.process_time() - cpu_began)
+        start = params
         if settings.start != "warm":
             warm = {name: value for name, value in params.items() if name.startswith("backbone.")}
-            self._start = {**placed(detector.init(generator), self.device), **warm}
-        self.objective = Objective(self.validation, validation, settings.objective, settings.smooth)
-        self.differentiated = self.objective
-        self.images = self.steps = self._numbers = 0
-        self.common_numbers = False
-        self.trajectory: Trajectory | None = None
-        self._evaluated: tuple[Parameters, Outputs] = ({}, (torch.empty(0), torch.empty(0)))
+            start = {**placed(detector.init(generator), validation.device), **warm}
+        objective = Objective(validation, inputs.validation, settings.objective)
+        return InnerLoop(
+            scene, detector, params, start, objective, photographs, settings, training, draws, pool, spent
+        )
 
     @property
-    def trainable(self) -> Parameters:
-        """The trained part of theta."""
-        return self.detector.split(self.theta)[1]
+    def backbone(self) -> Parameters:
+        """The frozen part of the parameters."""
+        return self.detector.split(self.params)[0]
 
-    def draw(self, psi: Float[Tensor, "objects K"]) -> RenderedImages:
-        """An iteration's training images, without maps where no derivative goes through them."""
+    @property
+    def warm_start(self) -> Parameters:
+        """The trained part of the parameters at the warm start."""
+        return self.detector.split(self.params)[1]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the loop trains."""
+        return self.objective.cached.device
+
+    @property
+    def shown(self) -> set[int]:
+        """Classes of which a validation image shows an object."""
+        labels = self.objective.images.labels
+        return set(labels[labels >= 0].tolist())
+
+    def draw(self, psi: Float[Tensor, "objects K"], numbers: Numbers) -> RenderedImages:
+        """Draw training images, without maps where no derivative goes through them."""
         scene, count = self.pool or self.scene, self.settings.images_per_object
-        rendered = scene.training_set(psi, count, self._common("images"), self.draws)
-        self.images += len(rendered)
+        rendered = scene.training_set(psi, count, numbers.of("images"), self.draws)
         return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
 
     def training_set(self, images: LabelledImages) -> CachedSet:
-        """The drawn images, and after them the photographs that train with them, under the backbone."""
+        """Return drawn images, and after them the photographs that train with them, under the backbone."""
         drawn = CachedSet.of(self.detector, self.backbone, images)
         return drawn if self.photographs is None else CachedSet.concatenate([drawn, self.photographs])
 
-    def drawn(self, images: CachedSet) -> int:
-        """How many of a training set's images were drawn from p_psi."""
-        return len(images) - (0 if self.photographs is None else len(self.photographs))
+    def weights(self, examples: CachedSet) -> Float[Tensor, "N"]:
+        """Return the examples' weights in the training loss, on the CPU: 1 / N, or as photographs are mixed in."""
+        sampling = self._sampling(examples)
+        return torch.full((len(examples),), 1.0 / len(examples)) if sampling is None else sampling.weights
 
-    def weights(self, images: CachedSet) -> Float[Tensor, "N"]:
-        """The images' weights in the training loss, on the CPU: 1 / N, or as photographs and drawn images are mixed."""
-        sampling = self._sampling(images)
-        return torch.full((len(images),), 1.0 / len(images)) if sampling is None else sampling.weights
-
-    def _sampling(self, images: CachedSet) -> Sampling | None:
+    def _sampling(self, examples: CachedSet) -> Sampling | None:
         if self.photographs is None:
             return None
-        real, batch_size = self.training.real, self.training.batch_size
-        return real.sampling(self.drawn(images), len(self.photographs), batch_size)
+        count = len(self.photographs)
+        return self.training.real.sampling(len(examples) - count, count, self.training.batch_size)
 
-    def _common(self, purpose: Literal["images", "training"]) -> torch.Generator:
-        """A generator of the same random numbers until :meth:`renew`, or of new ones without ``common_numbers``."""
-        if not self.common_numbers:
-            return self.generator
-        return stream(self._numbers, f"common {purpose}", self.generator)
+    def train(
+        self,
+        psi: Float[Tensor, "objects K"],
+        numbers: Numbers,
+        theta: Parameters | None = None,
+        recording: Recording | None = None,
+    ) -> Trained:
+        """Train on images of psi.
 
-    def renew(self) -> None:
-        """Change the common random numbers."""
-        self._numbers += 1
-
-    def train(self, images: CachedSet, recording: Recording | None = None) -> float:
-        """Train theta on a :meth:`training_set`; returns the last epoch's loss, nan for no epochs.
-
-        With ``recording``, the steps are in ``trajectory``.
+        Args:
+            psi: of p_psi.
+            numbers: of the draws and the training.
+            theta: where a training goes on under ``settings.start=previous``; None: from the warm start.
+            recording: what is recorded of the steps.
         """
-        if self.settings.epochs == 0:
-            return math.nan
-        sampling = self._sampling(images)
-        how = self.training.of(self._epochs(len(images), sampling))
+        theta = self.params if theta is None else theta
+        seconds: dict[str, float] = {}
+        rendered, examples = self._examples(psi, numbers, seconds)
+        history = None
+        with timed(seconds, "train", self.device):
+            if self.settings.epochs > 0:
+                theta, history = self._fit(examples, numbers, theta, recording)
+        return self._trained(psi, rendered, examples, theta, seconds, history)
+
+    def untrained(self, psi: Float[Tensor, "objects K"], numbers: Numbers, theta: Parameters) -> Trained:
+        """Draw images of psi for a detector that was trained elsewhere; the loss is theirs."""
+        seconds: dict[str, float] = {}
+        rendered, examples = self._examples(psi, numbers, seconds)
+        with timed(seconds, "train", self.device):
+            loss = self.loss(examples, theta)
+        return replace(self._trained(psi, rendered, examples, theta, seconds), loss=loss)
+
+    def _examples(
+        self, psi: Float[Tensor, "objects K"], numbers: Numbers, seconds: dict[str, float]
+    ) -> tuple[RenderedImages, CachedSet]:
+        with timed(seconds, "render", self.device):
+            rendered = self.draw(psi, numbers)
+        with timed(seconds, "features", self.device):
+            return rendered, self.training_set(rendered.images)
+
+    def _fit(
+        self, examples: CachedSet, numbers: Numbers, theta: Parameters, recording: Recording | None
+    ) -> tuple[Parameters, TrainingHistory]:
+        sampling = self._sampling(examples)
+        how = self.training.of(self._epochs(len(examples), sampling))
         how = replace(how, learning_rate=self.settings.learning_rate)
         # The proximal term replaces weight decay: with both, its Hessian would not be the inner problem's.
         if self.detector.proximal > 0.0:
             how = replace(how, weight_decay=0.0)
-        start = self.theta if self.settings.start == "previous" else self._start
-        self.theta, history = train_detector(
+        start = theta if self.settings.start == "previous" else self.start
+        return train_detector(
             self.detector,
             start,
-            images,
-            self._common("training"),
+            examples,
+            numbers.of("training"),
             how,
             self.warm_start,
             recording,
             sampling,
         )
-        self.steps += history.steps
-        self.trajectory = history.trajectory
-        return history.losses[-1]
 
     def _epochs(self, images: int, sampling: Sampling | None) -> int:
         """As many as ``outer.epochs`` and ``outer.least_steps`` ask for."""
@@ -183,26 +304,31 @@ class InnerLoop:
         steps = math.ceil(images / self.training.batch_size) if sampling is None else sampling.steps
         return max(self.settings.epochs, math.ceil(self.settings.least_steps / steps))
 
+    def _trained(
+        self,
+        psi: Float[Tensor, "objects K"],
+        rendered: RenderedImages,
+        examples: CachedSet,
+        theta: Parameters,
+        seconds: Mapping[str, float],
+        history: TrainingHistory | None = None,
+    ) -> Trained:
+        return Trained(
+            psi=psi.detach().clone(),
+            rendered=rendered,
+            examples=examples,
+            theta=theta,
+            trainable=self.detector.split(theta)[1],
+            loss=math.nan if history is None else history.losses[-1],
+            trajectory=None if history is None else history.trajectory,
+            objective=self.objective,
+            cost=Cost(images=len(rendered), detector_steps=0 if history is None else history.steps),
+            seconds=seconds,
+        )
+
     @torch.no_grad()
-    def loss(self, images: CachedSet) -> float:
-        """The training loss of a :meth:`training_set` at theta."""
-        weights = self.weights(images).to(self.device)
-        rows = torch.arange(len(images), device=self.device).split(32)
-        return float(sum(images.losses(self.trainable, part) @ weights[part] for part in rows))
-
-    def validation_loss(self) -> float:
-        """L_val at theta."""
-        return float(self.objective.of_outputs(self._on_validation()))
-
-    def scores(self) -> Float[Tensor, "classes images"]:
-        """Each validation image's contribution to theta's score of each class, more is better."""
-        return self.objective.scores(self._on_validation())
-
-    @torch.no_grad()
-    def _on_validation(self) -> Outputs:
-        """Theta's outputs on the validation images, cached until theta changes."""
-        theta, outputs = self._evaluated
-        if theta is not self.theta:
-            outputs = self.objective.outputs(self.trainable)
-            self._evaluated = (self.theta, outputs)
-        return outputs
+    def loss(self, examples: CachedSet, theta: Parameters) -> float:
+        """Compute the training loss of a :meth:`training_set` at theta."""
+        trainable, weights = self.detector.split(theta)[1], self.weights(examples).to(self.device)
+        rows = torch.arange(len(examples), device=self.device).split(32)
+        return float(sum(examples.losses(trainable, part) @ weights[part] for part in rows))

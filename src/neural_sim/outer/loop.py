@@ -1,4 +1,4 @@
-"""Base of all outer loops: psi, an iteration's record, and the Trainer that runs the loop."""
+"""What all outer loops share: psi, an iteration's cost and record, the Trainer; and the loop of rewards."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ import logging
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from typing_extensions import override
 
+from neural_sim.baseline.base import RewardMethod
+from neural_sim.detector.trajectory import Recording
 from neural_sim.devices import trainer_on
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, line
-from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.records import IterationRecord, LearnedPsi
+from neural_sim.outer.inner import InnerLoop, Numbers, Trained, timed
+from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi
 from neural_sim.outer.steps import Verdict
-from neural_sim.types import LabelledImages
 
 logger = logging.getLogger(__name__)
 
@@ -27,72 +30,105 @@ logger = logging.getLogger(__name__)
 class OuterLoop(pl.LightningModule):
     """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
 
-    ``inner`` draws an iteration's images and trains the detector on them. A subclass's ``training_step`` ends with
-    :meth:`record` and, after the step of psi, appends to ``trajectory`` the method's result if it ended there.
+    ``inner`` draws an iteration's images and trains the detector on them, from ``theta`` where a training goes on from
+    the one before, under the random ``numbers``. A subclass's ``training_step`` ends with :meth:`record` and, after the
+    step of psi, appends to ``trajectory`` the method's result if it ended there.
     """
 
-    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], rounds: int) -> None:
+    def __init__(
+        self, inner: InnerLoop, psi: Float[Tensor, "objects K"], rounds: int, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.inner, self.scene, self.settings, self.rounds = inner, inner.scene, inner.settings, rounds
+        self.theta, self.numbers = inner.params, Numbers(generator)
         self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
         self.records: list[IterationRecord] = []
         self.trajectory = [self.psi.detach().clone()]
         self.on_record: Callable[[IterationRecord], object] = lambda record: None
-        self._counted, self._cpu = (0, 0), inner.cpu_begun
+        self._cost, self._seconds = Cost(), {"pool": inner.preparation.seconds}
+        self._cpu = time.process_time() - inner.preparation.cpu_seconds
 
+    @override
     def configure_optimizers(self) -> None:
         return None
 
     def train_dataloader(self) -> range:
+        """Count the iterations, which need no data."""
         return range(self.rounds)
 
+    @override
     def on_train_batch_end(self, *step: Any) -> None:
         """Call ``on_record``, whose processor time is not counted as the method's."""
         begun = time.process_time()
         self.on_record(self.records[-1])
         self._cpu += time.process_time() - begun
 
+    def renew(self) -> None:
+        """Change the common random numbers."""
+        self.numbers = self.numbers.renewed()
+
+    def train_on(self, psi: Float[Tensor, "objects K"], recording: Recording | None = None) -> Trained:
+        """Train on images of psi, at the iteration's cost."""
+        return self.charged(self.inner.train(psi, self.numbers, self.theta, recording))
+
+    def charged(self, trained: Trained) -> Trained:
+        """Go on from a training, and add its cost to the iteration's."""
+        self.theta = trained.theta
+        self.charge(trained.cost)
+        for phase, spent in trained.seconds.items():
+            self._seconds[phase] = self._seconds.get(phase, 0.0) + spent
+        return trained
+
+    def charge(self, cost: Cost) -> None:
+        """Add images, detector steps and Hessian products to the iteration's."""
+        self._cost = self._cost + cost
+
+    def timed(self, phase: str) -> AbstractContextManager[None]:
+        """Add the seconds spent inside to those of the iteration's phase."""
+        return timed(self._seconds, phase, self.inner.device)
+
     def record(
         self,
-        psi: Float[Tensor, "objects K"],
-        images: LabelledImages,
-        training_loss: float,
-        seconds: dict[str, float],
+        trained: Trained,
+        scores: Float[Tensor, "classes"] | None = None,
+        verdicts: Mapping[str, Verdict] | None = None,
         certificate: Certificate | None = None,
         gradient: Hypergradient | None = None,
-        products: int = 0,
-        scores: Tensor | None = None,
-        verdicts: Mapping[str, Verdict] | None = None,
     ) -> IterationRecord:
-        """Record an iteration on ``images`` drawn from ``psi``, before the step."""
-        p_by_factor = self.scene.distribution.probabilities(psi.detach())
-        counted, cpu = (self.inner.images, self.inner.steps), time.process_time()
-        if not self.records:
-            seconds = {"pool": self.inner.pool_seconds, **seconds}
-        self.records.append(
-            IterationRecord(
-                probabilities={name: p.tolist() for name, p in p_by_factor.items()},
-                entropies={
-                    name: (-torch.special.xlogy(p, p).sum(-1)).tolist() for name, p in p_by_factor.items()
-                },
-                gradient_norms=self._lengths({} if gradient is None else gradient.psi_gradients),
-                gradient_errors=self._lengths({} if gradient is None else gradient.standard_errors),
-                validation_loss=self.inner.validation_loss(),
-                training_loss=training_loss,
-                certificate=certificate,
-                images=counted[0] - self._counted[0],
-                detector_steps=counted[1] - self._counted[1],
-                products=products,
-                images_without_box=int((~images.present.any(-1)).sum()),
-                scores=[] if scores is None else scores.tolist(),
-                verdicts=dict(verdicts or {}),
-                seconds=seconds,
-                cpu_seconds=cpu - self._cpu,
-            )
+        """Record an iteration, before the step of psi.
+
+        Args:
+            trained: its last training.
+            scores: of the classes, before the step.
+            verdicts: on the last step.
+            certificate: of its derivative.
+            gradient: the derivative.
+        """
+        p_by_factor, cpu = self.scene.distribution.probabilities(trained.psi), time.process_time()
+        present = trained.rendered.images.present
+        last = IterationRecord(
+            probabilities={name: p.tolist() for name, p in p_by_factor.items()},
+            entropies={
+                name: (-torch.special.xlogy(p, p).sum(-1)).tolist() for name, p in p_by_factor.items()
+            },
+            gradient_norms=self._lengths({} if gradient is None else gradient.gradients),
+            gradient_errors=self._lengths({} if gradient is None else gradient.errors),
+            validation_loss=trained.validation_loss,
+            training_loss=trained.loss,
+            certificate=certificate,
+            images=self._cost.images,
+            detector_steps=self._cost.detector_steps,
+            products=self._cost.products,
+            images_without_box=int((~present.any(-1)).sum()),
+            scores=[] if scores is None else scores.tolist(),
+            verdicts=dict(verdicts or {}),
+            seconds=self._seconds,
+            cpu_seconds=cpu - self._cpu,
         )
-        self._counted, self._cpu = counted, cpu
-        number, last = len(self.records), self.records[-1]
+        self.records.append(last)
+        self._cost, self._seconds, self._cpu = Cost(), {}, cpu
+        number = len(self.records)
         if certificate is None:
             logger.info("round %d/%d val %.4f%s", number, self.rounds, last.validation_loss, _outcomes(last))
         else:
@@ -104,11 +140,39 @@ class OuterLoop(pl.LightningModule):
         return [float(values[name].norm()) for name in self.scene.names] if values else []
 
 
+class RewardLoop(OuterLoop):
+    """The outer loop of methods that see only a reward: draw, train, reward; one training step is one round.
+
+    The reward is minus L_val, which varies where AP is still zero.
+    """
+
+    def __init__(
+        self,
+        inner: InnerLoop,
+        psi: Float[Tensor, "objects K"],
+        method: RewardMethod,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(inner, psi, method.rounds * inner.settings.iterations, generator)
+        self.search = method.begin(inner.scene.distribution, self.psi.detach(), generator)
+
+    @override
+    def training_step(self, batch: int, batch_idx: int) -> None:
+        trained = self.train_on(self.search.ask())
+        with self.timed("reward"):
+            reward = -trained.validation_loss
+        self.record(trained)
+        self.search.tell(reward, [part.draw for part in trained.rendered.objects])
+        self.psi.data = self.search.psi.clone()
+        self.trajectory.append(self.psi.detach().clone())
+
+
 def learn_psi(
     module: OuterLoop, progress: bool, on_record: Callable[[IterationRecord], object] | None = None
 ) -> LearnedPsi:
-    """Run the loop to its end by a Lightning Trainer that writes nothing. ``on_record`` is called with the record of
-    each iteration when it ends.
+    """Run the loop to its end by a Lightning Trainer that writes nothing.
+
+    ``on_record`` is called with the record of each iteration when it ends.
     """
     if on_record is not None:
         module.on_record = on_record
@@ -120,7 +184,7 @@ def learn_psi(
 
 
 def _outcomes(record: IterationRecord) -> str:
-    """Accepted and rejected steps of objects, for the log."""
+    """Name accepted and rejected steps of objects, for the log."""
     text = ""
     for outcome, accepted in (("accepted", True), ("rejected", False)):
         names = [name for name, verdict in record.verdicts.items() if verdict.accepted == accepted]

@@ -2,93 +2,137 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.detector.cached import CachedSet
-from neural_sim.gradient.base import Losses, ObjectImages, Probes
+from neural_sim.gradient.base import MixedDerivative, ObjectImages, Params, Probes
 from neural_sim.gradient.estimators import Estimator
-from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
-from neural_sim.outer.binding import bound_losses, object_images
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.gradient.implicit import Implicit, InnerProblem, curvature_rows, hypergradient
+from neural_sim.gradient.unrolled import Accumulated, Unrolled
+from neural_sim.outer.derivative import bound_losses, object_images, probe_groups, recorded
 from neural_sim.outer.descent import GradientLoop
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.inner import InnerLoop, Trained
+from neural_sim.outer.objective import Objective
 from neural_sim.outer.probing import ProbeSet
-from neural_sim.outer.response import agreement
-from neural_sim.outer.unrolling import through_training
-from neural_sim.randomness import stream
+from neural_sim.outer.records import Cost
+from neural_sim.outer.response import agreement, response
 from neural_sim.solver.adjoint import AdjointSolver
-from neural_sim.synthesis.assembly import RenderedImages
 
 
 class SimulatorModule(GradientLoop):
     """psi follows the hypergradient, with a certificate for every iteration."""
 
     def __init__(
-        self, inner: InnerLoop, psi: Float[Tensor, "objects K"], estimator: Estimator, solver: AdjointSolver
+        self,
+        inner: InnerLoop,
+        psi: Float[Tensor, "objects K"],
+        estimator: Estimator,
+        solver: AdjointSolver,
+        generator: torch.Generator,
     ) -> None:
-        super().__init__(inner, psi)
+        super().__init__(inner, psi, generator)
         self.estimator, self.solver = estimator, solver
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None
-        # A generator of its own, so that certifying does not change a run.
-        self._check_generator = stream(0, "certificate", inner.generator)
-        if self.settings.adjoint == "unrolled":
-            self._recording = self.settings.unrolled.recording
+        if isinstance(self.settings.adjoint, Unrolled):
+            self._recording = self.settings.adjoint.recording
 
-    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
-        trainable = self.inner.trainable
-        drawn, weights, device = len(rendered), self.inner.weights(cached), self.inner.device
-        subset, subset_weights = curvature_rows(
-            drawn, weights, self.settings.curvature_images, self.inner.generator
+    @override
+    def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:
+        weights, drawn, adjoint = (
+            self.inner.weights(trained.examples),
+            len(trained.rendered),
+            self.settings.adjoint,
         )
-        inner = InnerProblem(
-            trainable, cached.losses, weights.to(device),
+        # Drawn whatever the adjoint, so that all later random numbers are the same.
+        implicit = adjoint if isinstance(adjoint, Implicit) else Implicit()
+        subset, own = curvature_rows(drawn, weights, implicit.curvature_images, self.numbers.generator)
+        if isinstance(adjoint, Unrolled):
+            # The fraction of photographs is that of each step's batch, see Examples.drawn.
+            images = self._images(trained, torch.full((drawn,), 1.0 / drawn))
+            return self._with_fixed(self._through_training(trained, objective, images, adjoint))
+        device = self.inner.device
+        problem = InnerProblem(
+            trained.trainable, trained.examples.losses, weights.to(device),
             proximal=self.inner.detector.proximal, anchor=self.inner.warm_start,
-            subset=subset.to(device), subset_weights=subset_weights.to(device),
+            subset=subset.to(device), subset_weights=own.to(device),
         )  # fmt: skip
-        probed, unrolled = self._probes, self.settings.adjoint == "unrolled"
-        # Through a training, the fraction of photographs is that of each step's batch, see Examples.drawn.
-        own = torch.full((drawn,), 1.0 / drawn) if unrolled else weights[:drawn]
-        by_object = object_images(self.scene, rendered, self.psi, own)
-        learned = {name: by_object[name] for name in self._names}
-        if unrolled:
-            return self._with_fixed(
-                through_training(self.inner, inner, self.estimator, cached, learned, probed)
-            )
-        losses = bound_losses(cached, self.inner.backbone, probed.cached if probed else None)
-        estimates = {
-            name: self._bind(losses, learned[name], probed.probes[label] if probed else {})
-            for label, name in zip(self._learned, self._names, strict=True)
-        }
+        images = self._images(trained, weights[:drawn])
+        return self._with_fixed(self._at_stationary_point(trained, objective, images, problem))
+
+    def _images(self, trained: Trained, weights: Float[Tensor, "n"]) -> dict[str, ObjectImages]:
+        """Select the images of each learned object; ``weights`` are those of all drawn images."""
+        by_object = object_images(self.scene, trained.rendered, self.psi, weights)
+        return {name: by_object[name] for name in self.objects.names}
+
+    @property
+    def _probes_by_name(self) -> dict[str, Mapping[str, Probes]]:
+        probed = self._probes
+        named = zip(self.objects.names, self.objects.labels, strict=True)
+        return {name: {} if probed is None else probed.probes[label] for name, label in named}
+
+    def _through_training(
+        self,
+        trained: Trained,
+        objective: Objective,
+        images: Mapping[str, ObjectImages],
+        adjoint: Unrolled,
+    ) -> Hypergradient:
+        probes = self._probes_by_name
+
+        def estimate(name: str, sums: Accumulated) -> MixedDerivative:
+            return self.estimator.accumulated(sums, images[name], probes[name])
+
+        return adjoint.derivative(
+            recorded(self.inner, trained),
+            objective.terms(),
+            {name: partial(estimate, name) for name in images},
+            self.numbers.generator,
+            self.estimator.wanted,
+            None if self._probes is None else probe_groups(self._probes, probes),
+        )
+
+    def _at_stationary_point(
+        self,
+        trained: Trained,
+        objective: Objective,
+        images: Mapping[str, ObjectImages],
+        problem: InnerProblem,
+    ) -> Hypergradient:
+        probes, cached = self._probes_by_name, None if self._probes is None else self._probes.cached
+        losses = bound_losses(trained.examples, self.inner.backbone, cached)
+
+        def estimate(name: str, vector: Params) -> MixedDerivative:
+            return self.estimator.estimate(losses, trained.trainable, vector, images[name], probes[name])
+
         result = hypergradient(
-            inner,
-            self.inner.differentiated.terms(),
-            estimates,
+            problem,
+            objective.terms(),
+            {name: partial(estimate, name) for name in images},
             self.solver,
-            self.inner.generator,
+            self.numbers.generator,
             self._adjoint,
         )
-        self._adjoint = result.solution.value
-        return self._with_fixed(result)
+        self._adjoint = result.adjoint.solution.value
+        return result
 
     def _with_fixed(self, result: Hypergradient) -> Hypergradient:
-        """Zeros for objects whose psi is fixed, for which nothing was computed."""
+        """Add zeros for objects whose psi is fixed, for which nothing was computed."""
         zeros = {name: torch.zeros(self.psi.shape[1]) for name in self.scene.names}
         return replace(
             result,
-            psi_gradients={**zeros, **result.psi_gradients},
-            standard_errors={**zeros, **result.standard_errors},
+            gradients={**zeros, **result.gradients},
+            errors={**zeros, **result.errors},
         )
 
-    def _bind(self, losses: Losses, images: ObjectImages, probes: dict[str, Probes]) -> Callable:
-        trainable = self.inner.trainable
-        return lambda vector: self.estimator.estimate(losses, trainable, vector, images, probes)
-
+    @override
     def _prepare(self) -> None:
         """Draw probes, or replace a fraction of them, so that the noise of a sample does not bias all iterations."""
         per_bin = self.estimator.probes_per_bin
@@ -102,7 +146,7 @@ class SimulatorModule(GradientLoop):
         self._probes = fresh if new == per_bin else self._probes.renewed(fresh, len(self.records))
 
     def _every_bin(self, per_bin: int) -> ProbeSet:
-        """``per_bin`` images of every bin of every factor of the learned objects, with their features."""
+        """Draw ``per_bin`` images of every bin of every factor of the learned objects, with their features."""
         inner = self.inner
         probed = ProbeSet.draw(
             inner.pool or inner.scene,
@@ -110,34 +154,14 @@ class SimulatorModule(GradientLoop):
             inner.backbone,
             per_bin,
             self.psi,
-            inner.generator,
-            self._learned,
+            self.numbers.generator,
+            self.objects.labels,
         )
-        inner.images += len(probed.cached)
+        self.charge(Cost(images=len(probed.cached)))
         return probed
 
     @override
-    def _cosine(self, result: Hypergradient) -> float:
-        """The cosine with the response of training, averaged over objects and factors."""
-        return agreement(self.inner, self.psi, result, self._learned)
-
-
-def curvature_rows(
-    drawn: int, weights: Float[Tensor, "N"], wanted: int, generator: torch.Generator
-) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Rows of the training set for Hessian products, and their weights in them: ``wanted`` random ones (0: all), of the
-    first ``drawn``, which were drawn from p_psi, and of the others, which are photographs, in proportion to the weight
-    of each part, which its rows keep.
-    """
-    count, parts = len(weights), []
-    if not 0 < wanted < count:
-        return torch.arange(count), weights
-    for first, last in ((0, drawn), (drawn, count)):
-        size, mass = last - first, float(weights[first:last].sum())
-        if size == 0:
-            continue
-        few = min(size, max(1, round(wanted * mass))) if size < count else wanted
-        rows = first + torch.randperm(size, generator=generator)[:few]
-        parts.append((rows, torch.full((few,), mass / few)))
-    rows, scaled = (torch.cat(column) for column in zip(*parts, strict=True))
-    return rows, scaled
+    def _cosine(self, result: Hypergradient) -> float | None:
+        found = response(self.inner, self.psi, self.numbers, self.theta)
+        self.charge(found.cost)
+        return agreement(found.slopes(self.inner, self.psi), self.psi, result, self.objects)

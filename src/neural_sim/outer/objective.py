@@ -12,28 +12,34 @@ from torch.utils.checkpoint import checkpoint
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Outputs, Parameters
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
-from neural_sim.outer.settings import ObjectiveKind
 from neural_sim.solver.hvp import Term
 from neural_sim.types import LabelledImages
+
+
+@dataclass(frozen=True)
+class Loss:
+    """``outer.objective``: the mean loss of the validation images, the paper's."""
 
 
 @dataclass(frozen=True)
 class Objective:
     """L_val as a function of the parameters.
 
-    ``kind``: ``loss`` is the mean loss of the validation images (the paper's). ``average_precision``, or ``accuracy``
-    for a classifier, is one minus the mean over classes of that ``smooth`` score, plus ``smooth.loss`` times that loss.
-    ``cached`` has the validation images' features, ``images`` the same images' boxes.
+    Attributes:
+        cached: the validation images' features.
+        images: the same images' boxes.
+        score: what is lowered: their mean loss, or one minus the mean over classes of this smooth score, plus its
+            ``loss`` times that mean loss.
     """
 
     cached: CachedSet
     images: LabelledImages
-    kind: ObjectiveKind
-    smooth: SmoothAP | SmoothAccuracy
+    score: SmoothAP | SmoothAccuracy | Loss
 
     def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
-        """L_val on ``count`` disjoint random parts of the validation images (at most one for each), which have the same
-        number of images of every class (that of an image's first box), give or take one.
+        """Divide L_val by disjoint random parts of the validation images, ``count`` or one for each image.
+
+        They have the same number of images of every class (that of an image's first box), give or take one.
         """
         shuffled = torch.randperm(len(self.images), generator=generator)
         ordered = shuffled[self.images.labels.cpu()[shuffled, 0].argsort(stable=True)]
@@ -42,24 +48,21 @@ class Objective:
         return [replace(self, cached=self.cached.select(r), images=self.images.select(r)) for r in rows]
 
     def terms(self) -> list[Term]:
-        """L_val as a sum of terms; a smooth score, of which average precision ranks all images, is one."""
-        if self.kind == "loss":
+        """Return L_val as a sum of terms; a smooth score is one, because average precision ranks all images."""
+        if isinstance(self.score, Loss):
             return self.cached.mean_terms()
         return [lambda params: self.of_outputs(self.outputs(params))]
 
     def of_outputs(self, outputs: Outputs) -> Float[Tensor, ""]:
-        """L_val of the detector's outputs on all images."""
+        """Compute L_val from the detector's outputs on all images."""
         loss = self.cached.detector.losses_of(outputs, self.cached.targets).mean()
-        if self.kind == "loss":
+        if isinstance(self.score, Loss):
             return loss
-        return 1.0 - self.smooth_score(outputs).sum(1).nanmean() + self.smooth.loss * loss
-
-    def smooth_score(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """Each image's contribution to the smooth score of every class; nan for a class without a box."""
-        return self.smooth(self.cached.detector, outputs, self.images)
+        score = self.score(self.cached.detector, outputs, self.images)
+        return 1.0 - score.sum(1).nanmean() + self.score.loss * loss
 
     def outputs(self, params: Parameters, chunk_size: int = 64) -> Outputs:
-        """The detector's outputs on all images. A derivative recomputes intermediate values chunk by chunk."""
+        """Run the detector on all images. A derivative recomputes intermediate values chunk by chunk."""
         parts = [
             checkpoint(self.cached.outputs, params, rows, use_reentrant=False)
             for rows in torch.arange(len(self.cached), device=self.cached.device).split(chunk_size)
@@ -69,7 +72,7 @@ class Objective:
 
     @torch.no_grad()
     def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """Each image's contribution to the score of every class, more is better; on the CPU.
+        """Compute each image's contribution to the score of every class, more is better; on the CPU.
 
         A class's score, the sum of its row, is minus its part of L_val (up to the constant one), with losses averaged
         over the images with a box of the class; nan for a class without a box.
@@ -79,10 +82,6 @@ class Objective:
         classes = torch.arange(outputs[0].shape[-1])
         shown = (labels == classes[:, None, None]).any(-1).to(losses)
         parts = -shown * losses / shown.sum(1, keepdim=True)
-        if self.kind == "loss":
+        if isinstance(self.score, Loss):
             return parts
-        return self.smooth_score(outputs).cpu() + self.smooth.loss * parts
-
-    def double(self) -> Objective:
-        """The same in float64."""
-        return replace(self, cached=self.cached.double())
+        return self.score(self.cached.detector, outputs, self.images).cpu() + self.score.loss * parts

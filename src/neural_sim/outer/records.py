@@ -9,9 +9,32 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.outer.certificate import Certificate
-from neural_sim.outer.cost import Cost
+from neural_sim.outer.certificate import Certificate, ImplicitQuality, UnrolledQuality
 from neural_sim.outer.steps import Verdict
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a method or a training.
+
+    Labelled images, optimiser steps of detectors, Hessian products, seconds of wall-clock time and processor seconds
+    over all cores.
+    """
+
+    images: int = 0
+    detector_steps: int = 0
+    products: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(
+            self.images + other.images,
+            self.detector_steps + other.detector_steps,
+            self.products + other.products,
+            self.seconds + other.seconds,
+            self.cpu_seconds + other.cpu_seconds,
+        )
 
 
 @dataclass(frozen=True)
@@ -46,22 +69,30 @@ class IterationRecord:
 
 
 def cost_of(record: IterationRecord) -> Cost:
-    """Cost of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``, which includes them."""
+    """Sum up the cost of one iteration. Phases ``hypergradient_*`` are parts of ``hypergradient``."""
     phases = record.seconds.items()
     seconds = sum(spent for phase, spent in phases if not phase.startswith("hypergradient_"))
     return Cost(record.images, record.detector_steps, record.products, seconds, record.cpu_seconds)
 
 
 def record_of(stored: Mapping[str, Any]) -> IterationRecord:
-    """The inverse of ``dataclasses.asdict`` for a record."""
+    """Invert ``dataclasses.asdict`` for a record."""
     certificate = stored["certificate"]
     return IterationRecord(
         **{
             **stored,
-            "certificate": certificate and Certificate(**certificate),
+            "certificate": certificate and _certificate_of(certificate),
             "verdicts": {name: Verdict(**verdict) for name, verdict in stored["verdicts"].items()},
         }
     )
+
+
+def _certificate_of(stored: Mapping[str, Any]) -> Certificate:
+    adjoint = stored["adjoint"]
+    if adjoint is not None:
+        kind = UnrolledQuality if "reversed_steps" in adjoint else ImplicitQuality
+        adjoint = kind(**adjoint)
+    return Certificate(**{**stored, "adjoint": adjoint})
 
 
 @dataclass(frozen=True)
@@ -78,7 +109,7 @@ class LearnedPsi:
     before: Cost = field(default_factory=Cost)
 
     def cost(self, iterations: int) -> Cost:
-        """Cost up to the end of so many iterations; zero for none, whose psi is given."""
+        """Sum up the cost to the end of a number of iterations; zero for none, whose psi is given."""
         return sum(
             (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
         )

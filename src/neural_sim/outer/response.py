@@ -1,4 +1,4 @@
-"""The response of training: the change of an object's score when a fraction of its images moves to one bin.
+"""The finite-difference response of training: what an object's score gains when images of it move to one bin.
 
 It takes no derivative. The training is repeated, with common random numbers, once for each bin of a factor. Each run
 moves all objects at once, each to another bin, and reads each object's response from its score. The response is the
@@ -9,21 +9,21 @@ training for each bin.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
-from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.protocol import Parameters
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.descent import GradientLoop
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.outer.inner import InnerLoop, Numbers, Trained
+from neural_sim.outer.objective import Objective
+from neural_sim.outer.records import Cost
+from neural_sim.outer.steps import LearnedObjects
 from neural_sim.parameter.factor import Factor
-from neural_sim.solver.base import Solution, Status
-from neural_sim.solver.damping import Damped
-from neural_sim.synthesis.assembly import RenderedImages
 
 PART = 0.15
 """Fraction of an object's images that move."""
@@ -33,15 +33,21 @@ SPACING = 3
 
 @dataclass(frozen=True)
 class Response:
-    """``value``: the gain of each object's score when a fraction of its images moves to each bin (or of its weights to
-    each light), divided by that fraction. ``trainings`` counts the trainings that were run.
+    """The finite-difference response of training.
+
+    Attributes:
+        value: the gain of each object's score when a fraction of its images moves to each bin (or of its weights to
+            each light), divided by that fraction.
+        trainings: number of trainings that were run.
+        cost: what they cost.
     """
 
     value: Float[Tensor, "objects K"]
     trainings: int
+    cost: Cost = field(default_factory=Cost)
 
     def slopes(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """The derivative by psi that the response implies, of L_val = minus the mean score over classes."""
+        """Compute the derivative by psi that the response implies, of L_val = minus the mean score over classes."""
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
@@ -52,46 +58,65 @@ class Response:
         return distribution.join(parts)
 
 
-def response(inner: InnerLoop, psi: Float[Tensor, "objects K"], part: float = PART) -> Response:
-    """The response at ``psi``: one training at psi and one for each bin of each factor; theta does not change.
+def response(
+    inner: InnerLoop,
+    psi: Float[Tensor, "objects K"],
+    numbers: Numbers,
+    theta: Parameters | None = None,
+    part: float = PART,
+) -> Response:
+    """Measure the response at ``psi``: by one training at psi and one for each bin of each factor.
+
+    Args:
+        inner: the inner problem.
+        psi: where.
+        numbers: of the trainings, which have them in common.
+        theta: where each training goes on under ``outer.start=previous``.
+        part: fraction of an object's images that move.
 
     Raises:
         ValueError: a part that is not in (0, 1].
     """
     if not 0.0 < part <= 1.0:
         raise ValueError(f"response: part must lie in (0, 1], got {part}")
-    before = inner.theta, inner.trajectory, inner.common_numbers
-    inner.common_numbers = True
     distribution, values = inner.scene.distribution, {}
-    base = _scores(inner, psi)
+    common = replace(numbers, common=True)
+    base = inner.train(psi, common, theta)
+    before, cost = base.scores.sum(1), base.cost
     objects, trainings = torch.arange(len(psi)), 1
     for factor in distribution.factors:
         value = psi.new_zeros(len(psi), factor.size)
         for run in range(factor.size):
             bins = (run + SPACING * objects) % factor.size
-            gain = _scores(inner, _moved(inner, psi, factor, bins, part)) - base
+            trained = inner.train(_moved(inner, psi, factor, bins, part), common, theta)
+            gain = trained.scores.sum(1) - before
             value[objects, bins] = gain[: len(psi)].to(value) / part
+            cost = cost + trained.cost
         values[factor.name], trainings = value, trainings + factor.size
-    inner.theta, inner.trajectory, inner.common_numbers = before
-    return Response(distribution.join(values), trainings)
+    return Response(distribution.join(values), trainings, cost)
 
 
 def agreement(
-    inner: InnerLoop, psi: Float[Tensor, "objects K"], result: Hypergradient, learned: Sequence[int]
-) -> float:
-    """Cosine of the derivatives ``result`` with the response at ``psi``, in centred derivatives by p, averaged over
-    objects and factors; nan where one of them vanishes.
+    slopes: Float[Tensor, "objects K"],
+    psi: Float[Tensor, "objects K"],
+    result: Hypergradient,
+    objects: LearnedObjects,
+) -> float | None:
+    """Compare derivatives at ``psi`` with the ``slopes`` of the response.
+
+    Returns:
+        The cosine of centred derivatives by p, averaged over learned objects and factors; None where one vanishes.
     """
-    distribution = inner.scene.distribution
-    truth = distribution.split(response(inner, psi).slopes(inner, psi))
+    distribution = objects.distribution
+    truth = distribution.split(slopes)
     cosines = []
-    for label in learned:
-        gradient = distribution.split(result.psi_gradients[inner.scene.names[label]])
+    for name, label in zip(objects.names, objects.labels, strict=True):
+        gradient = distribution.split(result.gradients[name])
         for factor in distribution.factors:
             scale = factor.log_slopes(distribution.split(psi[label])[factor.name]).exp()
             cosines.append(centred_cosine(gradient[factor.name] / scale, truth[factor.name][label] / scale))
     known = [cosine for cosine in cosines if not math.isnan(cosine)]
-    return sum(known) / len(known) if known else math.nan
+    return sum(known) / len(known) if known else None
 
 
 def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
@@ -107,20 +132,23 @@ def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float
 class ResponseLoop(GradientLoop):
     """psi follows the response in the place of a derivative."""
 
-    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], part: float) -> None:
-        super().__init__(inner, psi)
+    def __init__(
+        self, inner: InnerLoop, psi: Float[Tensor, "objects K"], part: float, generator: torch.Generator
+    ) -> None:
+        super().__init__(inner, psi, generator)
         self.part = part
 
-    def _derivative(self, rendered: RenderedImages, cached: CachedSet) -> Hypergradient:
-        slopes = response(self.inner, self.psi, self.part).slopes(self.inner, self.psi)
+    @override
+    def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient[None]:
+        found = response(self.inner, self.psi, self.numbers, self.theta, self.part)
+        self.charge(found.cost)
+        slopes = found.slopes(self.inner, self.psi)
         zero = torch.zeros_like(slopes[0])
         gradients = {
-            name: slopes[i] if i in self._learned else zero for i, name in enumerate(self.scene.names)
+            name: slopes[i] if i in self.objects.labels else zero for i, name in enumerate(self.scene.names)
         }
-        solution = Solution(torch.zeros(1), Status.MEASURED, 0, 0.0, (0.0, 0.0), 0, False)
         # Its noise is not known; the training at the new psi decides on each step.
-        errors = dict.fromkeys(gradients, zero)
-        return Hypergradient(gradients, errors, {}, solution, Damped(0.0, None), math.nan, math.nan, math.nan)
+        return Hypergradient(gradients, dict.fromkeys(gradients, zero), None)
 
 
 def _moved(
@@ -130,9 +158,3 @@ def _moved(
     p = factor.p_of(parts[factor.name])
     moved = (1.0 - part) * p + part * torch.nn.functional.one_hot(bins, factor.size).to(p)
     return inner.scene.distribution.join({**parts, factor.name: factor.psi_of(moved)})
-
-
-def _scores(inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "classes"]:
-    """Scores of a detector trained on images of ``psi``."""
-    inner.train(inner.training_set(inner.draw(psi).images))
-    return inner.scores().sum(1)

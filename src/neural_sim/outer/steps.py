@@ -1,10 +1,10 @@
-"""Steps of psi: what every kind has, and free steps. Trust-region steps: :mod:`outer.checked`."""
+"""Steps of psi: what every kind has, and free gradient steps. Those of a trust region: :mod:`outer.trust_region`."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Protocol, Self
 
 import torch
 from jaxtyping import Float
@@ -12,10 +12,10 @@ from torch import Tensor
 
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
-from neural_sim.outer.settings import Outer
 from neural_sim.parameter.factor import Factor
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.parameter.update import Update, UpdateState
+from neural_sim.parameter.update import Mirror, Update, UpdateState
+from neural_sim.ranges import PositiveFraction, validated
 
 PValues = Mapping[str, Mapping[str, float]]
 """By object and factor."""
@@ -35,30 +35,24 @@ class Verdict:
     error: float
 
 
+@dataclass(frozen=True)
+class LearnedObjects:
+    """The objects whose psi moves, by name and class, and p_psi."""
+
+    names: Sequence[str]
+    labels: Sequence[int]
+    distribution: SceneDistribution
+
+
 class Steps(Protocol):
-    """Moves psi [objects, K] of the learned objects."""
+    """Where psi [objects, K] of the learned objects stands, and what is known for its next step.
 
-    def judge(
-        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
-    ) -> dict[str, Verdict]:
-        """Accept or reject the last step by trainings before and after it. The scores are each validation image's
-        contributions to the score of each class, more is better.
-        """
-        ...
-
-    def observe(self, result: Hypergradient) -> PValues:
-        """Add a derivative at ``reported``, after :meth:`judge` where a step was pending; p-values of the null that the
-        derivative which steps follow is zero.
-        """
-        ...
-
-    def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """Psi after the next step."""
-        ...
+    Immutable: :meth:`judge`, :meth:`observe` and :meth:`propose`, called in this order, return what comes after.
+    """
 
     @property
-    def waiting(self) -> Collection[tuple[str, str]]:
-        """Objects and factors that the last step did not move, whatever the certificate allowed."""
+    def reported(self) -> Float[Tensor, "objects K"]:
+        """Psi of the loop's result if it ends now."""
         ...
 
     @property
@@ -67,84 +61,148 @@ class Steps(Protocol):
         ...
 
     @property
-    def reported(self) -> Float[Tensor, "objects K"]:
-        """Psi of the loop's result if it ends now."""
+    def waiting(self) -> Collection[tuple[str, str]]:
+        """Objects and factors that the last step did not move, whatever the certificate allowed."""
         ...
-
-
-class FreeSteps:
-    """Steps of ``outer.update`` and ``outer.light_update``, none of which is rejected.
-
-    Steps shorten linearly over ``outer.iterations`` to ``outer.final_step`` of their length.
-    """
-
-    def __init__(
-        self,
-        settings: Outer,
-        distribution: SceneDistribution,
-        names: Sequence[str],
-        psi: Float[Tensor, "objects K"],
-    ) -> None:
-        self.settings, self.distribution, self.names = settings, distribution, names
-        self.reported = psi.detach().clone()
-        self._states = {name: UpdateState.zeros(part) for name, part in distribution.split(psi).items()}
-        self._gradient = self._error = torch.zeros_like(psi)
-        self._steps, self.pending = 0, False
-
-    waiting: Collection[tuple[str, str]] = ()
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
-    ) -> dict[str, Verdict]:
-        return {}
+    ) -> tuple[Self, dict[str, Verdict]]:
+        """Accept or reject the pending step by trainings before and after it.
 
-    def observe(self, result: Hypergradient) -> PValues:
-        self._gradient, self._error = stacked(result, self.names, self.reported)
-        return result.p_values
+        The scores are each validation image's contributions to the score of each class, more is better.
+        """
+        ...
 
-    def next(self, certificate: Certificate) -> Float[Tensor, "objects K"]:
-        """An insignificant derivative enters the momentum nevertheless: the average of several may be significant."""
-        length = 1.0 + self._steps / max(1, self.settings.iterations - 1) * (self.settings.final_step - 1.0)
-        self._steps += 1
+    def observe(self, result: Hypergradient) -> tuple[Self, PValues]:
+        """Add a derivative at ``reported``.
+
+        The p-values are those of the null that the derivative which steps follow is zero.
+        """
+        ...
+
+    def propose(self, certificate: Certificate, shrink: float) -> Self:
+        """Take the next step; ``shrink`` is the fraction of a shrunk one."""
+        ...
+
+
+@validated
+@dataclass(frozen=True)
+class FreeSteps:
+    """``outer.steps``: gradient steps, none of which is rejected.
+
+    Args:
+        update: the optimiser of logits of bins.
+        light_update: the optimiser of weights of lights, which are then projected on their constraint.
+        final_step: steps shorten linearly over the iterations to this fraction (Robbins and Monro 1951).
+    """
+
+    trainings: ClassVar[int] = 1
+    folds: ClassVar[int] = 1
+
+    update: Update = field(default_factory=lambda: Mirror(learning_rate=3.0, max_step=3.0))
+    light_update: Update = field(default_factory=lambda: Mirror(learning_rate=0.6, max_step=1.0))
+    final_step: PositiveFraction = 0.1
+
+    def begin(
+        self, objects: LearnedObjects, psi: Float[Tensor, "objects K"], iterations: int
+    ) -> GradientSteps:
+        """Stand at ``psi`` before the first of ``iterations`` steps."""
+        psi = psi.detach().clone()
+        states = {name: UpdateState.zeros(part) for name, part in objects.distribution.split(psi).items()}
+        nothing = torch.zeros_like(psi)
+        return GradientSteps(self, objects, iterations, psi, states, nothing, nothing)
+
+
+@dataclass(frozen=True)
+class GradientSteps:
+    """Where psi stands on its way by free steps.
+
+    Attributes:
+        settings: of the steps.
+        objects: the learned objects.
+        iterations: over which steps shorten.
+        reported: psi.
+        updates: states of the optimisers, by factor.
+        gradient: the derivative that was observed last.
+        error: its standard errors.
+        taken: number of steps.
+    """
+
+    settings: FreeSteps
+    objects: LearnedObjects
+    iterations: int
+    reported: Float[Tensor, "objects K"]
+    updates: Mapping[str, UpdateState]
+    gradient: Float[Tensor, "objects K"]
+    error: Float[Tensor, "objects K"]
+    taken: int = 0
+
+    @property
+    def pending(self) -> bool:
+        """False: nothing judges a step."""
+        return False
+
+    @property
+    def waiting(self) -> Collection[tuple[str, str]]:
+        """No object waits."""
+        return ()
+
+    def judge(
+        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
+    ) -> tuple[GradientSteps, dict[str, Verdict]]:
+        """Reject nothing."""
+        return self, {}
+
+    def observe(self, result: Hypergradient) -> tuple[GradientSteps, PValues]:
+        """Follow the last derivative alone; see :class:`Steps`."""
+        gradient, error = stacked(result, self.objects.names, self.reported)
+        return replace(self, gradient=gradient, error=error), result.p_values
+
+    def propose(self, certificate: Certificate, shrink: float) -> GradientSteps:
+        """Take the optimisers' steps; see :class:`Steps`.
+
+        An insignificant derivative enters the momentum nevertheless: the average of several may be significant.
+        """
+        length = 1.0 + self.taken / max(1, self.iterations - 1) * (self.settings.final_step - 1.0)
         if certificate.void:
-            return self.reported
+            return replace(self, taken=self.taken + 1)
+        distribution, updates, moved = self.objects.distribution, dict(self.updates), {}
         psi, slope, noise = (
-            self.distribution.split(values) for values in (self.reported, self._gradient, self._error)
+            distribution.split(values) for values in (self.reported, self.gradient, self.error)
         )
-        moved = {}
-        for factor in self.distribution.factors:
+        for factor in distribution.factors:
             name = factor.name
-            after = self._step(factor, psi[name], slope[name], noise[name])
-            taken = after.new_tensor(fractions(certificate, self.names, name, self.settings.trust.shrink))
-            moved[name] = psi[name] + taken[:, None] * (after - psi[name])
-        self.reported = self.reported + length * (self.distribution.join(moved) - self.reported)
-        return self.reported
+            after, updates[name] = self._step(factor, psi[name], slope[name], noise[name])
+            part = after.new_tensor(fractions(certificate, self.objects.names, name, shrink))
+            moved[name] = psi[name] + part[:, None] * (after - psi[name])
+        reported = self.reported + length * (distribution.join(moved) - self.reported)
+        return replace(self, reported=reported, updates=updates, taken=self.taken + 1)
 
-    def _step(self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor) -> Tensor:
-        """One factor's step in logits of bins, or in weights of lights, which are projected on their constraint."""
+    def _step(self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor) -> tuple[Tensor, UpdateState]:
+        """Step by one factor in logits of bins, or in weights of lights, which are projected on their constraint."""
         update: Update = getattr(self.settings, factor.update)
-        moved, self._states[factor.name] = update.step(
-            psi, factor.log_slopes(psi), slope, noise, self._states[factor.name]
-        )
-        return factor.project(moved)
+        state = self.updates[factor.name]
+        moved, state = update.step(psi, factor.log_slopes(psi), slope, noise, state)
+        return factor.project(moved), state
 
 
 def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
-    """Fraction that is taken of each object's step by a factor; ``shrink`` is that of a shrunk step."""
+    """Return the fraction that is taken of each object's step by a factor; ``shrink`` is that of a shrunk step."""
     taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0, "stopped": 0.0}
     return [taken[certificate.actions[name][factor]] for name in names]
 
 
-def by_p(
+def slopes_by_p(
     factor: Factor,
     psi: Float[Tensor, "objects k"],
     gradient: Float[Tensor, "objects k"],
     error: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
-    """The derivative of minus L_val by a factor's p, centred, and its components' variances.
+    """Convert the derivative of L_val by psi to that of minus L_val by a factor's p, centred.
 
-    ``gradient`` and ``error`` are the derivative of L_val by psi and its standard errors. By logits it is p - floor
-    times that by p, and would hardly move a bin of small p.
+    By logits it is p - floor times that by p, and would hardly move a bin of small p. ``error`` are the standard errors
+    of ``gradient``; the second result has the variances of the first.
     """
     scale = factor.log_slopes(psi).exp()
     direction = -gradient / scale
@@ -154,7 +212,7 @@ def by_p(
 def stacked(
     result: Hypergradient, names: Sequence[str], like: Tensor
 ) -> tuple[Float[Tensor, "objects K"], Float[Tensor, "objects K"]]:
-    """The named objects' derivatives and their standard errors."""
-    both = (result.psi_gradients, result.standard_errors)
+    """Stack the named objects' derivatives, and their standard errors."""
+    both = (result.gradients, result.errors)
     gradient, error = (torch.stack([values[name] for name in names]).to(like) for values in both)
     return gradient, error

@@ -1,6 +1,14 @@
-"""A step of psi as long as its trust radius.
+"""Trust-region steps of psi, accepted or rejected by a training at the new psi.
 
-It goes to the p nearest to p + t direction, whose distance from p is the radius: bins that are as good as each other
+The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
+parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
+step with little noise. A step is accepted if its derivative and this difference together are significant, because
+either alone often is not, and if the score did not fall beyond its error. The radius grows after a step that raised the
+object's score beyond the error and shrinks after one that lowered it beyond the error or was rejected (Conn, Gould and
+Toint 2000, Chapter 6, with the reduction measured object by object); in the last case less: the noise of a training
+does not shrink with the step, so that a much shorter one would be judged by chance even more.
+
+A step goes to the p nearest to p + t direction whose distance from p is the radius: bins that are as good as each other
 gain as much as each other. (Along logits, a bin gains in proportion to its p, and what is likely already takes nearly
 all.) A bin keeps a fraction of its p: the score is concave in the number of a bin's images, so that the derivative,
 which is linear, says little about having none of them.
@@ -8,27 +16,280 @@ which is linear, says little about having none of them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Annotated
+
 import torch
-from jaxtyping import Float
+from annotated_types import Ge, Gt, Lt
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neural_sim.configuration import UserError
+from neural_sim.gradient.hypergradient import Hypergradient
+from neural_sim.outer.certificate import Certificate
+from neural_sim.outer.evidence import Average
+from neural_sim.outer.steps import LearnedObjects, PValues, Verdict, fractions, slopes_by_p, stacked
 from neural_sim.parameter.factor import Factor
+from neural_sim.ranges import Fraction, NonNegative, Positive, PositiveInt, validated
 
+SMALLEST = 1e-15  # p-value, whose normal quantile is -8
 HALVINGS = 50
 # Of p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart.
 FARTHEST = 1e3
 
+ByFactor = Mapping[str, Float[Tensor, "objects"]]
 
-def within(
+
+@validated
+@dataclass(frozen=True)
+class TrustRegion:
+    """``outer.steps``: trust-region steps, which another training accepts or rejects.
+
+    Args:
+        trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter. After
+            one, the test knows the scatter of images alone.
+        folds: disjoint parts of the validation images; each derivative is that of L_val on one of them, so that the
+            scatter between derivatives has that of the validation images in it.
+        radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
+            the weights).
+        largest: upper bound of the radius.
+        smallest: an object whose radius is smaller does not move.
+        keep: fraction of its p that a step leaves each bin; 0: no bound. The score is concave in a bin's images.
+        level: significance level at which a step is accepted, by its derivative and its measured gain together.
+        errors: standard errors by which an object's score must rise for its radius to grow, and fall for it to shrink
+            by the whole factor.
+        waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
+            largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
+            present mistakes in it, and another once they have moved.
+        grow: factor of the radius after an accepted step that raised the score.
+        shrink: factor after one that lowered it; its square root after another rejected step.
+        momentum: factor of a derivative's weight in the average for every later move of its object.
+
+    Raises:
+        UserError: a radius that is not between its bounds.
+    """
+
+    trainings: PositiveInt = 2
+    folds: PositiveInt = 2
+    radius: Positive = 0.3
+    largest: Positive = 0.4
+    smallest: Positive = 0.05
+    keep: Annotated[float, Ge(0), Lt(1)] = 0.3
+    errors: NonNegative = 1.0
+    level: Annotated[float, Gt(0), Lt(1)] = 0.05
+    waits_below: Fraction = 0.2
+    grow: Annotated[float, Ge(1)] = 1.3
+    shrink: Annotated[float, Gt(0), Lt(1)] = 0.4
+    momentum: Fraction = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.smallest <= self.radius <= self.largest:
+            raise UserError(
+                f"TrustRegion: want smallest <= radius <= largest, got {self.smallest}, {self.radius}, {self.largest}"
+            )
+
+    def begin(
+        self, objects: LearnedObjects, psi: Float[Tensor, "objects K"], iterations: int
+    ) -> TrustRegionSteps:
+        """Stand at ``psi`` before the first iteration, whatever the number of ``iterations``."""
+        psi, parts = psi.detach().clone(), objects.distribution.split(psi)
+        averages = {name: Average.zeros(part, self.momentum) for name, part in parts.items()}
+        nothing = torch.zeros_like(psi[:, 0])
+        return TrustRegionSteps(
+            settings=self,
+            objects=objects,
+            accepted=psi,
+            trial=psi,
+            radius={name: torch.full_like(part[:, 0], self.radius) for name, part in parts.items()},
+            averages=averages,
+            observed=averages,
+            moved={name: torch.zeros(len(psi), dtype=torch.bool) for name in parts},
+            expected=nothing,
+            significance=nothing,
+        )
+
+
+@dataclass(frozen=True)
+class TrustRegionSteps:
+    """Where psi stands, and the evidence for its next step; see :class:`outer.steps.Steps`.
+
+    Attributes:
+        settings: of the steps.
+        objects: the learned objects.
+        accepted: psi without the pending step.
+        trial: psi with it.
+        radius: trust radii, by factor.
+        averages: the derivatives that steps have followed, by factor.
+        observed: these and the derivatives since the last step.
+        moved: whether the pending step moved an object, by factor.
+        expected: its expected gain.
+        significance: that of the derivatives by which the pending step moved an object, in standard deviations.
+        at_rest: for each judgment, the mean square of what objects that did not move gained or lost beyond the errors
+            of images: the variance of trainings.
+    """
+
+    settings: TrustRegion
+    objects: LearnedObjects
+    accepted: Float[Tensor, "objects K"]
+    trial: Float[Tensor, "objects K"]
+    radius: ByFactor
+    averages: Mapping[str, Average]
+    observed: Mapping[str, Average]
+    moved: Mapping[str, Bool[Tensor, "objects"]]
+    expected: Float[Tensor, "objects"]
+    significance: Float[Tensor, "objects"]
+    at_rest: tuple[float, ...] = ()
+
+    @property
+    def reported(self) -> Float[Tensor, "objects K"]:
+        """Psi with the pending step, which its expected gain supports until a training has judged it."""
+        return self.trial
+
+    @property
+    def pending(self) -> bool:
+        """Whether a step waits for :meth:`judge`."""
+        return bool(self._pending.any())
+
+    @property
+    def waiting(self) -> set[tuple[str, str]]:
+        """Objects and factors whose radius is too small, or whose gain is small compared with the largest one."""
+        return {
+            (name, factor)
+            for factor, moved in self.moved.items()
+            for name, moves in zip(self.objects.names, moved.tolist(), strict=True)
+            if not moves
+        }
+
+    @property
+    def _pending(self) -> Bool[Tensor, "objects"]:
+        """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
+        return torch.stack([*self.moved.values()]).any(0)
+
+    def judge(
+        self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
+    ) -> tuple[TrustRegionSteps, dict[str, Verdict]]:
+        """Accept or reject the pending step of each object; see :class:`outer.steps.Steps`.
+
+        A step is accepted if its derivative and the measured gain together are significant at ``level``, by the sum of
+        their normal quantiles over the root of 2 (Stouffer et al. 1949), and the score did not fall beyond ``errors``:
+        a derivative may differ from zero with certainty and yet promise next to nothing. The gain's error is that of
+        the images' paired differences and of trainings, which the scores of objects that did not move show. Where the
+        mean over all classes fell by more than its own error, though all steps would be accepted, all are rejected.
+        """
+        settings, labels, pending = self.settings, torch.tensor(self.objects.labels), self._pending
+        change = after.double() - before.double()
+        gains, images = change.sum(1), _errors_of_sums(change)
+        # Before at_rest is added to: what this step costs others is not scatter of trainings.
+        total_error = (
+            _errors_of_sums(change.nansum(0)).square() + len(gains) * _between_trainings(self.at_rest)
+        ).sqrt()
+        excess = (gains.square() - images.square())[labels][~pending]
+        excess = excess[excess.isfinite()]
+        at_rest = (*self.at_rest, float(excess.mean())) if len(excess) else self.at_rest
+        gain, error = gains[labels], (images.square() + _between_trainings(at_rest)).sqrt()[labels]
+        fell = gain < -settings.errors * error
+        measured = torch.where(gain == 0.0, 0.0, gain / error)
+        together = self.significance + measured > 2.0**0.5 * _quantile(settings.level)
+        accepted = pending & ~fell & together
+        if bool(accepted[pending].all()) and gains.nansum() < -settings.errors * total_error:
+            accepted, fell = torch.zeros_like(accepted), torch.ones_like(fell)
+        psi = torch.where(accepted[:, None], self.trial, self.accepted)
+        averages = {name: average.moved(accepted) for name, average in self.averages.items()}
+        verdicts = {
+            name: Verdict(bool(accepted[i]), float(self.expected[i]), float(gain[i]), float(error[i]))
+            for i, name in enumerate(self.objects.names)
+            if pending[i]
+        }
+        judged = replace(
+            self,
+            accepted=psi,
+            trial=psi,
+            radius=self._radii(rose=gain > settings.errors * error, fell=fell, accepted=accepted),
+            averages=averages,
+            observed=averages,
+            moved={name: torch.zeros_like(pending) for name in self.moved},
+            at_rest=at_rest,
+        )
+        return judged, verdicts
+
+    def _radii(
+        self, rose: Bool[Tensor, "objects"], fell: Bool[Tensor, "objects"], accepted: Bool[Tensor, "objects"]
+    ) -> ByFactor:
+        """Grow or shrink the radii of the factors that moved."""
+        settings = self.settings
+        factor = torch.where(rose, settings.grow, 1.0)
+        factor = torch.where(accepted, factor, settings.shrink**0.5)
+        factor = torch.where(fell, settings.shrink, factor)
+        return {
+            name: torch.where(self.moved[name], (radius * factor).clamp_max(settings.largest), radius)
+            for name, radius in self.radius.items()
+        }
+
+    def observe(self, result: Hypergradient) -> tuple[TrustRegionSteps, PValues]:
+        """Add a derivative at ``accepted`` to the average; see :class:`outer.steps.Steps`."""
+        names, distribution = self.objects.names, self.objects.distribution
+        gradient, error = stacked(result, names, self.accepted)
+        psi, slope, noise = (distribution.split(values) for values in (self.accepted, gradient, error))
+        observed = {
+            factor.name: self.observed[factor.name].joined(
+                *slopes_by_p(factor, psi[factor.name], slope[factor.name], noise[factor.name])
+            )
+            for factor in distribution.factors
+        }
+        tested = {name: average.p_values.tolist() for name, average in observed.items()}
+        p_values = {
+            name: {factor: values[i] for factor, values in tested.items()} for i, name in enumerate(names)
+        }
+        return replace(self, observed=observed), p_values
+
+    def propose(self, certificate: Certificate, shrink: float) -> TrustRegionSteps:
+        """Go along the averages by the radii; see :class:`outer.steps.Steps`."""
+        if certificate.void:
+            nothing = torch.zeros_like(self.expected)
+            return replace(self, observed=self.averages, trial=self.accepted, expected=nothing)
+        distribution, averages = self.objects.distribution, self.observed
+        psi = distribution.split(self.accepted)
+        tried, gains = {}, {}
+        for factor in distribution.factors:
+            name = factor.name
+            part = psi[name].new_tensor(fractions(certificate, self.objects.names, name, shrink))
+            too_small = self.radius[name] < self.settings.smallest
+            radius = torch.where(too_small, 0.0, self.radius[name] * part)
+            direction = averages[name].value
+            tried[name] = step_within(factor, psi[name], direction, radius, self.settings.keep)
+            gains[name] = (direction * (factor.p_of(tried[name]) - factor.p_of(psi[name]))).sum(1)
+        due = self.settings.waits_below * torch.stack([*gains.values()]).max()
+        moved, expected = {}, torch.zeros_like(self.expected)
+        for name, gain in gains.items():
+            moved[name] = (gain >= due) & (tried[name] != psi[name]).any(1)
+            tried[name] = torch.where(moved[name][:, None], tried[name], psi[name])
+            expected = expected + torch.where(moved[name], gain, 0.0)
+        return replace(
+            self,
+            trial=distribution.join(tried),
+            averages=averages,
+            moved=moved,
+            expected=expected,
+            significance=_significance(averages, moved),
+        )
+
+
+def step_within(
     factor: Factor,
     psi: Float[Tensor, "objects k"],
     direction: Float[Tensor, "objects k"],
     radius: Float[Tensor, "objects"],
     keep: float,
 ) -> Float[Tensor, "objects k"]:
-    """Psi whose p is moved along ``direction`` until half the absolute change of p (for bins, the total variation)
-    reaches ``radius``, or as far as it goes within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p; by
-    bisection.
+    """Move p along ``direction`` until half its absolute change (for bins, the total variation) reaches ``radius``.
+
+    It goes as far as it can within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p. The length is found
+    by bisection.
+
+    Returns:
+        Psi of the p that is reached.
     """
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
@@ -47,3 +308,35 @@ def within(
         low, high = torch.where(within_reach, middle, low), torch.where(within_reach, high, middle)
     still = (radius <= 0.0) | (size[:, 0] == 0.0)
     return torch.where(still[:, None], psi, moved(torch.where(inside(high), high, low)))
+
+
+def _between_trainings(at_rest: tuple[float, ...]) -> float:
+    """Return the variance of a gain between trainings.
+
+    It is the median judgment's, because after large steps objects at rest really gain by the better images of others.
+    """
+    return max(median(at_rest), 0.0) if at_rest else 0.0
+
+
+def _significance(
+    averages: Mapping[str, Average], moved: Mapping[str, Bool[Tensor, "objects"]]
+) -> Float[Tensor, "objects"]:
+    """Return the significance of the derivatives by the factors that move, in standard deviations.
+
+    Of several factors, the most significant one counts, its p-value times their number (Bonferroni).
+    """
+    moves = torch.stack([*moved.values()])
+    p_values = torch.stack([averages[name].p_values for name in moved])
+    p_value = p_values.where(moves, 1.0).amin(0) * moves.sum(0)
+    return _quantile(p_value.clamp(SMALLEST, 1.0 - SMALLEST))
+
+
+def _quantile(p: Float[Tensor, "*n"] | float) -> Float[Tensor, "*n"]:
+    """Return what a standard normal variable exceeds with probability p."""
+    return -torch.special.ndtri(torch.as_tensor(p, dtype=torch.float64))
+
+
+def _errors_of_sums(change: Float[Tensor, "*n images"]) -> Float[Tensor, "*n"]:
+    """Return standard errors of sums over images; 0 for one image, whose scatter is not known."""
+    images = change.shape[-1]
+    return images**0.5 * change.std(-1) if images > 1 else torch.zeros_like(change[..., 0])

@@ -17,10 +17,6 @@ from neural_sim.report.model_files import log_detector
 from neural_sim.report.run import RunResults
 
 _COUNTED = ("validation_loss", "training_loss", "images", "detector_steps", "products", "cpu_seconds")
-_CERTIFIED = (
-    "stationarity", "solver_steps", "solver_residual", "damping", "curvature_min", "curvature_max", "condition",
-    "sensitivity", "cosine",
-)  # fmt: skip
 
 
 class LiveRun:
@@ -138,7 +134,9 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
         if name in record["verdicts"]:
             metrics[f"psi/{name}/accepted"] = float(record["verdicts"][name]["accepted"])
     metrics |= {f"psi/{key}": record[key] for key in _COUNTED}
-    metrics |= {f"psi/{key}": certificate[key] for key in (_CERTIFIED if certificate else ())}
+    if certificate:
+        numbers = {**(certificate["adjoint"] or {}), "cosine": certificate["cosine"]}
+        metrics |= {f"psi/{key}": value for key, value in numbers.items() if isinstance(value, (int, float))}
     return metrics | {f"psi/seconds_{phase}": spent for phase, spent in record["seconds"].items()}
 
 

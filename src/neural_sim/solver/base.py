@@ -32,8 +32,6 @@ class Status(enum.Enum):
     NEGATIVE_CURVATURE = "operator is not positive definite: raise damping"
     LEAST_SQUARES = "singular and inconsistent: the value minimises the residual, which cannot vanish"
     SINGULAR = "operator is singular to rounding: the value is the minimum-norm solution on its range"
-    UNROLLED = "no system was solved: the derivative is that of the training that was run"
-    MEASURED = "no system was solved: trainings were compared"
     NON_FINITE = "operator, right-hand side or solution is not finite"
 
 

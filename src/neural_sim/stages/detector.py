@@ -18,7 +18,7 @@ from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.real import Sampling
 from neural_sim.detector.training import Training, train_detector
 from neural_sim.devices import placed, synchronise
-from neural_sim.outer.cost import Cost
+from neural_sim.outer.records import Cost
 from neural_sim.randomness import stream
 from neural_sim.stages.scene import TrainingImages, TrainingImagesStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage

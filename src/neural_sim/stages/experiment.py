@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.detector.protocol import Detector, Score, score_of
+from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.photos import Photos
+from neural_sim.outer.objective import Loss
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
@@ -26,6 +28,8 @@ from neural_sim.types import PinholeCamera
 
 SCORES: dict[str, Score] = {"detection": "AP", "classification": "accuracy"}
 """What a task's detectors are scored by."""
+_OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", SmoothAccuracy)}
+"""What the psi loop may lower of a detector with this score, other than its loss: the group's choice, and its class."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +104,11 @@ class Experiment:
                 f"task={task} and a detector that is scored by {score} do not belong together: want {choices}, and "
                 "detector=classifier for accuracy"
             )
-        wanted = {"AP": "average_precision", "accuracy": "accuracy"}[score]
-        if objective not in (wanted, "loss"):
-            raise ValueError(f"outer.objective: want {wanted} or loss for task={task}, got {objective}")
+        name, wanted = _OBJECTIVES[score]
+        if not isinstance(objective, (wanted, Loss)):
+            raise ValueError(
+                f"outer/objective: want {name} or loss for task={task}, got {type(objective).__name__}"
+            )
         if not self.loop.outer.train_first and self.training.warm_start != "initial":
             raise ValueError(
                 "outer.train_first=false takes the first hypergradient at the warm start: want "

@@ -13,13 +13,11 @@ from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
 from neural_sim.gradient.estimators import Estimator
-from neural_sim.outer.cost import Cost
-from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.loop import OuterLoop, learn_psi
+from neural_sim.outer.inner import InnerLoop, LoopInputs
+from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.records import IterationRecord, LearnedPsi, record_of
+from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, record_of
 from neural_sim.outer.response import ResponseLoop
-from neural_sim.outer.rewarded import RewardLoop
 from neural_sim.outer.settings import Outer
 from neural_sim.parameter.product import Draws, HardDraws, SceneDistribution
 from neural_sim.randomness import stream
@@ -103,17 +101,17 @@ class PsiStage(Stage[LearnedPsi]):
         method, scene, training = self.method, results(self.warm_start.scene), self.warm_start.training
         if self.outer.quality is not None:
             scene = scene.with_quality(self.outer.quality)
-        inner = InnerLoop(
-            scene, self.warm_start.build(), results(self.warm_start).params, results(self.targets).val, self.outer,
-            training, stream(self.seed, "psi"), self.draws, self.warm_start.photographs(results),
-        )  # fmt: skip
+        detector, params = self.warm_start.build(), results(self.warm_start).params
+        inputs = LoopInputs(detector, params, results(self.targets).val, self.warm_start.photographs(results))
+        generator = stream(self.seed, "psi")
+        inner = InnerLoop.prepare(scene, inputs, self.outer, training, generator, self.draws)
         if self.parts is not None:
-            return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver)
+            return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver, generator)
         if isinstance(method, Response):
-            return ResponseLoop(inner, self.initial, method.part)
+            return ResponseLoop(inner, self.initial, method.part, generator)
         if isinstance(method, (Fixed, HypergradientLoop)):
             raise ValueError(f"baseline={method.name} has no outer loop")
-        return RewardLoop(inner, self.initial, method)
+        return RewardLoop(inner, self.initial, method, generator)
 
     @override
     def pack(self, value: LearnedPsi) -> dict[str, Any]:

@@ -13,13 +13,14 @@ from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Losses, MixedDerivative
 from neural_sim.gradient.estimators import by_strata
-from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.gradient.mixed import scores
 from neural_sim.gradient.pathwise import PathwiseEstimator
-from neural_sim.outer.binding import image_losses, object_images
+from neural_sim.outer.derivative import image_losses, object_images
 from neural_sim.outer.probing import ProbeSet
 from neural_sim.parameter.factor import BinnedFactor, Factor
 from neural_sim.solver.adjoint import AdjointSolver
+from neural_sim.solver.hvp import gradient
 from neural_sim.solver.operator import unflatten
 from neural_sim.synthesis.scene import Scene
 from neural_sim.tasks.context import Context
@@ -78,10 +79,10 @@ class FrozenLoop:
         weights = torch.full((len(images),), 1.0 / len(images), dtype=dtype, device=cached.device)
         inner = InnerProblem(trainable, cached.losses, weights)
         terms = CachedSet.of(detector, backbone, validation).mean_terms()
-        result = hypergradient(inner, terms, {}, solver, generator)
-        solution = result.solution
+        adjoint = solver.solve(inner.terms(), trainable, gradient(terms, trainable), None, generator)
+        solution = adjoint.solution
         solve = (
-            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {result.damping.value:.2g}"
+            f"{solution.status.name.lower()} in {solution.steps} steps at lambda {adjoint.damping.value:.2g}"
         )
         vector = unflatten(solution.value, trainable)
         return FrozenLoop(scene, detector, backbone, trainable, vector, psi, solve)

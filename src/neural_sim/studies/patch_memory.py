@@ -19,7 +19,7 @@ from neural_sim.devices import peak_bytes, synchronise
 from neural_sim.documents import markdown_table
 from neural_sim.gradient.mixed import image_cotangents
 from neural_sim.gradient.pathwise import PathwiseEstimator, contract, draw_cotangents, map_cotangents
-from neural_sim.outer.binding import image_losses, rendered_path
+from neural_sim.outer.derivative import image_losses, rendered_path
 from neural_sim.parameter.product import HARD
 from neural_sim.ranges import PositiveInt, validated
 from neural_sim.report.tracking import Run

@@ -12,8 +12,7 @@ from typing_extensions import override
 from neural_sim.baseline.base import HypergradientLoop, Response
 from neural_sim.documents import write_json
 from neural_sim.outer.descent import GradientLoop
-from neural_sim.outer.foreseen import foresee
-from neural_sim.outer.labelled import labelled_gains
+from neural_sim.outer.preflight import expected_gains, photograph_gains
 from neural_sim.ranges import PositiveFraction, PositiveInt, validated
 from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import bin_scores
@@ -58,14 +57,14 @@ class PreflightTask(Task):
         names, validation = list(graph.names), results(graph.targets).val
         loop = cast(GradientLoop, graph.learned.loop(results))
         outer = x.loop.outer
-        foreseen = foresee(loop, self.trials, self.moved)
+        foreseen = expected_gains(loop, self.trials, self.moved)
         photographs, labelled = results(graph.targets).train, []
         if photographs is not None and self.labelled:
-            labelled = labelled_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
+            labelled = photograph_gains(loop, photographs, self.labelled, self.trials, x.run.seed)
         detections = graph.of_initial.build().predict(results(graph.of_initial).params, validation.images)
         images = graph.of_initial.images(results).images.to("cpu")
         differ = mismatches(validation, images)
-        level = 0.05 if outer.trust is None or outer.trust.level is None else outer.trust.level
+        level = 0.05 if outer.trust.level is None else outer.trust.level
         report = Preflight(
             experiment=x.run.name,
             names=tuple(names),

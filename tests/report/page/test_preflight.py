@@ -5,8 +5,7 @@ import re
 
 import torch
 
-from neural_sim.outer.foreseen import Foreseen
-from neural_sim.outer.labelled import Labelled
+from neural_sim.outer.preflight import ExpectedGains, PhotographGain
 from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import BinScore
 from neural_sim.target.mismatch import Mismatch
@@ -14,7 +13,7 @@ from neural_sim.types import LabelledImages
 
 
 def foreseen(name, p_value, step=0.1):
-    return Foreseen(name, "pose", p_value, 0.15, (step, -step), (0.01, 0.01), step, 0.02)
+    return ExpectedGains(name, "pose", p_value, 0.15, (step, -step), (0.01, 0.01), step, 0.02)
 
 
 def preflight(*p_values):
@@ -46,10 +45,12 @@ def test_the_summary_has_gains_weak_bins_and_advice():
 def test_the_gain_is_told_in_labelled_photographs():
     report = preflight(0.001, 0.5)
     assert report.gain == 0.1 and "none are for training" in report.worth
-    counted = dataclasses.replace(report, labelled=(Labelled(10, 0.05, 0.01), Labelled(25, 0.2, None)))
+    counted = dataclasses.replace(
+        report, labelled=(PhotographGain(10, 0.05, 0.01), PhotographGain(25, 0.2, None))
+    )
     assert counted.worth.startswith("A first step is worth about 15 of them.")
     assert "10 lower it by 0.050 ± 0.010; 25 lower it by 0.200." in counted.summary()
-    few = dataclasses.replace(report, labelled=(Labelled(10, 0.05, 0.01),))
+    few = dataclasses.replace(report, labelled=(PhotographGain(10, 0.05, 0.01),))
     assert few.worth.startswith("A first step is worth more than 10 of them.")
     hopeless = dataclasses.replace(preflight(0.5), labelled=few.labelled)
     assert hopeless.worth.startswith("Labelled photographs in training")

@@ -47,7 +47,8 @@ def shown():
 def results():
     uniform = torch.full((2, 4), 0.25, dtype=torch.float64)
     peaked = torch.tensor([[0.85, 0.05, 0.05, 0.05], [0.25] * 4], dtype=torch.float64)
-    certificate = {"p_values": {"mug": {"pose": 0.01}, "can": {"pose": 0.4}}, "doubts": [], "cosine": float("nan"),
+    certificate = {"p_values": {"mug": {"pose": 0.01}, "can": {"pose": 0.4}}, "doubts": [],
+                   "cosine": None, "adjoint": None,
                    "actions": {"mug": {"pose": "kept"}, "can": {"pose": "skipped"}}}  # fmt: skip
     record = {"probabilities": {"pose": uniform.tolist()}, "certificate": certificate, "verdicts": {},
               "images_without_box": 0}  # fmt: skip

@@ -8,13 +8,12 @@ import torch
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training
-from neural_sim.gradient.accumulated import Unrolled
 from neural_sim.gradient.estimators import StratifiedEstimator
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import Response
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.update import Mirror
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.damping import LanczosDamping
 from neural_sim.solver.operator import flatten
@@ -32,7 +31,7 @@ from neural_sim.studies.work_precision.micro import PSI, small_scene
 from neural_sim.studies.work_precision.series import Timing
 
 SOLVER = AdjointSolver(damping=LanczosDamping(lanczos_steps=4), max_steps=4)
-OUTER = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, curvature_images=6, pool_per_bin=2)
+OUTER = Outer(iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
 
 
 def simulator(outer, solver, seed, psi=None):
@@ -40,10 +39,9 @@ def simulator(outer, solver, seed, psi=None):
     generator, scene = torch.Generator().manual_seed(seed), small_scene()
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = scene.training_set(PSI, 3, generator).images
-    inner = InnerLoop(
-        scene, detector, detector.init(generator), validation, outer, Training(batch_size=4), generator
-    )
-    return SimulatorModule(inner, psi, StratifiedEstimator(probes_per_bin=2), solver)
+    inputs = LoopInputs(detector, detector.init(generator), validation)
+    inner = InnerLoop.prepare(scene, inputs, outer, Training(batch_size=4), generator)
+    return SimulatorModule(inner, psi, StratifiedEstimator(probes_per_bin=2), solver, generator)
 
 
 WORLD = SimpleNamespace(names=("a", "b"), outer=OUTER, simulator=simulator, visited={"end": PSI.flip(0)})
@@ -61,14 +59,14 @@ def test_every_way_has_an_error_and_the_default_is_the_loops_own():
     # Of two steps of a new network, whose differences of gradients in float32 have few digits.
     assert error["unrolled, all probes every step"] < 0.5 < error["unrolled, last quarter"]
     own = ways(OUTER, SOLVER)[DEFAULT].outer
-    assert own.adjoint == OUTER.adjoint == "unrolled" and own.unrolled == OUTER.unrolled == Unrolled()
+    assert own.adjoint == OUTER.adjoint == Unrolled()
 
 
 def test_a_derivative_that_is_the_response_has_no_error(monkeypatch):
     """The response is taken to be what one way finds, times any number and plus any constant."""
     named = ways(OUTER, SOLVER)["unrolled, exact products"]
     found = torch.randn(2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    monkeypatch.setattr(family, "response", lambda inner, psi: Response(3.0 * found + 1.0, 1))
+    monkeypatch.setattr(family, "response", lambda inner, psi, numbers: Response(3.0 * found + 1.0, 1))
     monkeypatch.setattr(family, "ways", lambda outer, solver: {DEFAULT: named, EXACT: named})
     monkeypatch.setattr(family, "slopes", lambda loop, way: (found, 0.5))
     series, unrolled = Hypergradients(1, SOLVER).measure(WORLD, Timing(1), 0)
@@ -85,7 +83,7 @@ def test_places_are_those_that_the_loop_came_to(monkeypatch):
         return torch.eye(2, 4), 0.5
 
     monkeypatch.setattr(family, "slopes", watched)
-    monkeypatch.setattr(family, "response", lambda inner, psi: Response(torch.eye(2, 4), 1))
+    monkeypatch.setattr(family, "response", lambda inner, psi, numbers: Response(torch.eye(2, 4), 1))
     found = Hypergradients(1, SOLVER, places=("first_step", "end")).measure(WORLD, Timing(1), 0)
     assert [series.name for series in found] == [
         "hypergradient/of a training, end",
@@ -104,10 +102,10 @@ def test_ways_see_the_same_images_probes_and_training(monkeypatch):
     loop, named, seen = simulator(OUTER, SOLVER, 0), ways(OUTER, SOLVER), []
     derivative = SimulatorModule._derivative
 
-    def watched(self, rendered, cached):
-        probes = self._probes.cached.inputs[0]
-        seen.append((rendered.images.images, cached.inputs[0], probes, flatten(self.inner.trainable)))
-        return derivative(self, rendered, cached)
+    def watched(self, trained, objective):
+        probes, inputs = self._probes.cached.inputs[0], trained.examples.inputs[0]
+        seen.append((trained.rendered.images.images, inputs, probes, flatten(trained.trainable)))
+        return derivative(self, trained, objective)
 
     monkeypatch.setattr(SimulatorModule, "_derivative", watched)
     first, again = (slopes(loop, named[DEFAULT])[0] for _ in range(2))

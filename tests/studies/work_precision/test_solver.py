@@ -8,7 +8,7 @@ import torch
 
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Backbone, Head
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.direct import Identity
 from neural_sim.solver.minres import MinimumResidual

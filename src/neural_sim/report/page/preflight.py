@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 
 from neural_sim.detector.protocol import Score
-from neural_sim.outer.foreseen import Foreseen
-from neural_sim.outer.labelled import Labelled, equivalent
+from neural_sim.outer.preflight import ExpectedGains, PhotographGain, equivalent
 from neural_sim.report.page import pictures, render
 from neural_sim.report.page.verdict import listed
 from neural_sim.report.page.weak_bins import BinScore, by_object, weakest
@@ -41,20 +40,20 @@ class Preflight:
 
     experiment: str
     names: tuple[str, ...]
-    foreseen: tuple[Foreseen, ...]
+    foreseen: tuple[ExpectedGains, ...]
     level: float
     bins: tuple[BinScore, ...]
     mismatches: tuple[Mismatch, ...]
     settings: Mapping[str, str]
     distance_factor: float | None
-    labelled: tuple[Labelled, ...] = ()
+    labelled: tuple[PhotographGain, ...] = ()
     score: Score = "AP"
 
     @property
-    def promising(self) -> list[Foreseen]:
+    def promising(self) -> list[ExpectedGains]:
         """Objects and factors of a significant derivative, by Holm's step-down procedure (1979), most gain first."""
         ordered = sorted(self.foreseen, key=lambda f: f.p_value)
-        kept: list[Foreseen] = []
+        kept: list[ExpectedGains] = []
         for place, one in enumerate(ordered):
             if one.p_value > self.level / (len(ordered) - place):
                 break

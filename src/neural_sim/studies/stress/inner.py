@@ -10,7 +10,8 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.gradient.base import MixedDerivative, Params
-from neural_sim.gradient.hypergradient import Hypergradient, InnerProblem, hypergradient
+from neural_sim.gradient.hypergradient import Hypergradient, ImplicitAdjoint
+from neural_sim.gradient.implicit import InnerProblem, hypergradient
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import LinearSolver, Status
 from neural_sim.solver.cg import ConjugateGradient
@@ -68,7 +69,7 @@ class Quadratic:
         slope = self.b.T @ (self.b @ theta - self.t)
         return self.d.T @ self.a @ torch.linalg.solve(self.hessian, slope) / ROWS
 
-    def solved(self, theta: Tensor, solver: LinearSolver, rtol: float) -> Hypergradient:
+    def solved(self, theta: Tensor, solver: LinearSolver, rtol: float) -> Hypergradient[ImplicitAdjoint]:
         """Solve by the project's own code, with the proximal term as damping."""
         params = {"w": theta[:2].clone(), "v": theta[2:].clone()}
         weights = torch.full((ROWS,), self.unit / ROWS, dtype=DOUBLE)
@@ -110,11 +111,13 @@ def far_from_stationary(scope: Scope) -> Checks:
         for name, solver in TRIED.items():
             result = problem.solved(theta, solver, rtol)
             label = f"{name}, |delta| = {distance:g}"
-            error = abs(result.stationarity - float((hessian @ (theta - best)).norm()))
-            yield ended(f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, result.solution)
-            value = float((result.psi_gradients["x"] - exact).norm())
+            error = abs(result.adjoint.stationarity - float((hessian @ (theta - best)).norm()))
+            yield ended(
+                f"stationarity: {label}", error, 4 * ROWS * eps(DOUBLE) * size, result.adjoint.solution
+            )
+            value = float((result.gradients["x"] - exact).norm())
             off = f"{relative(exact, truth):.1e} off the truth"
-            yield ended(f"gradient ({off}): {label}", value, bound, result.solution)
+            yield ended(f"gradient ({off}): {label}", value, bound, result.adjoint.solution)
 
 
 @case
@@ -125,8 +128,8 @@ def units(scope: Scope) -> Checks:
     for power in (-200, -60, 60, 200):
         scaled = replace(problem, unit=2.0**power)
         result = scaled.solved(problem.minimiser, ConjugateGradient(), 1e-10)
-        change = worst(result.psi_gradients["x"] - plain.psi_gradients["x"])
-        yield ended(f"change by a unit of 2^{power}", change, 0.0, result.solution)
+        change = worst(result.gradients["x"] - plain.gradients["x"])
+        yield ended(f"change by a unit of 2^{power}", change, 0.0, result.adjoint.solution)
 
 
 @case
@@ -223,7 +226,7 @@ def untrained_detector(scope: Scope) -> Checks:
         coarse, fine = ((loss(h) - loss(-h)) / (2 * h) for h in (step, 0.5 * step))
         truth = fine + (fine - coarse) / 3.0
         bound = abs(truth - fine) + 64 * eps(DOUBLE) * abs(loss(0.0)) / step
-        quantity = f"stationarity, {result.stationarity:.1e}: {factor:g} times the start"
-        yield Check(quantity, abs(result.stationarity - truth), bound)
-        wrong = not_finite(result.solution.value)
+        quantity = f"stationarity, {result.adjoint.stationarity:.1e}: {factor:g} times the start"
+        yield Check(quantity, abs(result.adjoint.stationarity - truth), bound)
+        wrong = not_finite(result.adjoint.solution.value)
         yield Check(f"numbers not finite: {factor:g} times the start", wrong, 0.0)

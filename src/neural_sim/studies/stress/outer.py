@@ -12,10 +12,14 @@ from torch import Tensor
 
 from neural_sim.detector.training import Training
 from neural_sim.gradient.base import MixedDerivative
-from neural_sim.outer.inner import InnerLoop
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.outer.certificate import OnUntrusted, Trust
+from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
-from neural_sim.outer.settings import OnUntrusted, Outer
+from neural_sim.outer.objective import Loss
+from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import FreeSteps
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import HardDraws, SceneDistribution
@@ -198,21 +202,17 @@ def _module(estimator: Constant, choice: OnUntrusted, iterations: int, scope: Sc
     psi = torch.zeros(1, 4)
     validation = scene.training_set(psi, 2, generator).images
     settings = Outer(
-        Mirror(max_step=MAX_STEP), iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1,
-        on_untrusted=choice, objective="loss", adjoint="implicit", steps="free", train_first=False,
+        iterations=iterations, images_per_object=3, epochs=1, pool_per_bin=1, train_first=False,
+        steps=FreeSteps(Mirror(max_step=MAX_STEP)), adjoint=Implicit(), objective=Loss(),
+        trust=Trust(on_untrusted=choice),
     )  # fmt: skip
-    inner = InnerLoop(
-        scene,
-        network,
-        network.init(generator),
-        validation,
-        settings,
-        Training(batch_size=3, weight_decay=0.0),
-        generator,
-    )
+    inputs = LoopInputs(network, network.init(generator), validation)
+    training = Training(batch_size=3, weight_decay=0.0)
+    inner = InnerLoop.prepare(scene, inputs, settings, training, generator)
     return SimulatorModule(
         inner,
         psi,
         estimator,  # pyright: ignore[reportArgumentType]  (stands in for the estimators of conf/gradient)
         AdjointSolver(max_steps=4),
+        generator,
     )

@@ -6,7 +6,6 @@ random numbers, and takes no derivative. Derivatives are compared with it as vec
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +19,8 @@ from annotated_types import MinLen
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.gradient.implicit import Implicit
+from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.response import centred_cosine, response
 from neural_sim.outer.settings import Outer
@@ -50,10 +51,11 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
     """Return every adjoint by name, as changes of the loop's own settings."""
 
     def unrolled(line: str, **changed: object) -> Way:
-        how = replace(outer.unrolled, **changed)  # pyright: ignore[reportArgumentType]
-        return Way(line, replace(outer, adjoint="unrolled", unrolled=how), solver)
+        own = outer.adjoint if isinstance(outer.adjoint, Unrolled) else Unrolled()
+        how = replace(own, **changed)  # pyright: ignore[reportArgumentType]
+        return Way(line, replace(outer, adjoint=how), solver)
 
-    implicit = replace(outer, adjoint="implicit")
+    implicit = replace(outer, adjoint=Implicit())
     everything: dict[str, object] = {"probes_per_step": 0, "scored_steps": 0}
     return {
         DEFAULT: unrolled("unrolled"),
@@ -67,7 +69,7 @@ def ways(outer: Outer, solver: AdjointSolver) -> dict[str, Way]:
         "unrolled, last quarter": unrolled("part", part=0.25),
         "implicit, as configured": Way("implicit", implicit, solver),
         "implicit, all images, rtol 1e-3": Way(
-            "implicit", replace(implicit, curvature_images=0), replace(solver, rtol=1e-3)
+            "implicit", replace(outer, adjoint=Implicit(curvature_images=0)), replace(solver, rtol=1e-3)
         ),
         "first order: dL_val/dtheta alone": Way("first order", implicit, replace(solver, linear=Identity())),
     }
@@ -107,7 +109,7 @@ class Hypergradients:
         }
         for repeat in range(self.trainings):
             loop = world.simulator(world.outer, self.solver, 1_000 * seed + repeat, psi)
-            truth = response(loop.inner, loop.psi.detach()).value
+            truth = response(loop.inner, loop.psi.detach(), loop.numbers).value
             truths.append(truth)
             found = {name: slopes(loop, way) for name, way in named.items()}
             for name, (value, seconds) in found.items():
@@ -148,15 +150,12 @@ def slopes(loop: SimulatorModule, way: Way) -> tuple[Slopes, float]:
 
     Images, training and probes are the same for all ways: the loop's common random numbers, and its generator anew.
     """
-    inner = copy.copy(loop.inner)
-    inner.settings, inner.generator = (
-        way.outer,
-        torch.Generator().manual_seed(loop.inner.generator.initial_seed()),
-    )
-    other = SimulatorModule(inner, loop.psi.detach().clone(), loop.estimator, way.solver)
+    generator = torch.Generator().manual_seed(loop.numbers.generator.initial_seed())
+    inner = replace(loop.inner, settings=way.outer)
+    other = SimulatorModule(inner, loop.psi.detach().clone(), loop.estimator, way.solver, generator)
     found = other.derivative()
     p = torch.cat([*loop.scene.distribution.probabilities(loop.psi.detach()).values()], -1)
-    slope = torch.stack([found.psi_gradients[name] for name in loop.scene.names])
+    slope = torch.stack([found.gradients[name] for name in loop.scene.names])
     return -slope / p, sum(found.seconds.values())
 
 

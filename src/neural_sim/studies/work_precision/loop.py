@@ -80,7 +80,7 @@ def series(
         if all(run["iterations"] for run in mine):
             loss = fmean(run["iterations"][-1]["validation_loss"] for run in mine)
             point = Point(method, loss, ends, None, default, method)
-            losses.setdefault(mine[0]["config"]["outer"]["objective"], []).append(point)
+            losses.setdefault(objective_of(mine[0]), []).append(point)
         distances.append(Point(method, fmean(distance(run) for run in mine), ends, None, default, method))
     kinds = (
         ("AP", "1 - AP of the biased classes", scored),
@@ -118,3 +118,9 @@ def half(runs: Sequence[Results], clock: Clock) -> str:
     if not reached:
         return f"half the gap: never in {len(runs)}"
     return f"half the gap: {fmean(reached):.3g} s, in {len(reached)} of {len(runs)}"
+
+
+def objective_of(run: Results) -> str:
+    """Return the name of a run's outer objective; older runs have it as a word, not as a class."""
+    objective = run["config"]["outer"]["objective"]
+    return objective if isinstance(objective, str) else objective["_target_"].rpartition(".")[2]

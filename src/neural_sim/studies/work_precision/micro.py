@@ -14,7 +14,7 @@ from neural_sim.detector.training import train_detector
 from neural_sim.field.grid import GridField
 from neural_sim.gradient.base import Params
 from neural_sim.gradient.estimators import importance_weights
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.protocol import Detector, Parameters
-from neural_sim.gradient.hypergradient import InnerProblem
+from neural_sim.gradient.implicit import InnerProblem
 from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Solution

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neural_sim.gradient.estimators import importance_weights, stratified
-from neural_sim.gradient.hypergradient import InnerProblem, hypergradient
+from neural_sim.gradient.implicit import InnerProblem, hypergradient
 from neural_sim.gradient.mixed import scores
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.solver.base import Status
@@ -32,11 +32,9 @@ def test_pathwise_hypergradient_is_the_retrained_derivative(problem, pathwise, p
     settings = {"patch_size": patch_size, "chunk_size": 3}
     inner = problem.inner(batch.images)
     result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch, **settings))
-    assert result.solution.status is Status.CONVERGED
-    assert result.stationarity < 1e-12
-    torch.testing.assert_close(
-        result.psi_gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10
-    )
+    assert result.adjoint.solution.status is Status.CONVERGED
+    assert result.adjoint.stationarity < 1e-12
+    torch.testing.assert_close(result.gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10)
 
 
 def test_tangents_of_the_first_render_give_the_same_hypergradient(problem, pathwise, stand_in_tangents):
@@ -47,16 +45,14 @@ def test_tangents_of_the_first_render_give_the_same_hypergradient(problem, pathw
     batch = dataclasses.replace(batch, path=path)
     inner = problem.inner(batch.images)
     result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch))
-    torch.testing.assert_close(
-        result.psi_gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10
-    )
+    torch.testing.assert_close(result.gradients["can"], problem.central_difference(), rtol=1e-7, atol=1e-10)
 
 
 def test_a_step_along_the_negative_hypergradient_lowers_the_validation_loss(problem, pathwise):
     batch = problem.object_images()
     inner = problem.inner(batch.images)
     result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch))
-    slope = result.psi_gradients["can"]
+    slope = result.gradients["can"]
     before = problem.validation(problem.minimiser(problem.psi))
     after = problem.validation(problem.minimiser(problem.psi - 1e-4 * slope / slope.norm()))
     assert after < before
@@ -97,8 +93,8 @@ def test_stratified_hypergradient_is_the_retrained_derivative_over_hard_bins(pro
         / 2e-5
         for e in basis
     ]
-    assert result.stationarity < 1e-12
-    torch.testing.assert_close(result.psi_gradients["can"], torch.stack(outer), rtol=1e-7, atol=1e-10)
+    assert result.adjoint.stationarity < 1e-12
+    torch.testing.assert_close(result.gradients["can"], torch.stack(outer), rtol=1e-7, atol=1e-10)
 
 
 def test_solver_and_damping_are_accounted_for(problem, pathwise):
@@ -106,14 +102,19 @@ def test_solver_and_damping_are_accounted_for(problem, pathwise):
     inner = problem.inner(batch.images)
     solver = AdjointSolver(ConjugateGradient(), LanczosDamping(max_condition=20.0), rtol=1e-8, max_steps=100)
     result = solve(problem, inner, lambda v: pathwise(problem.loss_of, inner.params, v, batch), solver)
-    assert result.solution.status is Status.CONVERGED
-    assert result.damping.condition <= 20.0 * (1 + 1e-6)
+    assert result.adjoint.solution.status is Status.CONVERGED
+    assert result.adjoint.damping.condition <= 20.0 * (1 + 1e-6)
     assert set(result.seconds) == {"validation", "solve", "mixed"}
     assert 0.0 < result.p_values["can"]["pose"] <= 1.0
     again = hypergradient(
-        inner, [problem.validation], {}, solver, torch.Generator().manual_seed(0), result.solution.value
+        inner,
+        [problem.validation],
+        {},
+        solver,
+        torch.Generator().manual_seed(0),
+        result.adjoint.solution.value,
     )
-    assert again.solution.warm_started and again.solution.steps <= 1
+    assert again.adjoint.solution.warm_started and again.adjoint.solution.steps <= 1
 
 
 def test_a_subset_stands_for_the_whole_in_hessian_products_only(problem):

@@ -1,20 +1,26 @@
-"""The estimators' inputs from rendered images: losses by row, and the differentiable path from psi to an image."""
+"""What a derivative by psi needs of rendered images: losses by row, the path from psi to an image, recorded steps."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
 from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Parameters
-from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, RenderedPath
+from neural_sim.gradient.base import ImageLoss, Losses, ObjectImages, Probes, RenderedPath
+from neural_sim.gradient.reversal import Examples, InputsOf, RecordedTraining
+from neural_sim.gradient.unrolled import ProbeGroups
+from neural_sim.outer.inner import InnerLoop, Trained
+from neural_sim.outer.probing import ProbeSet
 from neural_sim.synthesis.assembly import Compose, RenderedImages, RenderedObject
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import SceneDraw
 
 
 def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> ImageLoss:
-    """Losses of images, differentiable in their pixels."""
+    """Return the losses of images, differentiable in their pixels."""
 
     def losses(params: Parameters, chunk: Tensor, index: Tensor) -> Tensor:
         return detector.per_image_loss(params, detector.features(backbone, chunk), targets.select(index))
@@ -23,13 +29,13 @@ def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> 
 
 
 def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | None) -> Losses:
-    """Losses of an iteration's training images, from features and from pixels, and of its probes."""
+    """Return the losses of a training's images, from features and from pixels, and of its probes."""
     from_images = image_losses(cached.detector, backbone, cached.targets)
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compose) -> RenderedPath:
-    """The path from psi to one object's images through a relaxed draw; ``compose`` makes them of its maps.
+    """Return the path from psi to one object's images through a relaxed draw; ``compose`` makes them of its maps.
 
     Raises:
         ValueError: images of hard draws.
@@ -58,8 +64,9 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
 def object_images(
     scene: Scene, rendered: RenderedImages, psi: Tensor, weights: Tensor
 ) -> dict[str, ObjectImages]:
-    """The images in which each object shows, by its name, with their rows in the training set; a path where draws are
-    relaxed. ``weights`` are those of all images in the training loss.
+    """Return the images in which each object shows, by its name, with their rows in the training set.
+
+    They have a path where draws are relaxed. ``weights`` are those of all images in the training loss.
     """
     pixels = rendered.images.images
     bound = {}
@@ -74,3 +81,37 @@ def object_images(
             path=rendered_path(scene, label, part, rendered.compose[label]) if part.relaxed else None,
         )
     return bound
+
+
+def recorded(inner: InnerLoop, trained: Trained) -> RecordedTraining:
+    """Bind a training's recorded steps to what it was trained on.
+
+    Raises:
+        ValueError: that training was not recorded.
+    """
+    if trained.trajectory is None:
+        raise ValueError("unrolled: the training was not recorded; want train(..., recording=...)")
+    examples = Examples(
+        inputs=trained.examples.inputs,
+        losses=trained.examples.losses_from,
+        proximal=inner.detector.proximal,
+        anchor=inner.warm_start,
+        inputs_of=inputs_of(inner, trained.examples),
+        drawn=None if inner.photographs is None else len(trained.rendered),
+    )
+    return RecordedTraining(trained.trajectory, examples, trained.trainable)
+
+
+def probe_groups(probed: ProbeSet, probes: Mapping[str, Mapping[str, Probes]]) -> ProbeGroups:
+    """Arrange the probes of learned objects, by object and factor, in tables [strata, per_bin]."""
+    tables = [part.index.view(-1, probed.per_bin) for parts in probes.values() for part in parts.values()]
+    return ProbeGroups(probed.cached.losses, tables)
+
+
+def inputs_of(inner: InnerLoop, examples: CachedSet) -> InputsOf:
+    """Return the function that computes a training set's inputs from drawn images and their rows."""
+
+    def inputs(pixels: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
+        return (*inner.detector.features(inner.backbone, pixels), examples.targets.select(rows).deltas)
+
+    return inputs

@@ -9,29 +9,32 @@ from neural_sim.baseline.lts import LearningToSimulate
 from neural_sim.detector.retinanet import RetinaNet
 from neural_sim.detector.settings import Anchors, Head
 from neural_sim.detector.training import Training
-from neural_sim.outer.inner import InnerLoop
-from neural_sim.outer.loop import learn_psi
-from neural_sim.outer.rewarded import RewardLoop
+from neural_sim.outer.inner import InnerLoop, LoopInputs
+from neural_sim.outer.loop import RewardLoop, learn_psi
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.update import Mirror
 
 
 @pytest.fixture
-def inner(scene):
+def reward_loop(scene):
     generator = torch.Generator().manual_seed(0)
     detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
     validation = scene.training_set(torch.zeros(2, 4), 3, generator).images
-    settings = Outer(Mirror(), iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
-    return lambda: InnerLoop(
-        scene, detector, detector.init(torch.Generator().manual_seed(1)), validation, settings,
-        Training(batch_size=4, weight_decay=0.0),
-        torch.Generator().manual_seed(2),
-    )  # fmt: skip
+    settings = Outer(iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
+    inputs = LoopInputs(detector, detector.init(torch.Generator().manual_seed(1)), validation)
+
+    def make(method):
+        generator = torch.Generator().manual_seed(2)
+        inner = InnerLoop.prepare(
+            scene, inputs, settings, Training(batch_size=4, weight_decay=0.0), generator
+        )
+        return RewardLoop(inner, torch.zeros(2, 4), method, generator)
+
+    return make
 
 
-def test_rounds_are_counted_and_the_trajectory_is_the_methods(inner):
+def test_rounds_are_counted_and_the_trajectory_is_the_methods(reward_loop):
     method = LearningToSimulate(rounds=3)
-    loop = RewardLoop(inner(), torch.zeros(2, 4), method)
+    loop = reward_loop(method)
     learned = learn_psi(loop, progress=False)
     assert len(learned.records) == 2 * method.rounds and len(learned.trajectory) == len(learned.records) + 1
     for record in learned.records:
@@ -41,9 +44,9 @@ def test_rounds_are_counted_and_the_trajectory_is_the_methods(inner):
     assert any(record.probabilities != learned.records[0].probabilities for record in learned.records)
 
 
-def test_an_observer_sees_each_iteration_when_it_has_ended_at_no_cost_of_the_method(inner, monkeypatch):
+def test_an_observer_sees_each_iteration_when_it_has_ended_at_no_cost_of_the_method(reward_loop, monkeypatch):
     clock, seen = [0.0], []
-    loop = RewardLoop(inner(), torch.zeros(2, 4), LearningToSimulate(rounds=2))
+    loop = reward_loop(LearningToSimulate(rounds=2))
 
     def observe(record):
         seen.append((record, len(loop.records), len(loop.trajectory)))

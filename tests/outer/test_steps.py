@@ -1,4 +1,4 @@
-"""Checked steps: where they go, what evidence moves them, and what a training's outcome does to them."""
+"""Trust-region steps: where they go, what evidence moves them, and what a training's outcome does to them."""
 
 import math
 from statistics import NormalDist
@@ -6,30 +6,26 @@ from statistics import NormalDist
 import pytest
 import torch
 
-from neural_sim.gradient.hypergradient import Hypergradient
-from neural_sim.outer.certificate import certify
-from neural_sim.outer.checked import CheckedSteps
-from neural_sim.outer.settings import Checks, Trust
+from neural_sim.gradient.hypergradient import Hypergradient, UnrolledAdjoint
+from neural_sim.gradient.unrolled import Unrolled
+from neural_sim.outer.certificate import Trust, certify
+from neural_sim.outer.steps import LearnedObjects
+from neural_sim.outer.trust_region import TrustRegion
 from neural_sim.parameter.factor import BinnedFactor
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.solver.base import Solution, Status
-from neural_sim.solver.damping import Damped
 
 POSE = BinnedFactor("pose", "phi", 4, 0.0, 2 * math.pi)
 NAMES = ("a", "b")
 
 
 def hypergradient(gradient, error, names=NAMES):
-    solution = Solution(torch.zeros(1), Status.UNROLLED, 1, 0.0, (0.0, 0.0), 1, False)
-    return Hypergradient(
-        dict(zip(names, gradient, strict=True)), dict(zip(names, error, strict=True)), {}, solution,
-        Damped(0.0, None), math.nan, 0.0, 0.0,
-    )  # fmt: skip
+    both = (dict(zip(names, values, strict=True)) for values in (gradient, error))
+    return Hypergradient(*both, UnrolledAdjoint(1, True, 0.0))
 
 
 def steps_at(psi, factors=(POSE,), labels=(0, 1), **checks):
     checks = {"radius": 0.5, "largest": 0.7} | checks
-    return CheckedSteps(Checks(**checks), 0.25, SceneDistribution(factors), NAMES, labels, psi)
+    return TrustRegion(**checks).begin(LearnedObjects(NAMES, labels, SceneDistribution(factors)), psi, 10)
 
 
 def scored(*values, images=8):
@@ -38,12 +34,12 @@ def scored(*values, images=8):
 
 
 def proposed(steps, gradient, error, level=0.05):
+    """The steps after the next one, by that derivative, and its p-values."""
     result = hypergradient(gradient, error)
-    p_values = steps.observe(result)
-    factors = steps.distribution.names
-    return steps.next(
-        certify(result, p_values, NAMES, factors, math.nan, Trust(level=level), "skip")
-    ), p_values
+    steps, p_values = steps.observe(result)
+    factors = steps.objects.distribution.names
+    certificate = certify(result, p_values, NAMES, factors, Trust(level), Unrolled())
+    return steps.propose(certificate, 0.25), p_values
 
 
 def gradients(target, psi):
@@ -62,14 +58,15 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
     psi = POSE.psi_of(torch.tensor([[0.7, 0.1, 0.1, 0.1], [0.25, 0.25, 0.25, 0.25]], dtype=torch.float64))
     steps = steps_at(psi, radius=0.2)
     gradient = gradients([2, 3], psi)
-    tried, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, p_values = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
     p, before = POSE.p_of(tried), POSE.p_of(psi)
     assert p.argmax(1)[1] == 3 and float((p - before)[0, 2]) > 0.15
     torch.testing.assert_close(
         variation(POSE, tried, psi), torch.full((2,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0
     )
     assert max(p_values["a"]["pose"], p_values["b"]["pose"]) < 1e-6
-    verdicts = steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))
+    steps, verdicts = steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))
     # The score is linear in p: the promise is its change.
     for i, name in enumerate(NAMES):
         assert verdicts[name].expected_gain == pytest.approx(float((p - before)[i, [2, 3][i]]), rel=1e-9)
@@ -79,7 +76,8 @@ def test_steps_go_where_the_score_is_by_the_radius_and_promise_their_first_order
 def test_a_step_leaves_each_bin_the_fraction_that_the_settings_say(keep):
     psi = torch.zeros(2, 4, dtype=torch.float64)
     gradient = gradients([1, 2], psi)
-    tried, _ = proposed(steps_at(psi, keep=keep), gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = proposed(steps_at(psi, keep=keep), gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
     assert POSE.p_of(tried).amin(1).tolist() == pytest.approx([0.25 * keep] * 2)
 
 
@@ -90,8 +88,8 @@ def test_directions_are_derivatives_by_p_where_a_bin_is_at_the_floor():
     scores = torch.tensor([[0.0, 0.0, 0.5, 1.0], [0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
     (by_logits,) = torch.autograd.grad((floored.log_probabilities(psi).exp() * scores).sum(), psi)
     steps = steps_at(psi.detach(), factors=(floored,))
-    steps.observe(hypergradient(-by_logits, torch.zeros_like(by_logits)))
-    direction = steps._joined["pose"].value
+    steps, _ = steps.observe(hypergradient(-by_logits, torch.zeros_like(by_logits)))
+    direction = steps.observed["pose"].value
     torch.testing.assert_close(direction, scores - scores.mean(1, keepdim=True))
 
 
@@ -99,18 +97,19 @@ def test_only_the_object_that_did_not_gain_goes_back_and_its_next_step_is_shorte
     psi = torch.zeros(2, 4, dtype=torch.float64)
     steps = steps_at(psi)
     gradient = gradients([1, 2], psi)
-    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.45, 0.5))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
+    steps, verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.45, 0.5))
     assert verdicts["a"].accepted and not verdicts["b"].accepted
     assert verdicts["b"].measured_gain == pytest.approx(-0.05)
     assert torch.equal(steps.reported, torch.stack([tried[0], psi[1]]))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
     # The next step of b sets out from where it was.
-    again, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    again = steps.trial
     assert float(variation(POSE, again, psi)[1]) == pytest.approx(0.2, abs=1e-6)
-    assert steps.judge(scored(0.6, 0.5, 0.5), scored(0.7, 0.52, 0.5))["b"].measured_gain == pytest.approx(
-        0.02
-    )
+    _, verdicts = steps.judge(scored(0.6, 0.5, 0.5), scored(0.7, 0.52, 0.5))
+    assert verdicts["b"].measured_gain == pytest.approx(0.02)
 
 
 def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
@@ -118,9 +117,10 @@ def test_a_verdict_changes_the_radius_of_the_factors_that_moved_alone():
     psi = torch.zeros(2, 8, dtype=torch.float64)
     steps = steps_at(psi, (POSE, zoom))
     gradient = torch.cat([gradients([1, 2], psi[:, :4]), torch.zeros(2, 4, dtype=torch.float64)], 1)
-    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
     assert bool((tried[:, :4] != 0.0).any(1).all()) and not bool(tried[:, 4:].any())
-    steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.4, 0.5))
+    steps, _ = steps.judge(scored(0.5, 0.5, 0.5), scored(0.6, 0.4, 0.5))
     assert steps.radius["pose"].tolist() == pytest.approx([0.65, 0.2])
     assert steps.radius["zoom"].tolist() == [0.5, 0.5]
 
@@ -139,8 +139,8 @@ def test_a_radius_grows_after_a_rise_and_shrinks_after_a_fall_beyond_the_error(c
     """After so significant a derivative only a fall beyond the error rejects a step."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(torch.zeros(2, 50), scattering() + torch.tensor([[change], [3.0]]) / 50)
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, verdicts = steps.judge(torch.zeros(2, 50), scattering() + torch.tensor([[change], [3.0]]) / 50)
     assert [verdict.accepted for verdict in verdicts.values()] == [accepted, True]
     assert steps.radius["pose"].tolist() == pytest.approx([radius, 0.65])
 
@@ -151,10 +151,11 @@ def test_the_derivative_and_the_measured_gain_are_significant_together(noise, be
     """Stouffer's sum of the two quantiles, from the standard library's normal distribution."""
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), level=0.05)
-    _, p_values = proposed(steps, gradient, torch.full_like(gradient, noise), level=0.9)
+    steps, p_values = proposed(steps, gradient, torch.full_like(gradient, noise), level=0.9)
     normal = NormalDist()
     least = -(2.0**0.5) * normal.inv_cdf(0.05) + normal.inv_cdf(p_values["a"]["pose"])
-    verdict = steps.judge(torch.zeros(2, 50), (scattering() + (least + beyond) / 50).expand(2, -1))["a"]
+    steps, verdicts = steps.judge(torch.zeros(2, 50), (scattering() + (least + beyond) / 50).expand(2, -1))
+    verdict = verdicts["a"]
     assert verdict.accepted == accepted
     assert verdict.error == pytest.approx(1.0) and verdict.measured_gain == pytest.approx(least + beyond)
     assert accepted or steps.radius["pose"].tolist() == pytest.approx(
@@ -167,11 +168,10 @@ def test_what_objects_at_rest_gain_or_lose_is_the_error_of_trainings():
     gradient = gradients([1, 2], torch.zeros(2, 4, dtype=torch.float64))
     error = torch.stack([torch.full((4,), 0.1), torch.full((4,), torch.inf)]).double()
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-    proposed(steps, gradient, error, level=0.9)
+    steps, _ = proposed(steps, gradient, error, level=0.9)
     after = torch.stack([0.1 * scattering() + 0.5 / 50, 0.05 * scattering() - 0.3 / 50])
-    assert steps.judge(torch.zeros(2, 50), after)["a"].error == pytest.approx(
-        math.hypot(0.1, math.sqrt(0.3**2 - 0.05**2))
-    )
+    _, verdicts = steps.judge(torch.zeros(2, 50), after)
+    assert verdicts["a"].error == pytest.approx(math.hypot(0.1, math.sqrt(0.3**2 - 0.05**2)))
 
 
 def test_one_judgment_after_which_objects_at_rest_gain_much_does_not_count_as_scatter():
@@ -179,15 +179,16 @@ def test_one_judgment_after_which_objects_at_rest_gain_much_does_not_count_as_sc
     error = torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)]).double()
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), radius=0.1, grow=1.0)
     for others, scatter in ((0.3, 0.3), (0.02, math.sqrt((0.3**2 + 0.02**2) / 2)), (0.04, 0.04)):
-        proposed(steps, gradient, error, level=0.9)
-        assert steps.judge(scored(0.0, 0.0), scored(0.5, others))["a"].error == pytest.approx(scatter)
+        steps, _ = proposed(steps, gradient, error, level=0.9)
+        steps, verdicts = steps.judge(scored(0.0, 0.0), scored(0.5, others))
+        assert verdicts["a"].error == pytest.approx(scatter)
 
 
 def test_steps_that_gain_for_themselves_and_cost_others_more_are_all_rejected():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     gradient = gradients([1, 2], steps.accepted)
-    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.52, 0.51, 0.3))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, verdicts = steps.judge(scored(0.5, 0.5, 0.5), scored(0.52, 0.51, 0.3))
     assert not any(verdict.accepted for verdict in verdicts.values())
     assert float(steps.reported.abs().max()) == 0.0
     assert steps.radius["pose"].tolist() == pytest.approx([0.2, 0.2])
@@ -200,9 +201,13 @@ def test_what_others_lose_counts_beyond_the_error_of_the_sum():
     scatter = (scatter - scatter.mean()) / scatter.std() / 50**0.5
     for error, kept in ((0.05, False), (0.2, True)):
         steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
-        proposed(steps, gradient, torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)]))
+        steps, _ = proposed(
+            steps, gradient, torch.stack([torch.full((4,), 1e-4), torch.full((4,), torch.inf)])
+        )
         others = error * scatter - 0.2 / 50
-        verdicts = steps.judge(torch.zeros(2, 50), torch.stack([torch.full_like(others, 0.1 / 50), others]))
+        steps, verdicts = steps.judge(
+            torch.zeros(2, 50), torch.stack([torch.full_like(others, 0.1 / 50), others])
+        )
         assert verdicts["a"].accepted == kept
 
 
@@ -213,7 +218,8 @@ def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
     noise = torch.full_like(gradient, 0.03)
     found = []
     for _ in range(6):
-        tried, p_values = proposed(steps, gradient, noise, level=0.01)
+        steps, p_values = proposed(steps, gradient, noise, level=0.01)
+        tried = steps.trial
         found.append(p_values["a"]["pose"])
         assert steps.pending == (not torch.equal(tried, psi))
     assert found[0] > 0.01 > found[-1]
@@ -223,9 +229,10 @@ def test_without_evidence_nothing_moves_and_consistent_evidence_adds_up():
 def test_an_object_whose_radius_is_too_small_rests():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), smallest=0.3)
     gradient = gradients([1, 2], steps.accepted)
-    proposed(steps, gradient, torch.full_like(gradient, 1e-4))
-    steps.judge(scored(0.0, 0.0), scored(-1.0, -1.0))
-    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = steps.judge(scored(0.0, 0.0), scored(-1.0, -1.0))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
     assert torch.equal(tried, steps.accepted)
 
 
@@ -234,25 +241,30 @@ def test_an_object_of_little_gain_waits_until_the_large_steps_are_done(part, mov
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64), waits_below=0.2)
     gradient = gradients([1, 2], steps.accepted) * torch.tensor([[1.0], [part]], dtype=torch.float64)
     small = torch.full_like(gradient, 1e-6)
-    tried, p_values = proposed(steps, gradient, small)
+    steps, p_values = proposed(steps, gradient, small)
+    tried = steps.trial
     assert p_values["b"]["pose"] < 1e-6
     assert not torch.equal(tried[0], steps.accepted[0])
     assert torch.equal(tried[1], steps.accepted[1]) != moves
     waiting = steps.waiting
-    assert ("b" in steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))) == moves
+    steps, verdicts = steps.judge(scored(0.0, 0.0), scored(0.1, 0.1))
+    assert ("b" in verdicts) == moves
     assert (("b", "pose") in waiting) != moves
     # Now that the derivative of the first is zero, that of the second counts.
-    after, _ = proposed(steps, gradient * torch.tensor([[-1.0], [1.0]], dtype=torch.float64), small)
+    steps, _ = proposed(steps, gradient * torch.tensor([[-1.0], [1.0]], dtype=torch.float64), small)
+    after = steps.trial
     assert not torch.equal(after[1], tried[1])
 
 
 def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     steps = steps_at(torch.zeros(2, 4, dtype=torch.float64))
     bad = torch.full((2, 4), math.nan, dtype=torch.float64)
-    tried, _ = proposed(steps, bad, bad)
+    steps, _ = proposed(steps, bad, bad)
+    tried = steps.trial
     assert torch.equal(tried, steps.accepted)
     gradient = gradients([1, 2], steps.accepted)
-    tried, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    steps, _ = proposed(steps, gradient, torch.full_like(gradient, 1e-4))
+    tried = steps.trial
     assert POSE.p_of(tried).argmax(1).tolist() == [1, 2]
 
 
@@ -272,5 +284,5 @@ def test_a_derivative_that_is_not_finite_moves_nothing_and_is_forgotten():
     ],
 )
 def test_settings_out_of_range_are_refused(bad):
-    with pytest.raises(ValueError, match=r"outer\.checks"):
-        Checks(**bad)
+    with pytest.raises(ValueError, match="TrustRegion"):
+        TrustRegion(**bad)

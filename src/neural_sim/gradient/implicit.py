@@ -1,0 +1,206 @@
+"""The hypergradient at a stationary point of the inner problem (Eq. 2).
+
+``dL_val/dpsi = - d/dpsi <dL_train/dtheta, v>`` with ``(H + lambda I) v = dL_val/dtheta``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.detector.losses import proximal_loss
+from neural_sim.gradient.base import IndexedLoss, MixedDerivative, Params
+from neural_sim.gradient.hypergradient import Hypergradient, ImplicitAdjoint
+from neural_sim.ranges import NonNegative, NonNegativeInt, validated
+from neural_sim.solver.adjoint import Adjoint, AdjointSolver
+from neural_sim.solver.base import Status
+from neural_sim.solver.hvp import Term, gradient
+from neural_sim.solver.operator import norm, unflatten
+
+Estimate = Callable[[Params], MixedDerivative]
+FAILED = (Status.NEGATIVE_CURVATURE, Status.NON_FINITE)
+
+
+@validated
+@dataclass(frozen=True)
+class Implicit:
+    """``outer.adjoint``: the hypergradient of a stationary point, by the group ``solver``.
+
+    Args:
+        curvature_images: training images of the Hessian products; 0: all.
+        max_residual: largest relative residual of the solve that is trusted; None: no limit, as for the others.
+        max_stationarity: largest ``|dL_train/dtheta|``.
+        max_sensitivity: largest relative change from lambda to 2 lambda; wants ``solver.sensitivity``.
+    """
+
+    curvature_images: NonNegativeInt = 64
+    max_residual: NonNegative | None = 0.1
+    max_stationarity: NonNegative | None = None
+    max_sensitivity: NonNegative | None = None
+
+    def doubts(self, adjoint: ImplicitAdjoint) -> list[str]:
+        """Name the conditions that a solve fails."""
+        solution = adjoint.solution
+        # solver=identity never iterates: whoever chooses it accepts its residual.
+        residual = None if solution.status is Status.APPROXIMATE else solution.residual
+        limits = {
+            "residual": (residual, self.max_residual),
+            "stationarity": (adjoint.stationarity, self.max_stationarity),
+            "sensitivity": (adjoint.sensitivity, self.max_sensitivity),
+        }
+        failed = [
+            name
+            for name, (value, limit) in limits.items()
+            if value is not None and limit is not None and value > limit
+        ]
+        return (["solver"] if solution.status in FAILED else []) + failed
+
+
+@dataclass(frozen=True)
+class InnerProblem:
+    """``L_train(theta) = sum_i w_i l_i(theta) + proximal / 2 |theta - anchor|^2`` near its minimiser ``params``.
+
+    Attributes:
+        params: theta.
+        losses: l_i by row.
+        weights: w_i of rows 0..N-1 of ``losses``; 1 / N each for independent draws.
+        chunk_size: images in memory at a time.
+        proximal: weight of the proximal term, with which ``(H + proximal I)^-1`` is the problem's exact derivative.
+        anchor: the fixed theta_0 of the proximal term.
+        subset: rows of the Hessian products (not of the stationarity), None: all.
+        subset_weights: weights of those rows; None: their own, scaled up to the sum of all.
+
+    Raises:
+        ValueError: no weights, a chunk of no image, or a proximal term that is negative or lacks its anchor.
+    """
+
+    params: Params
+    losses: IndexedLoss
+    weights: Float[Tensor, "N"]
+    chunk_size: int = 64
+    proximal: float = 0.0
+    anchor: Params | None = None
+    subset: Int[Tensor, "n"] | None = None
+    subset_weights: Float[Tensor, "n"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.weights.ndim != 1 or self.weights.numel() == 0:
+            raise ValueError(
+                f"inner problem: weights must be a non-empty vector, got {tuple(self.weights.shape)}"
+            )
+        if self.chunk_size < 1 or self.proximal < 0.0:
+            raise ValueError(
+                f"inner problem: want chunk_size >= 1 and proximal >= 0, got {self.chunk_size}, {self.proximal}"
+            )
+        if self.proximal > 0.0 and self.anchor is None:
+            raise ValueError("inner problem: a proximal term needs its anchor theta_0")
+
+    def terms(
+        self, subset: Int[Tensor, "n"] | None = None, subset_weights: Float[Tensor, "n"] | None = None
+    ) -> list[Term]:
+        """Return the loss as a sum over chunks and the proximal term, of all rows or a subset that stands for them."""
+        index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
+        weights = self.weights[index] if subset_weights is None else subset_weights
+        if subset is not None and subset_weights is None:
+            weights = weights * (self.weights.sum() / weights.sum())
+        chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
+        terms: list[Term] = [
+            lambda params, rows=rows, weight=weight: self.losses(params, rows) @ weight
+            for rows, weight in chunks
+        ]
+        anchor = self.anchor
+        if self.proximal > 0.0 and anchor is not None:
+            terms.append(lambda params: proximal_loss(params, anchor, self.proximal))
+        return terms
+
+
+def hypergradient(
+    inner: InnerProblem,
+    validation: Sequence[Term],
+    estimates: Mapping[str, Estimate],
+    solver: AdjointSolver,
+    generator: torch.Generator,
+    previous: Float[Tensor, "m"] | None = None,
+) -> Hypergradient[ImplicitAdjoint]:
+    """Compute Eq. 2 for every object.
+
+    Args:
+        inner: the inner problem at its minimiser.
+        validation: the terms of L_val as functions of the parameters.
+        estimates: by object, the function from v to ``d/dpsi <dL_train/dtheta, v>``.
+        solver: of v. A failed solve gives the best iterate: read ``adjoint.solution.status``.
+        generator: of the damping's random start.
+        previous: the solve's initial guess.
+    """
+    began = time.perf_counter()
+    right_hand_side = gradient(validation, inner.params)
+    stationarity = norm(gradient(inner.terms(), inner.params))
+    validated = time.perf_counter()
+    adjoint: Adjoint = solver.solve(
+        inner.terms(inner.subset, inner.subset_weights), inner.params, right_hand_side, previous, generator
+    )
+    solved = time.perf_counter()
+    vector = unflatten(adjoint.vector, inner.params)
+    mixed = {name: estimate(vector) for name, estimate in estimates.items()}
+    sensitivity = None
+    if adjoint.doubled is not None and mixed:
+        doubled = unflatten(adjoint.doubled, inner.params)
+        sensitivity = _relative_change(
+            mixed, {name: estimate(doubled) for name, estimate in estimates.items()}
+        )
+    seconds = {
+        "validation": validated - began,
+        "solve": solved - validated,
+        "mixed": time.perf_counter() - solved,
+    }
+    return Hypergradient(
+        # The one minus sign of the implicit function theorem: dtheta/dpsi = -(H + lambda I)^-1 d2L_train/dtheta dpsi.
+        gradients={name: -part.value for name, part in mixed.items()},
+        errors={name: part.standard_error for name, part in mixed.items()},
+        p_values={name: part.p_values for name, part in mixed.items()},
+        seconds=seconds,
+        adjoint=ImplicitAdjoint(
+            adjoint.solution,
+            adjoint.damping,
+            adjoint.damping_raises,
+            stationarity,
+            norm(right_hand_side),
+            sensitivity,
+        ),
+    )
+
+
+def curvature_rows(
+    drawn: int, weights: Float[Tensor, "N"], wanted: int, generator: torch.Generator
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Choose rows of the training set for Hessian products, and their weights in them.
+
+    ``wanted`` random ones (0: all), of the first ``drawn``, which were drawn from p_psi, and of the others, which are
+    photographs, in proportion to the weight of each part, which its rows keep.
+    """
+    count, parts = len(weights), []
+    if not 0 < wanted < count:
+        return torch.arange(count), weights
+    for first, last in ((0, drawn), (drawn, count)):
+        size, mass = last - first, float(weights[first:last].sum())
+        if size == 0:
+            continue
+        few = min(size, max(1, round(wanted * mass))) if size < count else wanted
+        rows = first + torch.randperm(size, generator=generator)[:few]
+        parts.append((rows, torch.full((few,), mass / few)))
+    rows, scaled = (torch.cat(column) for column in zip(*parts, strict=True))
+    return rows, scaled
+
+
+def _relative_change(
+    before: Mapping[str, MixedDerivative], after: Mapping[str, MixedDerivative]
+) -> float | None:
+    old = torch.cat([part.value for part in before.values()])
+    new = torch.cat([part.value for part in after.values()])
+    size = norm(old)
+    return norm(new - old) / size if size > 0.0 else None

@@ -1,0 +1,268 @@
+"""Reverse mode through the steps of a training's optimiser.
+
+The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of
+L_val by the state before step t (theta and the optimiser's moments), each step back takes
+
+    a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
+    lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
+
+where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta,
+a_t>``. Summed over the steps, this score replaces ``-<dl/dtheta, v>``, the minus sign included (Baydin and Pearlmutter
+2014; Maclaurin et al. 2015, with stored states instead of states recomputed backwards).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neural_sim.detector.optimiser import pulled_back
+from neural_sim.detector.trajectory import Trajectory
+from neural_sim.gradient.base import Params
+from neural_sim.solver.operator import flatten, plain_norm, unflatten
+
+Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
+Wanted = Literal["probes", "weights", "inputs"]
+"""Sums that an estimator reads: probes' scores only, also derivatives by the training images' weights, or also those by
+the images' inputs."""
+InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+"""A training's inputs from images and their rows."""
+
+
+class LossesFrom(Protocol):
+    """Losses of training images, differentiable twice in parameters and in the inputs."""
+
+    def __call__(
+        self, params: Params, inputs: tuple[Tensor, ...], rows: Int[Tensor, "n"], /
+    ) -> Float[Tensor, "n"]:
+        """Compute the losses of ``rows`` from those rows of the inputs."""
+        ...
+
+
+@dataclass(frozen=True)
+class Examples:
+    """A training's examples and their losses.
+
+    Each step's objective was its batch's mean loss plus ``proximal / 2 |theta - anchor|^2``.
+
+    Attributes:
+        inputs: those by which losses are differentiated where images move, [N, ...] each.
+        losses: of rows of the inputs.
+        proximal: weight of the proximal term.
+        anchor: its fixed theta_0.
+        inputs_of: computes the inputs from images and their rows.
+        drawn: how many rows, the first ones, were drawn from p_psi; the others (photographs) do not depend on it. None:
+            all of them.
+
+    Raises:
+        ValueError: a proximal term that is negative or lacks its anchor.
+    """
+
+    inputs: tuple[Tensor, ...]
+    losses: LossesFrom
+    proximal: float = 0.0
+    anchor: Params | None = None
+    inputs_of: InputsOf | None = None
+    drawn: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.proximal < 0.0 or (self.proximal > 0.0 and self.anchor is None):
+            raise ValueError(
+                f"unrolled: proximal must be at least 0 and wants its anchor, got {self.proximal}, "
+                f"{'no anchor' if self.anchor is None else 'an anchor'}"
+            )
+
+    def of(self, rows: Int[Tensor, "n"]) -> tuple[Tensor, ...]:
+        """Select rows of the inputs."""
+        return tuple(values[rows] for values in self.inputs)
+
+    def drawn_part(self, rows: Int[Tensor, "batch"]) -> Tensor | float:
+        """Return the fraction of a batch that was drawn from p_psi."""
+        return 1.0 if self.drawn is None else (rows < self.drawn).double().mean()
+
+    def gradient(
+        self, theta: Float[Tensor, "n"], like: Params, rows: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "n"]:
+        """Compute the gradient of one step's objective."""
+        point = theta.detach().requires_grad_()
+        with torch.enable_grad():
+            loss = self.losses(unflatten(point, like), self.of(rows), rows).mean()
+        (slope,) = torch.autograd.grad(loss, point)
+        return slope + self.proximal_gradient(theta, like)
+
+    def proximal_gradient(self, theta: Float[Tensor, "n"], like: Params) -> Float[Tensor, "n"] | float:
+        """Compute the proximal term's gradient."""
+        if self.anchor is None or self.proximal == 0.0:
+            return 0.0
+        return self.proximal * (theta - flatten({name: self.anchor[name] for name in like}))
+
+
+@dataclass(frozen=True)
+class RecordedTraining:
+    """A training that can be reversed.
+
+    Attributes:
+        trajectory: its steps.
+        examples: what it was trained on.
+        params: theta after its last step.
+    """
+
+    trajectory: Trajectory
+    examples: Examples
+    params: Params
+
+    @property
+    def steps(self) -> int:
+        """The number of recorded steps."""
+        return len(self.trajectory) - self.trajectory.first
+
+
+@dataclass(frozen=True)
+class ReversedStep:
+    """One reversed step.
+
+    Attributes:
+        step: its number.
+        params: theta before it.
+        along: a_t.
+        rows: its batch.
+        scores: the batch's <dl/dtheta, a_t>; empty unless wanted.
+        inputs: derivative of the mean score by these rows of the inputs; empty unless wanted.
+    """
+
+    step: int
+    params: Params
+    along: Params
+    rows: Int[Tensor, "batch"]
+    scores: Float[Tensor, "batch"]
+    inputs: tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class _Curved:
+    """A batch's curvature along a: ``product`` is H a, the others as in ``ReversedStep``."""
+
+    product: Float[Tensor, "n"]
+    scores: Float[Tensor, "batch"]
+    inputs: tuple[Tensor, ...]
+
+
+def reversed_steps(
+    training: RecordedTraining,
+    slope: Float[Tensor, "n"],
+    product: Product = "central_difference",
+    wanted: Wanted = "weights",
+    floor: float = 0.0,
+) -> Iterator[ReversedStep]:
+    """Walk the steps of a training backwards, from the last to the first recorded one.
+
+    Args:
+        training: the training.
+        slope: ``dL_val/dtheta`` after its last step.
+        product: how a batch's Hessian is multiplied. ``forward_difference``: the gradient at ``theta + h a`` minus the
+            step's recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as
+            ``central_difference``); ``central_difference``: two gradients at ``theta +- h a``, of relative error
+            eps^(2/3); ``reverse_over_reverse``: exact, at the time of three and a half gradients and the memory of a
+            second derivative.
+        wanted: what each step computes.
+        floor: fraction of :meth:`detector.optimiser.Rule.floored`; at 0 the derivative is that of the training.
+
+    Raises:
+        ValueError: an unknown product, or a slope of another length than theta.
+    """
+    trajectory, examples, like = training.trajectory, training.examples, training.params
+    if product not in get_args(Product):
+        raise ValueError(f"outer.adjoint.product must be one of {get_args(Product)}, got {product!r}")
+    if slope.shape != trajectory.end.shape:
+        raise ValueError(
+            f"unrolled: got a slope of shape {tuple(slope.shape)}, want {tuple(trajectory.end.shape)}"
+        )
+    one_sided = product == "forward_difference" and wanted == "probes"
+    curved = _doubly_reversed if product == "reverse_over_reverse" else _differenced
+    rule = trajectory.rule
+    cotangents = list(rule.begin(slope))  # L_val does not depend on the buffers after the last step
+    for segment in trajectory.segments():
+        replayed = trajectory.replayed(segment, lambda theta, rows: examples.gradient(theta, like, rows))
+        for step in reversed(segment):
+            state, gradient = replayed.pop()
+            rate = trajectory.rates[step]
+            if step + 1 == len(trajectory):
+                sizes = [part.numel() for part in like.values()]
+                rule = rule.floored(rule.step(state, gradient, rate, step), len(trajectory), floor, sizes)
+            cotangents, along = pulled_back(rule, state, gradient, rate, step, cotangents)
+            rows = trajectory.rows[step]
+            if one_sided:
+                of_batch = gradient - examples.proximal_gradient(state[0], like)
+                curvature = _from_one_side(examples, state[0], like, rows, along, of_batch)
+            else:
+                curvature = curved(examples, state[0], like, rows, along, wanted == "inputs")
+            cotangents[0] = cotangents[0] + curvature.product + examples.proximal * along
+            yield ReversedStep(
+                step,
+                unflatten(state[0], like),
+                unflatten(along, like),
+                rows,
+                curvature.scores,
+                curvature.inputs,
+            )
+
+
+def _doubly_reversed(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
+) -> _Curved:
+    """Differentiate <gradient, a> once more, by theta, the images' weights and their inputs at once."""
+    point = theta.detach().requires_grad_()
+    weights = theta.new_full((len(rows),), 1.0 / len(rows)).requires_grad_()
+    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
+    with torch.enable_grad():
+        loss = examples.losses(unflatten(point, like), inputs, rows) @ weights
+        (slope,) = torch.autograd.grad(loss, point, create_graph=True)
+    leaves = (point, weights, *(inputs if with_inputs else ()))
+    product, scores, *moved = torch.autograd.grad(slope, leaves, along, materialize_grads=True)
+    return _Curved(product, scores, tuple(moved))
+
+
+def _differenced(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, with_inputs: bool
+) -> _Curved:
+    """Take central differences of losses and gradients, without waiting for a device."""
+    unit, scale = _displacement(theta, along, torch.finfo(theta.dtype).eps ** (1 / 3))
+    inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
+    sides = []
+    for point in (theta + unit, theta - unit):
+        leaf = point.detach().requires_grad_()
+        with torch.enable_grad():
+            losses = examples.losses(unflatten(leaf, like), inputs, rows)
+            loss = losses.mean()
+        leaves = (leaf, *(inputs if with_inputs else ()))
+        sides.append((losses.detach(), *torch.autograd.grad(loss, leaves, materialize_grads=True)))
+    scores, product, *moved = ((above - below) * (0.5 * scale) for above, below in zip(*sides, strict=True))
+    return _Curved(product, scores, tuple(moved))
+
+
+def _from_one_side(
+    examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, at_theta: Tensor
+) -> _Curved:
+    """Take the forward difference of gradients; ``at_theta``, the one at theta, is the training's."""
+    # At eight times the root of eps, rounding and third derivatives contribute about equally.
+    unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
+    leaf = (theta + unit).detach().requires_grad_()
+    with torch.enable_grad():
+        loss = examples.losses(unflatten(leaf, like), examples.of(rows), rows).mean()
+    (beside,) = torch.autograd.grad(loss, leaf)
+    return _Curved((beside - at_theta) * scale, theta.new_zeros(0), ())
+
+
+def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """Return a vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device.
+
+    For a = 0 all differences are zero.
+    """
+    size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
+    length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)
+    return (along.double() / size).to(theta) * length.to(theta), (size / length).to(theta)
