@@ -8,8 +8,8 @@ import neural_sim
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
     "types", "alpha", "digests", "documents", "extras", "interruption", "randomness", "configuration",
-    "ranges", "cameras", "devices", "objects", "field", "renderer", "parameter", "synthesis", "target", "detector",
-    "solver", "gradient", "baseline", "outer", "report", "stages", "tasks", "studies", "main",
+    "ranges", "cameras", "devices", "pictures", "objects", "field", "renderer", "parameter", "synthesis", "target",
+    "detector", "solver", "gradient", "baseline", "outer", "report", "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 
@@ -71,3 +71,8 @@ def test_types_cameras_and_solvers_know_only_torch():
 def test_no_file_grows_over_400_lines():
     long = [p.name for p in PACKAGE.rglob("*.py") if len(p.read_text().splitlines()) > 400]
     assert not long
+
+
+def test_pictures_are_opened_in_one_place():
+    opening = [path for path in PACKAGE.rglob("*.py") if "Image.open(" in path.read_text()]
+    assert opening == [PACKAGE / "pictures.py"]

@@ -100,7 +100,7 @@ def test_missing_empty_and_broken_photos_are_refused_with_their_path(tmp_path: P
     with pytest.raises(ValueError, match=f"no photograph .* in {tmp_path}"):
         PhotoFolder(tmp_path)
     (tmp_path / "broken.png").write_bytes(b"not an image")
-    with pytest.raises(ValueError, match=r"broken\.png: not a readable photograph"):
+    with pytest.raises(ValueError, match=r"PhotoFolder\.root: .*broken\.png: not a readable image"):
         PhotoFolder(tmp_path).draw(1, 8, 8, torch.Generator())
 
 

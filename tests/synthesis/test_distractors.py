@@ -185,5 +185,5 @@ def test_files_without_an_alpha_channel_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"plain\.png: want a picture with an alpha channel, got mode RGB"):
         Distractors(tmp_path, count=(1, 1)).draw(1, 16, 24, seeded())
     (tmp_path / "plain.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match=r"plain\.png: not a readable picture"):
+    with pytest.raises(ValueError, match=r"plain\.png: not a readable image"):
         Distractors(tmp_path, count=(1, 1)).draw(1, 16, 24, seeded())

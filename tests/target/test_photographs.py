@@ -7,27 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from neural_sim.target.photographs import Photograph, grid_of, image_size, opened, read
-
-
-def test_a_file_that_ends_early_is_named(tmp_path):
-    file = tmp_path / "a.png"
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)).save(file)
-    file.write_bytes(file.read_bytes()[:2000])
-    assert image_size(file) == (80, 60)  # by the header
-    with pytest.raises(ValueError, match=r"a\.png: not a readable image"):
-        grid_of(file, (80, 60))
-    with pytest.raises(ValueError, match=r"a\.png: not a readable image"), opened(file) as image:
-        image.convert("RGB")
-
-
-def test_grids_have_one_channel_and_the_photograph_s_size(tmp_path):
-    file = tmp_path / "a.png"
-    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(file)
-    with pytest.raises(ValueError, match=r"a\.png: want one channel, got 3"):
-        grid_of(file, (8, 6))
-    with pytest.raises(ValueError, match=r"a\.png: is 8 x 6 pixels, its photograph 6 x 8"):
-        grid_of(file, (6, 8))
+from neural_sim.target.photographs import Photograph, read
 
 
 def test_boxes_follow_their_photograph_and_small_ones_are_counted(tmp_path, caplog):

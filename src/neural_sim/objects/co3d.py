@@ -20,7 +20,7 @@ from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.objects.files import Names
 from neural_sim.objects.photos import Photos, PoseCorrector, Up
 from neural_sim.objects.pictures import Box, Masks, SceneMaskMaker
-from neural_sim.objects.transforms_json import image_size
+from neural_sim.pictures import read_header
 from neural_sim.ranges import Positive, validated
 
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
@@ -127,10 +127,12 @@ def _frame(root: Path, entry: Mapping[str, Any], where: str) -> Frame:
         if not mask.is_file():
             raise ValueError(f"{where}.mask.path: no such file: {mask}")
     size = _numbers(entry["image"], "size", (2,), f"{where}.image")
-    width, height = image_size(image, where)
+    header = read_header(image, f"{where}: {image}")
+    width, height = header.stored
     if size.tolist() != [height, width]:
         raise ValueError(
             f"{where}.image.size: want height and width of {image}, {[height, width]}, got {size.tolist()}"
+            f"{header.turning}"
         )
     view, where = entry.get("viewpoint"), f"{where}.viewpoint"
     if not isinstance(view, dict):

@@ -9,7 +9,7 @@ import numpy as np
 
 from neural_sim.extras import require
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
-from neural_sim.objects.transforms_json import image_size
+from neural_sim.pictures import by, read_header
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -73,11 +73,11 @@ def _frame(image: Any, read: Any, folder: Path, model: Path) -> Frame:
     if not path.is_file():
         raise ValueError(f"{where}: no such image: {path}")
     lens = _lens(read.cameras[image.camera_id], where)
-    size = image_size(path, where)
-    if size != (lens.width, lens.height):
+    header = read_header(path, f"{where}: {path}")
+    if header.stored != (lens.width, lens.height):
         raise ValueError(
-            f"{where}: the image has {size[0]} x {size[1]} pixels, its camera {image.camera_id} "
-            f"{lens.width} x {lens.height}"
+            f"{where}: the image has {by(header.stored)} pixels, its camera {image.camera_id} "
+            f"{lens.width} x {lens.height}{header.turning}"
         )
     world_to_camera = np.eye(4)
     world_to_camera[:3] = image.cam_from_world().matrix()

@@ -11,9 +11,12 @@ from typing import Annotated, ClassVar
 import numpy as np
 import trimesh
 from annotated_types import MinLen
+from PIL import Image
+from trimesh.visual import TextureVisuals
 
 from neural_sim.objects.mesh import ObjectMesh, normalise
 from neural_sim.objects.repair import repair
+from neural_sim.pictures import eight_bits
 
 Names = Annotated[list[str], MinLen(1)] | None
 """Which objects of a folder, None: all."""
@@ -61,6 +64,7 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
         raise ValueError(f"{path}: object {name!r} cannot be read as a mesh: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise ValueError(f"{path}: object {name!r} holds a {type(mesh).__name__}, want a triangle mesh")
+    _read_textures(mesh, f"{path}: texture")
     mesh = repair(mesh, name, str(path))
     if metres_per_unit != 1.0:
         mesh.apply_scale(metres_per_unit)
@@ -69,6 +73,15 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
     mesh.apply_transform(Y_UP_TO_Z_UP)
     item = normalise(mesh, name, str(path), digest)
     return replace(item, transform=np.linalg.inv(Y_UP_TO_Z_UP) @ item.transform)
+
+
+def _read_textures(mesh: trimesh.Trimesh, where: str) -> None:
+    """Decode a mesh's textures to 8 bits, which trimesh does not. Raises ``ValueError`` for damaged ones."""
+    material = mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None
+    for key in ("image", "baseColorTexture"):
+        image = getattr(material, key, None)
+        if isinstance(image, Image.Image):
+            setattr(material, key, eight_bits(image, where))
 
 
 def choose(

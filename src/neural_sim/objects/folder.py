@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from neural_sim.objects.files import MeshFiles, Names, folder_of
+from neural_sim.pictures import without_leftovers
 from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
@@ -32,9 +33,9 @@ class MeshFolder(MeshFiles):
 
 def _find(root: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
-    for entry in sorted(root.iterdir()):
+    for entry in without_leftovers(sorted(root.iterdir()), root):
         if entry.is_dir():
-            meshes = sorted(path for path in entry.rglob("*") if _is_mesh(path))
+            meshes = without_leftovers(sorted(path for path in entry.rglob("*") if _is_mesh(path)), entry)
             if not meshes:
                 continue
             path = min(meshes, key=lambda mesh: (FORMATS.index(mesh.suffix.lower()), str(mesh)))

@@ -14,7 +14,16 @@ from torch import Tensor
 from neural_sim.objects.capture import Capture, Frame
 from neural_sim.objects.colmap import model_folder, read_colmap
 from neural_sim.objects.files import Names, choose, content_digest, folder_of
-from neural_sim.objects.pictures import Box, Direction, Masks, Pictures, SceneMaskMaker, box_of, mask_of
+from neural_sim.objects.pictures import (
+    Box,
+    Direction,
+    Masks,
+    Pictures,
+    SceneMaskMaker,
+    box_of,
+    check_masks,
+    mask_of,
+)
 from neural_sim.objects.placing import AXES, Placement, place
 from neural_sim.objects.resampling import pixels_per_pixel, resample
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
@@ -79,7 +88,9 @@ class Photos:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
             raise ValueError(f"objects.box wants objects.masks=scene, got objects.masks={masks}")
-        _ = self.captures  # errors in a file are raised here, not in a later stage
+        for capture in self.captures.values():  # errors in a file are raised here, not in a later stage
+            if masks in ("auto", "files"):
+                check_masks(capture)
 
     def _found(self) -> dict[str, Path]:
         """The captures' folders below the root, by the names of their objects."""

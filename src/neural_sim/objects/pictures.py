@@ -10,11 +10,12 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
 from neural_sim.objects.capture import Capture, Frame
+from neural_sim.pictures import Size, alpha_of, by, read_header, read_mask, read_picture
 from neural_sim.ranges import Matching, validated
 
 Masks = Literal["auto", "alpha", "files", "scene"]
@@ -86,33 +87,42 @@ class Pictures:
 
     def rgba(self, frame: Frame) -> Float[Tensor, "h w 4"]:
         """Colour and mask of a frame: straight alpha, float32 in [0, 1]."""
-        picture = _open(frame.image)
+        picture = read_picture(frame.image, upright=False)
+        colours = _values(picture.convert("RGB"))
         if self.masks == "scene":
             number = next(i for i, other in enumerate(self.capture.frames) if other is frame)
             mask = self.computed[number][None, None]
             size = (picture.height, picture.width)
             alpha = functional.interpolate(mask, size, mode="bilinear", align_corners=False)[0, 0, :, :, None]
             alpha = (0.5 + SHARPNESS * (alpha - 0.5)).clamp(0.0, 1.0)
-            return torch.cat([_values(picture.convert("RGB")), alpha], -1)
+            return torch.cat([colours, alpha], -1)
         file = mask_of(frame, self.capture.source) if self.masks != "alpha" else None
         if file is not None:
-            mask = _open(file)
-            if mask.size != picture.size:
-                raise ValueError(
-                    f"{file}: the mask has {mask.size[0]} x {mask.size[1]} pixels, its image {frame.image} "
-                    f"{picture.size[0]} x {picture.size[1]}"
-                )
-            alpha = _values(mask.getchannel("A") if mask.mode in ("LA", "RGBA") else mask.convert("L"))[
-                ..., None
-            ]
-        elif self.masks != "files" and picture.mode in ("RGBA", "LA", "PA"):
-            alpha = _values(picture.convert("RGBA").getchannel("A"))[..., None]
-        else:
+            mask = read_mask(file)
+            refuse_size(file, (mask.shape[1], mask.shape[0]), frame.image, picture.size)
+            return torch.cat([colours, torch.from_numpy(mask)[..., None]], -1)
+        own = alpha_of(picture) if self.masks != "files" else None
+        if own is None:
             raise ValueError(
-                f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel, a "
-                f"mask_path, or a mask of its name in a folder {FOLDER!r}; objects.masks=scene finds masks without any"
+                f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel that "
+                f"is not opaque everywhere, a mask_path, or a mask of its name in a folder {FOLDER!r}; "
+                "objects.masks=scene finds masks without any"
             )
-        return torch.cat([_values(picture.convert("RGB")), alpha], -1)
+        return torch.cat([colours, _values(own)[..., None]], -1)
+
+
+def check_masks(capture: Capture) -> None:
+    """Raise ``ValueError`` for a file of masks that is no picture by its header, or not of its photograph's size."""
+    for frame in capture.frames:
+        file = mask_of(frame, capture.source)
+        if file is not None:
+            refuse_size(file, read_header(file).stored, frame.image, (frame.lens.width, frame.lens.height))
+
+
+def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
+    """Raise ``ValueError`` for a mask that has not the size of its image."""
+    if size != wanted:
+        raise ValueError(f"{file}: the mask has {by(size)} pixels, its image {image} {by(wanted)}")
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
@@ -129,19 +139,10 @@ def mask_of(frame: Frame, source: Path) -> Path | None:
     return None
 
 
-def _open(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: not a readable image ({error})") from error
-
-
 def _values(image: Image.Image) -> Float[Tensor, "h w *c"]:
     return torch.from_numpy(np.asarray(image, dtype=np.float32) / 255.0)
 
 
 def reduced(frame: Frame, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
     """A photograph's colours, averaged to ``size`` (width, height)."""
-    return _values(_open(frame.image).convert("RGB").resize(size, Image.Resampling.BOX))
+    return _values(read_picture(frame.image, upright=False).convert("RGB").resize(size, Image.Resampling.BOX))

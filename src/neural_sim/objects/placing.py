@@ -24,6 +24,8 @@ AXES = {
 }
 SMALL = 256
 """Pixels along the longer side of the silhouettes that carve the hull."""
+NEARLY_ALL = 0.95
+"""Fraction of a photograph beyond which a mask is doubted."""
 CELLS = 48
 """Cells along each side of the cube that is carved."""
 OUTSIDE = 0.05
@@ -66,7 +68,9 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placemen
             capture.name, *(np.array(chosen) / max(float(np.linalg.norm(chosen)), 1e-12)),
         )  # fmt: skip
     turn = upright(np.array(chosen, dtype=np.float64), capture.name)
-    centre, radius = sphere_of(capture, [silhouette(pictures, frame) for frame in capture.frames])
+    silhouettes = [silhouette(pictures, frame) for frame in capture.frames]
+    _doubt(capture, silhouettes)
+    centre, radius = sphere_of(capture, silhouettes)
     _log.info(
         "%s: centre (%.4g, %.4g, %.4g) and radius %.4g in the capture's unit, from %d silhouettes",
         capture.name, *centre, radius, len(capture.frames),
@@ -100,6 +104,23 @@ def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
     alpha = pictures.rgba(frame)[..., 3]
     step = max(1, max(alpha.shape) // SMALL)
     return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
+
+
+def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]) -> None:
+    """Warn of masks that touch the edges of their photographs or cover nearly all of them."""
+    kinds = {
+        "touch the edges of their photographs, beyond which the object is unknown": lambda mask: bool(
+            torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any()
+        ),
+        "cover nearly all of their photographs": lambda mask: float(mask.float().mean()) > NEARLY_ALL,
+    }
+    for what, holds in kinds.items():
+        found = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if holds(mask)]
+        if found:
+            _log.warning(
+                "%s: the masks of %d of %d photographs %s, such as that of %s",
+                capture.name, len(found), len(silhouettes), what, found[0],
+            )  # fmt: skip
 
 
 def sphere_of(

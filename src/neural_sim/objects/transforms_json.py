@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, UnidentifiedImageError
-
 from neural_sim.documents import read_json
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
+from neural_sim.pictures import Header, by, read_header
 
 NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
@@ -85,7 +84,7 @@ def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, t
         raise ValueError(f"{where}: has no pose; want a transform_matrix")
     pose = checked_pose(entry["transform_matrix"], f"{where}: transform_matrix")
     image = _image(source.parent / entry["file_path"], where)
-    lens = _lens({**document, **entry}, image_size(image, where), where)
+    lens = _lens({**document, **entry}, read_header(image, f"{where}: {image}"), where)
     mask = entry.get("mask_path")
     if mask is not None and not (source.parent / str(mask)).is_file():
         raise ValueError(f"{where}: mask_path: no such file: {source.parent / str(mask)}")
@@ -100,27 +99,19 @@ def _image(path: Path, where: str) -> Path:
     raise ValueError(f"{where}: no such image: {path}")
 
 
-def image_size(path: Path, where: str) -> tuple[int, int]:
-    """Width and height in pixels. Raises ``ValueError`` for a file that is no image."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{where}: {path} is not a readable image ({error})") from error
-
-
-def _lens(values: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
+def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
         if type(value) not in (int, float):
             raise ValueError(f"{where}: {key}: want a number, got {value!r}")
         return float(value)
 
-    width, height = size
+    width, height = header.stored
     stated = round(number("w", width)), round(number("h", height))
-    if stated != size:
+    if stated != header.stored:
         raise ValueError(
-            f"{where}: the image has {width} x {height} pixels, its intrinsics w and h say {stated[0]} x {stated[1]}"
+            f"{where}: the image has {by(header.stored)} pixels, its intrinsics w and h say "
+            f"{by(stated)}{header.turning}"
         )
     model = values.get("camera_model", "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye", False))

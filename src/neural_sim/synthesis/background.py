@@ -11,14 +11,14 @@ from typing import Protocol
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from neural_sim.devices import moved
 from neural_sim.objects.files import content_digest
+from neural_sim.pictures import PHOTO_SUFFIXES, check_headers, picture_files, read_picture
 from neural_sim.ranges import Fraction, NonNegative, NonNegativeInt, PositiveFraction, PositiveInt, validated
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 # Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
 CHUNK = 16
 
@@ -151,16 +151,17 @@ class PhotoFolder:
     crop relative to the largest.
 
     Raises:
-        ValueError: no folder, or no photograph in it.
+        ValueError: no folder, no photograph in it, or one that is none by its header.
     """
 
     def __init__(self, root: str | Path, smallest: PositiveFraction = 0.4) -> None:
         self.root, self.smallest = Path(root).expanduser(), smallest
         if not self.root.is_dir():
             raise ValueError(f"PhotoFolder.root: want a folder of photographs, got {self.root}")
-        self.files = sorted(path for path in self.root.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+        self.files = picture_files(self.root)
         if not self.files:
             raise ValueError(f"PhotoFolder.root: no photograph ({', '.join(PHOTO_SUFFIXES)}) in {self.root}")
+        check_headers(self.files, "PhotoFolder.root")
 
     def draw(
         self,
@@ -175,7 +176,7 @@ class PhotoFolder:
         uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
         images = torch.empty(n, 3, height, width)
         for file in sorted(set(chosen)):  # every file is decoded once
-            photo = _read(self.files[file])
+            photo = read_picture(self.files[file]).convert("RGB")
             for index in (i for i, other in enumerate(chosen) if other == file):
                 images[index] = self._crop(photo, height, width, *uniform[index])
         return images.to(device)
@@ -194,10 +195,3 @@ class PhotoFolder:
         box = (left, top, left + scale * width, top + scale * height)
         crop = photo.resize((width, height), Image.Resampling.BILINEAR, box=box)
         return torch.from_numpy(np.asarray(crop, dtype=np.float32) / 255.0).movedim(-1, 0)
-
-
-def _read(path: Path) -> Image.Image:
-    try:
-        return Image.open(path).convert("RGB")
-    except (UnidentifiedImageError, OSError) as error:
-        raise ValueError(f"{path}: not a readable photograph ({error})") from error

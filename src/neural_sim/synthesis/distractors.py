@@ -11,15 +11,14 @@ import numpy as np
 import torch
 from annotated_types import Gt, Le
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from neural_sim.objects.files import content_digest
+from neural_sim.pictures import CUTOUT_SUFFIXES, picture_files, read_header, read_picture, refuse_mode
 from neural_sim.ranges import Ascending, Fraction, NonNegativeInt, validated
 
 Size = Annotated[float, Gt(0), Le(4)]
-SUFFIXES = (".png", ".webp", ".tif", ".tiff")
-"""Of formats with an alpha channel."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Distractors:
         front: probability of being in front of the objects, which it then hides.
 
     Raises:
-        ValueError: no folder, or no picture in it.
+        ValueError: no folder, no picture in it, or one that by its header is none or has no alpha channel.
     """
 
     root: str | Path | None = None
@@ -62,7 +61,12 @@ class Distractors:
         if self._folder is not None and not self._folder.is_dir():
             raise ValueError(f"Distractors.root: want a folder of pictures, got {self.root}")
         if self._folder is not None and not self.files:
-            raise ValueError(f"Distractors.root: no picture ({', '.join(SUFFIXES)}) in {self.root}")
+            raise ValueError(f"Distractors.root: no picture ({', '.join(CUTOUT_SUFFIXES)}) in {self.root}")
+        for path in self.files if self.used else ():
+            header = read_header(path)
+            refuse_mode(header.mode, header.format, str(path))
+            if not header.transparent:
+                raise ValueError(f"{path}: want a picture with an alpha channel, got mode {header.mode}")
 
     @property
     def _folder(self) -> Path | None:
@@ -83,7 +87,7 @@ class Distractors:
         """The pictures, by name."""
         if self._folder is None:
             return []
-        return sorted(path for path in self._folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+        return picture_files(self._folder, CUTOUT_SUFFIXES)
 
     @cached_property
     def _digest(self) -> str | None:
@@ -102,7 +106,7 @@ class Distractors:
         where there are no distractors.
 
         Raises:
-            ValueError: a picture that cannot be read or has no alpha channel, with its file.
+            ValueError: a picture that cannot be read, with its file.
         """
         if not self.used:
             return None
@@ -126,7 +130,7 @@ class Distractors:
         """A picture whose longer side has about ``side`` pixels, premultiplied."""
         picture = self._pictures.get(file)
         if picture is None:
-            picture = self._pictures[file] = _read(self.files[file])
+            picture = self._pictures[file] = read_picture(self.files[file]).convert("RGBA")
         scale = side / max(picture.size)
         size = max(1, round(scale * picture.width)), max(1, round(scale * picture.height))
         # "RGBa" is premultiplied, so that the colour of clear pixels does not enter.
@@ -138,17 +142,6 @@ class Distractors:
     @cached_property
     def _pictures(self) -> dict[int, Image.Image]:
         return {}
-
-
-def _read(path: Path) -> Image.Image:
-    try:
-        picture = Image.open(path)
-        picture.load()
-    except (UnidentifiedImageError, OSError) as error:
-        raise ValueError(f"{path}: not a readable picture ({error})") from error
-    if not picture.has_transparency_data:
-        raise ValueError(f"{path}: want a picture with an alpha channel, got mode {picture.mode}")
-    return picture.convert("RGBA")
 
 
 def _paste(

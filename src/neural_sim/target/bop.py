@@ -17,6 +17,7 @@ from jaxtyping import Float
 from typing_extensions import override
 
 from neural_sim.documents import read_json
+from neural_sim.pictures import read_grid, read_header
 from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
@@ -29,7 +30,6 @@ from neural_sim.target.frames import (
     numbers,
     rigid,
 )
-from neural_sim.target.photographs import grid_of, image_size
 from neural_sim.target.posed import PosedTarget
 from neural_sim.types import PinholeCamera
 
@@ -124,7 +124,7 @@ class BopScenes(FrameReader):
         where = f"{self._folder(name) / 'scene_gt.json'}: {name.number}"
         if not isinstance(poses, list) or not isinstance(infos, list) or len(poses) != len(infos):
             raise ValueError(f"{where}: want a list of objects, and as many in scene_gt_info.json")
-        camera, size = self.camera(name), image_size(self._image(name))
+        camera, size = self.camera(name), read_header(self._image(name)).stored
         objects = [
             self._object_of(name, i, *both, size) for i, both in enumerate(zip(poses, infos, strict=True))
         ]
@@ -147,7 +147,7 @@ class BopScenes(FrameReader):
             pose["cam_R_m2c"], numbers(pose["cam_t_m2c"], 3, f"{where}: cam_t_m2c") * MILLIMETRE, where
         )
         file = self._folder(name) / "mask_visib" / f"{name.number:06d}_{index:06d}.png"
-        mask = grid_of(file, size) > 0 if file.is_file() else None
+        mask = read_grid(file, size) > 0 if file.is_file() else None
         if mask is not None:
             box = box_of_mask(mask)
         else:
@@ -163,7 +163,7 @@ class BopScenes(FrameReader):
         entry = self._entry(name, "scene_camera.json")
         where = f"{self._folder(name) / 'scene_camera.json'}: {name.number}"
         _want(entry, ("cam_K",), where)
-        size = image_size(self._image(name))
+        size = read_header(self._image(name)).stored
         said = (entry.get("width", size[0]), entry.get("height", size[1]))
         if said != size:
             raise ValueError(
@@ -178,7 +178,7 @@ class BopScenes(FrameReader):
         entry = self._entry(name, "scene_camera.json")
         where = f"{self._folder(name) / 'scene_camera.json'}: {name.number}"
         _want(entry, ("depth_scale",), where)
-        return grid_of(file, size) * (float(numbers(entry["depth_scale"], 1, where)[0]) * MILLIMETRE)
+        return read_grid(file, size) * (float(numbers(entry["depth_scale"], 1, where)[0]) * MILLIMETRE)
 
     @override
     def centre(self, class_name: str) -> Float[np.ndarray, "3"] | None:

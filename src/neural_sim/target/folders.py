@@ -12,6 +12,7 @@ import torch
 from typing_extensions import override
 
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.pictures import check_headers, without_leftovers
 from neural_sim.ranges import NonNegativeInt, validated
 from neural_sim.target.base import AnnotatedPhotographs
 from neural_sim.target.classes import ClassMap
@@ -54,6 +55,7 @@ class FolderTarget(AnnotatedPhotographs):
         if not self._folders:
             raise ValueError(f"target.root: {self.source} has no folders, want one for each class")
         self._classes.check_listed(self._folders)
+        check_headers(self.files().values(), "target.root")
         _ = self._groups  # refused here rather than after the fields are fitted
 
     @property
@@ -67,7 +69,8 @@ class FolderTarget(AnnotatedPhotographs):
 
     @cached_property
     def _folders(self) -> dict[str, Path]:
-        return {path.name: path for path in sorted(self.source.iterdir()) if path.is_dir()}
+        folders = [path for path in sorted(self.source.iterdir()) if path.is_dir()]
+        return {path.name: path for path in without_leftovers(folders, self.source)}
 
     @property
     def _read(self) -> list[str]:

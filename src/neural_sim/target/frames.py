@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from neural_sim.cameras import opencv_camera
 from neural_sim.objects.capture import ROTATION_TOLERANCE
-from neural_sim.target.photographs import by, image_size
+from neural_sim.pictures import by, read_header
 from neural_sim.types import PinholeCamera
 
 
@@ -87,8 +87,11 @@ class Frame:
 
     def __post_init__(self) -> None:
         size = (self.camera.width, self.camera.height)
-        if (got := image_size(self.image)) != size:
-            raise ValueError(f"{self.image}: is {by(got)} pixels, its camera {by(size)}")
+        header = read_header(self.image)
+        if header.stored != size or header.shown != size:
+            raise ValueError(
+                f"{self.image}: is {by(header.stored)} pixels, its camera {by(size)}{header.turning}"
+            )
         grids = {f"the mask of {item.name}": item.mask for item in self.objects} | {"the depth": self.depth}
         for what, grid in grids.items():
             if grid is not None and grid.shape[::-1] != size:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import glob
 import logging
 import os
-from collections.abc import Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +16,7 @@ from jaxtyping import Float, Int
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from neural_sim.synthesis.background import PHOTO_SUFFIXES
+from neural_sim.pictures import PHOTO_SUFFIXES, eight_bits, picture_files, read_picture
 from neural_sim.types import LabelledImages
 
 _log = logging.getLogger(__name__)
@@ -26,50 +25,6 @@ GREY = 0.5
 
 
 # --- files ---
-
-
-@contextmanager
-def opened(path: Path, where: str = "") -> Iterator[Image.Image]:
-    """Open a picture; all pictures of targets are read through here.
-
-    Args:
-        path: the file.
-        where: what messages begin with; empty: the path.
-
-    Raises:
-        ValueError: no such file, or none that can be read as an image, to its end where its pixels are asked for.
-    """
-    try:
-        with Image.open(path) as image:
-            yield image
-    except OSError as error:  # UnidentifiedImageError is one
-        raise ValueError(f"{where or path}: not a readable image ({error})") from error
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) by the file's header. Raises ``ValueError`` as :func:`opened` does."""
-    with opened(path) as image:
-        return image.size
-
-
-def grid_of(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read the numbers [height, width] of an image of one channel, such as labels or depth.
-
-    Raises:
-        ValueError: no such file, or one of another ``size`` (width, height) or number of channels.
-    """
-    if (got := image_size(path)) != size:
-        raise ValueError(f"{path}: is {by(got)} pixels, its photograph {by(size)}")
-    with opened(path) as image:
-        grid = np.asarray(image)
-    if grid.ndim != 2:
-        raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")
-    return grid
-
-
-def by(size: tuple[int, ...]) -> str:
-    """Return a size in words, such as 64 x 48."""
-    return " x ".join(map(str, size))
 
 
 @dataclass(frozen=True)
@@ -104,9 +59,9 @@ class PhotoFiles:
     def paths(self) -> Sequence[Path]:
         """The files in the order of their names."""
         if self._folder.is_dir():
-            return sorted(
-                p for p in self._folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file()
-            )
+            return picture_files(self._folder)
+        if self._folder.is_file():  # its name may have signs of a glob
+            return [self._folder]
         found = glob.glob(str(self._folder), recursive=True)
         return sorted(path for path in map(Path, found) if path.is_file())
 
@@ -122,9 +77,8 @@ class PhotoFiles:
         return path.relative_to(self.root).as_posix()
 
     def read(self, path: Path) -> Image.Image:
-        """Read a photograph in RGB. Raises ``ValueError`` where it cannot be read."""
-        with opened(path, f"{self.key}: {path}") as photo:
-            return photo.convert("RGB")
+        """Read a photograph in RGB, upright. Raises ``ValueError`` where it cannot be read."""
+        return read_picture(path, f"{self.key}: {path}").convert("RGB")
 
 
 # --- pixels and boxes ---
@@ -170,7 +124,7 @@ def letterbox(
     inner_width = max(1, min(width, round(scale * photo.width)))
     inner_height = max(1, min(height, round(scale * photo.height)))
     left, top = (width - inner_width) // 2, (height - inner_height) // 2
-    resized = photo.convert("RGB").resize((inner_width, inner_height), Image.Resampling.BILINEAR)
+    resized = eight_bits(photo).convert("RGB").resize((inner_width, inner_height), Image.Resampling.BILINEAR)
     image = torch.full((3, height, width), GREY)
     pixels = torch.from_numpy(np.asarray(resized, dtype=np.float32) / 255.0).movedim(-1, 0)
     image[:, top : top + inner_height, left : left + inner_width] = pixels
@@ -184,7 +138,8 @@ class Photograph:
     Args:
         path: its file.
         labels: the class of each box, a position in the run's objects.
-        boxes: (x0, y0, x1, y1) in the file's pixels, along their edges; None: one box, which is the whole photograph.
+        boxes: (x0, y0, x1, y1) in the upright picture's pixels, along their edges; None: one box,
+            which is the whole photograph.
         bins: the pose bin of each box, from 0, -1 where it is unknown; None: no box has one.
         name: what messages call it.
         group: what a split keeps together.
@@ -202,19 +157,19 @@ class Photograph:
     border: int = 0
 
     def letterboxed(self, height: int, width: int) -> tuple[Float[Tensor, "3 height width"], Letterbox]:
-        """Read the photograph at one size.
+        """Read the photograph at one size, upright.
 
         Raises:
             ValueError: a file that cannot be read, or nothing left within the border.
         """
-        with opened(self.path, self.where) as photo:
-            if self.border == 0:
-                return letterbox(photo, height, width)
-            if min(photo.size) <= 2 * self.border:
-                raise ValueError(
-                    f"target.border: {self.border} leaves nothing of {self.path}, of {photo.size} pixels"
-                )
-            return letterbox(ImageOps.crop(photo.convert("RGB"), self.border), height, width)
+        photo = read_picture(self.path, self.where).convert("RGB")
+        if self.border == 0:
+            return letterbox(photo, height, width)
+        if min(photo.size) <= 2 * self.border:
+            raise ValueError(
+                f"target.border: {self.border} leaves nothing of {self.path}, of {photo.size} pixels"
+            )
+        return letterbox(ImageOps.crop(photo, self.border), height, width)
 
 
 def read(

@@ -18,6 +18,7 @@ from scipy.io.matlab import MatReadError
 from typing_extensions import override
 
 from neural_sim.extras import require
+from neural_sim.pictures import read_grid, read_header
 from neural_sim.ranges import validated
 from neural_sim.target.frames import (
     Frame,
@@ -30,7 +31,6 @@ from neural_sim.target.frames import (
     numbers,
     rigid,
 )
-from neural_sim.target.photographs import grid_of, image_size
 from neural_sim.target.posed import PosedTarget
 from neural_sim.types import PinholeCamera
 
@@ -143,11 +143,11 @@ class YcbVideoScenes(FrameReader):
         meta = self.file(name, "meta.mat")
         image, label_file = self.file(name, "color.png"), self.file(name, "label.png")
         arrays = read_arrays(meta, ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth"))
-        size = image_size(image)
+        size = read_header(image).stored
         camera = camera_of_matrix(arrays["intrinsic_matrix"], *size, f"{meta}: intrinsic_matrix")
         classes = [int(value) for value in arrays["cls_indexes"].reshape(-1)]
         poses = _poses(arrays["poses"], classes, meta)
-        labels = grid_of(label_file, size) if label_file.is_file() else None
+        labels = read_grid(label_file, size) if label_file.is_file() else None
         if labels is not None and (stray := sorted(set(np.unique(labels).tolist()) - {0, *classes})):
             raise ValueError(f"{label_file}: shows classes {stray}, of which {meta.name} has no pose")
         whole = _boxes(self.file(name, "box.txt"), size)
@@ -167,14 +167,14 @@ class YcbVideoScenes(FrameReader):
     def _depth(self, name: FrameName, size: tuple[int, int], factor: np.ndarray) -> np.ndarray | None:
         file = self.file(name, "depth.png")
         per_metre = float(numbers(factor, 1, f"{self.file(name, 'meta.mat')}: factor_depth")[0])
-        return grid_of(file, size) / per_metre if file.is_file() else None
+        return read_grid(file, size) / per_metre if file.is_file() else None
 
     @override
     def camera(self, name: FrameName) -> PinholeCamera:
         meta = self.file(name, "meta.mat")
         matrix = read_arrays(meta, ("intrinsic_matrix",))["intrinsic_matrix"]
         return camera_of_matrix(
-            matrix, *image_size(self.file(name, "color.png")), f"{meta}: intrinsic_matrix"
+            matrix, *read_header(self.file(name, "color.png")).stored, f"{meta}: intrinsic_matrix"
         )
 
     @override

@@ -15,6 +15,7 @@ from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
+from neural_sim.pictures import check_headers
 from neural_sim.ranges import Fraction, PositiveInt, validated
 from neural_sim.report.coco import result_rows
 from neural_sim.report.predictions import draw, save_picture, scores_table
@@ -38,7 +39,7 @@ class PredictTask(Task):
         batch_size: pictures that are read at once.
 
     Raises:
-        ValueError: no pictures.
+        ValueError: no pictures, or a file that is none by its header.
     """
 
     model: str | None = None
@@ -51,7 +52,7 @@ class PredictTask(Task):
     def __post_init__(self) -> None:
         if not self.images:
             raise ValueError("predict.images: want a folder of pictures, a glob or a picture, got null")
-        _ = PhotoFiles(self.images, "predict.images")
+        check_headers(PhotoFiles(self.images, "predict.images").paths, "predict.images")
 
     @override
     def run(self, context: Context) -> None:

@@ -1,0 +1,354 @@
+"""The one reader of pictures and masks: targets, predictions, backgrounds, cut-outs, captures and textures.
+
+Pictures become 8-bit RGB or RGBA as a viewer shows them, upright by their EXIF orientation. White is 65535 in grey of
+16 bits and 1 in floats. What cannot be read is a ``ValueError`` of one line that names the file.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import ExifTags, Image
+
+_log = logging.getLogger(__name__)
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+CUTOUT_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
+"""Formats with an alpha channel."""
+LEFTOVERS = frozenset({"__MACOSX", "@eaDir", ".ipynb_checkpoints", ".thumbnails", ".Trashes", "$RECYCLE.BIN"})
+"""Folders that other programs leave among pictures."""
+APPLE_DOUBLE = "._"
+"""Beginning of the files in which a Mac keeps attributes of others; they have the others' suffixes."""
+
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What turns a picture upright, by its EXIF orientation."""
+_LOSSY = ("JPEG", "MPO", "WEBP")
+_WHITE = 65535.0
+"""White of 16 bits."""
+_MOST_LABELS = 32
+"""A mask whose largest value is below it holds labels, if there are more than two values."""
+_SPREAD = 32
+"""How far the channels of a grey pixel may differ, in a mask that has been compressed once."""
+
+
+# --- files ---
+
+
+def picture_files(root: Path, suffixes: Collection[str] = PHOTO_SUFFIXES) -> list[Path]:
+    """List the pictures under a folder, at any depth, by name; leftovers of other programs are counted in the log."""
+    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    return without_leftovers(found, root)
+
+
+def without_leftovers(paths: Sequence[Path], root: Path) -> list[Path]:
+    """Leave out what other programs left among the files below ``root``, and count it in the log."""
+    kept = [path for path in paths if not _left_over(path.relative_to(root))]
+    if len(kept) < len(paths):
+        example = next(path for path in paths if _left_over(path.relative_to(root)))
+        _say_left_out(root, len(paths) - len(kept), example)
+    return kept
+
+
+def _left_over(path: Path) -> bool:
+    return any(part in LEFTOVERS or part.startswith(APPLE_DOUBLE) for part in path.parts)
+
+
+@lru_cache(maxsize=1024)  # once, however often a folder is listed
+def _say_left_out(root: Path, count: int, example: Path) -> None:
+    _log.warning("%s: %d leftovers of other programs are left out, such as %s", root, count, example)
+
+
+# --- headers ---
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the head of a picture's file says.
+
+    Args:
+        stored: the size of the pixels as they lie in the file.
+        orientation: of EXIF, 1 to 8; 1 is upright.
+        mode: Pillow's name of what a pixel is.
+        format: Pillow's name of the file's format.
+        transparent: whether pixels may be transparent.
+    """
+
+    stored: Size
+    orientation: int
+    mode: str
+    format: str | None
+    transparent: bool
+
+    @property
+    def shown(self) -> Size:
+        """The size of the upright picture."""
+        return (self.stored[1], self.stored[0]) if self.orientation >= 5 else self.stored
+
+    @property
+    def turning(self) -> str:
+        """What messages about sizes add: how EXIF turns the picture, empty where it does not."""
+        if self.orientation == 1:
+            return ""
+        return f"; its EXIF orientation {self.orientation} shows the stored {by(self.stored)} as {by(self.shown)}"
+
+
+def read_header(path: Path, where: str = "") -> Header:
+    """Read a picture's header.
+
+    Args:
+        path: the file.
+        where: what messages begin with; empty: the path.
+
+    Raises:
+        ValueError: no such file, or one whose head is not a picture's.
+    """
+    with _named(where or str(path)), Image.open(path) as image:
+        return Header(image.size, _orientation(image), image.mode, image.format, image.has_transparency_data)
+
+
+def check_headers(paths: Iterable[Path], key: str) -> None:
+    """Refuse pictures that cannot be read by what their headers say, before anything is computed.
+
+    Args:
+        paths: the files.
+        key: the setting that they come from, for messages.
+
+    Raises:
+        ValueError: as :func:`read_header` does, or a mode that :func:`read_picture` refuses.
+    """
+    for path in paths:
+        where = f"{key}: {path}"
+        header = read_header(path, where)
+        refuse_mode(header.mode, header.format, where)
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation, 1 where there is none. Pillow turns TIFF itself."""
+    known = any(key in image.info for key in ("exif", "Raw profile type exif", "xmp", "XML:com.adobe.xmp"))
+    if image.format == "TIFF" or (image.format == "PNG" and not known):  # else all of a PNG would be decoded
+        return 1
+    try:
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except (
+        Exception
+    ):  # damaged EXIF, of which Pillow's parsers raise many kinds, says nothing about the pixels
+        return 1
+    return orientation if orientation in _UPRIGHT else 1
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Turn all that Pillow raises on a damaged or unknown file into one line with its name."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{where}: not a readable image ({reason})") from error
+
+
+def by(size: tuple[int, ...]) -> str:
+    """Return a size in words, such as 64 x 48."""
+    return " x ".join(map(str, size))
+
+
+# --- pictures ---
+
+
+def read_picture(path: Path, where: str = "", upright: bool = True) -> Image.Image:
+    """Read a picture in 8 bits: RGBA if its pixels may be transparent, else RGB.
+
+    Args:
+        path: the file.
+        where: what messages begin with; empty: the path.
+        upright: whether EXIF turns it; False for pixels as they are stored, which the cameras of captures are of.
+
+    Raises:
+        ValueError: no such file, one that cannot be read to its end, or a mode that has no known black and white.
+    """
+    where = where or str(path)
+    image, orientation = _loaded(path, where)
+    image = eight_bits(image, where)
+    if upright and orientation in _UPRIGHT:
+        image = image.transpose(_UPRIGHT[orientation])
+        image.info.pop("exif", None)  # its orientation no longer holds
+    return image
+
+
+def _loaded(path: Path, where: str) -> tuple[Image.Image, int]:
+    with _named(where), Image.open(path) as image:
+        orientation = _orientation(image)
+        image.load()
+        return image, orientation
+
+
+def eight_bits(image: Image.Image, where: str = "picture") -> Image.Image:
+    """Return a picture of any mode as RGBA if its pixels may be transparent, else as RGB.
+
+    Args:
+        image: the picture.
+        where: what messages begin with.
+
+    Raises:
+        ValueError: a mode that has no known black and white, or values beyond them.
+    """
+    refuse_mode(image.mode, image.format, where)
+    if image.mode == "F" or image.mode.startswith("I"):
+        return _scaled(image, where)
+    with _named(where):
+        return image.convert("RGBA" if image.has_transparency_data else "RGB")
+
+
+def refuse_mode(mode: str, format: str | None, where: str) -> None:
+    """Raise ``ValueError`` for a picture's mode that has no known black and white."""
+    if mode == "I" and format not in ("PNG", "PPM"):  # these have at most 16 bits
+        raise ValueError(
+            f"{where}: integers of 32 bits (mode I) have no known white; save it with 8 or 16 bits"
+        )
+    if mode in ("LAB", "La"):
+        raise ValueError(f"{where}: pictures of mode {mode} are not read; save it as RGB")
+
+
+def _scaled(image: Image.Image, where: str) -> Image.Image:
+    """Scale grey of 16 bits, or of floats in [0, 1], to 8 bits."""
+    values, white = np.asarray(image), 1.0 if image.mode == "F" else _WHITE
+    if not (values.size and values.min() >= 0 and values.max() <= white):  # NaN is refused too
+        raise ValueError(
+            f"{where}: pictures of mode {image.mode} want values from 0 to {white:g}, got "
+            f"{values.min():g} to {values.max():g}"
+        )
+    grey = Image.fromarray(np.rint(values.astype(np.float64) * (255.0 / white)).astype(np.uint8))
+    clear = image.info.get("transparency")
+    if clear is None:
+        return grey.convert("RGB")
+    made = grey.convert("RGBA")
+    made.putalpha(Image.fromarray(np.where(values == clear, 0, 255).astype(np.uint8)))
+    return made
+
+
+def alpha_of(picture: Image.Image) -> Image.Image | None:
+    """Return the alpha channel; None without one, and where it is opaque everywhere, which says nothing."""
+    if not picture.has_transparency_data:
+        return None
+    alpha = picture.convert("RGBA").getchannel("A")
+    return None if alpha.getextrema() == (255, 255) else alpha
+
+
+# --- masks and grids ---
+
+
+def read_grid(path: Path, size: Size | None = None) -> np.ndarray:
+    """Read the numbers [height, width] of an image of one channel, such as labels or depth, as they are stored.
+
+    Args:
+        path: the file.
+        size: width and height that it must have; None: any.
+
+    Raises:
+        ValueError: no such file, or one of another size or number of channels.
+    """
+    if size is not None and (got := read_header(path).stored) != size:
+        raise ValueError(f"{path}: is {by(got)} pixels, its photograph {by(size)}")
+    grid = np.asarray(_loaded(path, str(path))[0])
+    if grid.ndim != 2:
+        raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")
+    return grid
+
+
+def read_mask(path: Path) -> Float[np.ndarray, "height width"]:
+    """Read a mask's opacity in [0, 1].
+
+    Two values, whichever they are, are the background and the object, the darker or smaller being the background; one
+    value other than 0 is the object. More values of grey are opacities by the format's white. Of a coloured palette the
+    index counts. A picture with an alpha channel is a mask by its alpha where that says something, else by its colours.
+
+    Raises:
+        ValueError: a file that cannot be read, or several labels or colours, of which none is known to be the object's.
+    """
+    image, where = _loaded(path, str(path))[0], str(path)
+    lossy = image.format in _LOSSY
+    if image.has_transparency_data:
+        picture = eight_bits(image, where)
+        alpha = alpha_of(picture)
+        if alpha is not None and alpha.getextrema()[0] != alpha.getextrema()[1]:
+            return np.asarray(alpha, dtype=np.float32) / 255.0
+        return _coloured(picture.convert("RGB"), where, lossy)
+    if image.mode == "P":
+        colours = image.convert("RGB")
+        return _coloured(colours, where, lossy) if _is_grey(colours) else _labels(np.asarray(image), where)
+    if image.mode in ("1", "L", "F") or image.mode.startswith("I"):
+        return _grey(np.asarray(image), where, lossy)
+    return _coloured(eight_bits(image, where).convert("RGB"), where, lossy)
+
+
+def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarray, "height width"]:
+    """Return the opacity that numbers of one channel say."""
+    if values.dtype == bool:
+        return values.astype(np.float32)
+    levels = np.unique(values)
+    if not lossy and len(levels) <= 2:
+        return _two(values, levels)
+    whole = values.dtype != np.float32
+    if whole and not lossy and levels[-1] < _MOST_LABELS:
+        raise ValueError(_several(where, "labels", len(levels)))
+    white = 255.0 if values.dtype == np.uint8 else _WHITE if whole else 1.0
+    if not (levels[0] >= 0 and levels[-1] <= white):
+        raise ValueError(
+            f"{where}: a mask wants values from 0 to {white:g}, got {levels[0]:g} to {levels[-1]:g}"
+        )
+    return values.astype(np.float32) / np.float32(white)
+
+
+def _coloured(picture: Image.Image, where: str, lossy: bool) -> Float[np.ndarray, "height width"]:
+    """Return the opacity that colours say."""
+    light = np.asarray(picture.convert("L"))
+    if lossy or _is_grey(picture):
+        return _grey(light, where, lossy)
+    colours, places = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_inverse=True)
+    if len(colours) > 2:
+        raise ValueError(_several(where, "colours", len(colours)))
+    if len(colours) == 1:
+        return np.full(light.shape, float(colours.any()), dtype=np.float32)
+    darker = int(colours.sum(1).argmin())
+    return (places.reshape(light.shape) != darker).astype(np.float32)
+
+
+def _labels(values: np.ndarray, where: str) -> Float[np.ndarray, "height width"]:
+    levels = np.unique(values)
+    if len(levels) > 2:
+        raise ValueError(_several(where, "labels", len(levels)))
+    return _two(values, levels)
+
+
+def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height width"]:
+    """Return 1 where the larger of two values stands; a single one other than 0 is the object."""
+    if len(levels) == 1:
+        return np.full(values.shape, float(levels[0] > 0), dtype=np.float32)
+    return (values == levels[-1]).astype(np.float32)
+
+
+def _several(where: str, what: str, count: int) -> str:
+    return (
+        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey"
+    )
+
+
+def _is_grey(picture: Image.Image) -> bool:
+    values = np.asarray(picture).astype(np.int16)
+    return bool((values.max(-1) - values.min(-1)).max(initial=0) <= _SPREAD)
