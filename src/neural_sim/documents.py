@@ -38,14 +38,14 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file in UTF-8.
+    """Read a JSON file in UTF-8, with or without a byte order mark.
 
     Raises:
         ValueError: a file that is missing, cannot be read or is no JSON, with its path.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not readable as JSON ({error})") from error
 
 

@@ -163,7 +163,7 @@ def _named(where: str) -> Iterator[None]:
         raise ValueError(f"{where}: not a readable image ({reason})") from error
 
 
-def by(size: tuple[int, ...]) -> str:
+def by(size: tuple[float, ...]) -> str:
     """Return a size in words, such as 64 x 48."""
     return " x ".join(map(str, size))
 

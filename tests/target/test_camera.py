@@ -74,7 +74,7 @@ def test_the_targets_own_camera_in_another_size(tmp_path):
         ({"camera": {**ENTRY, "fx": "wide"}}, r"labels.json: camera: .*fx"),
         ({"camera": {**ENTRY, "fx": 0}}, r"labels.json: camera: .*positive"),
         ({"camera": [1, 2]}, r"labels.json: camera: want numbers"),
-        ({"images": [{"id": 1, "file_name": "a.png", "width": 65, "height": 48}]}, "a.png has .*65"),
+        ({"camera": {**ENTRY, "width": 65}}, r"labels.json: a.png has .*64.*, its camera .*65"),
     ],
 )
 def test_a_camera_entry_that_is_none_is_named(tmp_path, changes, message):

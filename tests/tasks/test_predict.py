@@ -205,7 +205,7 @@ REFUSED = [
      r"predict\.categories: \['tree'\] are no categories of .*labels\.json, which has \["),
     (lambda photos: annotated(photos, images=[]), ["predict.annotations={photos}/labels.json", NAMED],
      r"predict\.annotations: .*labels\.json has no entry for any of the 4 pictures of predict\.images, such as a\.png"),
-    (lambda photos: annotated(photos, images=[{"id": 1, "file_name": "a.png", "width": 12, "height": 9}]),
+    (lambda photos: annotated(photos, images=[{"id": 100, "file_name": "a.png", "width": 12, "height": 9}]),
      ["predict.annotations={photos}/labels.json", NAMED], r"a\.png is listed with 12 x 9 pixels, .* has 120 x 90"),
     (lambda photos: annotated(photos, annotations=[{"image_id": 100, "category_id": 5, "bbox": [0, 0, 1, 1]}]),
      ["predict.annotations={photos}/labels.json", NAMED], r"json: category ids \[5\] of a\.png are not declared"),

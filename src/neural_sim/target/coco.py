@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +18,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.parameter.product import SceneDistribution
+from neural_sim.pictures import read_header, refuse_mode
 from neural_sim.ranges import validated
 from neural_sim.target.base import AnnotatedPhotographs
 from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.classes import ClassMap
-from neural_sim.target.coco_file import COCO_KIND, CocoFile, Entry
+from neural_sim.target.coco_file import COCO_KIND, CocoFile, Entry, listed_size, name_of, refuse_size
 from neural_sim.target.photographs import Photograph
 from neural_sim.target.split import groups_of
 from neural_sim.types import LabelledImages, PinholeCamera
@@ -76,6 +79,8 @@ class CocoTarget(AnnotatedPhotographs):
         if not self._entries:
             raise ValueError(f"{self.source}: holds no images")
         self._classes.check_listed(self._coco.category_names)
+        self._coco.check_declared()
+        self._check_pictures()
         _ = self._groups, self._bins  # refused here rather than after the fields are fitted
 
     @property
@@ -97,14 +102,14 @@ class CocoTarget(AnnotatedPhotographs):
 
     @cached_property
     def _entries(self) -> list[Entry]:
-        return sorted(self._coco.images, key=lambda entry: entry["id"])[: self.limit]
+        return sorted(self._coco.images, key=_order)[: self.limit]
 
     @cached_property
     def _groups(self) -> Sequence[str | int]:
         """The group of each entry."""
         if self.split_by is None:
             return range(len(self._entries))
-        names = [str(entry["file_name"]) for entry in self._entries]
+        names = [name_of(entry) for entry in self._entries]
         return groups_of(names, self.split_by, self.source, self._entries)
 
     @cached_property
@@ -114,8 +119,43 @@ class CocoTarget(AnnotatedPhotographs):
 
     @override
     def files(self) -> dict[str, Path]:
-        names = [str(entry["file_name"]) for entry in self._coco.images]
-        return {"": self.source, **{name: self._folder / name for name in names}}
+        return {"": self.source, **{name_of(entry): self._path(entry) for entry in self._coco.images}}
+
+    def _path(self, entry: Entry) -> Path:
+        """Return an image's file: of the name as it is written, with ``/``, or in Unicode's other form.
+
+        Raises:
+            ValueError: a name that leaves the folder.
+        """
+        names = [entry["file_name"], name_of(entry)]
+        names += [unicodedata.normalize(form, names[1]) for form in ("NFC", "NFD")]
+        folder = os.path.abspath(self._folder)
+        for name in names:
+            if os.path.commonpath([folder, os.path.abspath(self._folder / name)]) != folder:
+                raise ValueError(
+                    f"{self.source}: file_name {entry['file_name']!r} of image {entry['id']!r} leads out of {folder}"
+                )
+        paths = [self._folder / name for name in names]
+        return next((path for path in paths if path.is_file()), paths[1])
+
+    def _where(self, entry: Entry) -> str:
+        return f"{self._path(entry)} (named in {self.source})"
+
+    def _check_pictures(self) -> None:
+        """Raise ``ValueError`` for pictures that by their headers cannot be read or have another size than listed."""
+        unsized = []
+        for entry in self._entries:
+            path, where = self._path(entry), self._where(entry)
+            header = read_header(path, where)
+            refuse_mode(header.mode, header.format, where)
+            refuse_size(entry, header, where)
+            if header.orientation > 1 and listed_size(entry) is None:
+                unsized.append(path)
+        if unsized:
+            _log.warning(
+                "%s: %d photographs without width and height are turned by EXIF, such as %s; their boxes are taken to "
+                "be of the upright pictures", self.source, len(unsized), unsized[0],
+            )  # fmt: skip
 
     @override
     def camera(self) -> PinholeCamera:
@@ -143,7 +183,7 @@ class CocoTarget(AnnotatedPhotographs):
     ) -> list[Photograph]:
         self._check_bins(distribution)
         names = self._coco.category_names
-        self._classes.refuse(names, objects)
+        self._coco.refuse_strange(self._classes, objects)
         labels = self._coco.by_id(self._classes.labels(names, objects))
         rows = self._coco.rows_by_image(labels)
         self._log_left_out(names, objects)
@@ -159,15 +199,14 @@ class CocoTarget(AnnotatedPhotographs):
         bins = (
             None if self._bins is None else torch.tensor([self._bins[row] for row in rows], dtype=torch.long)
         )
-        path = self._folder / entry["file_name"]
         return Photograph(
-            path,
+            self._path(entry),
             torch.tensor([labels[category] for category in categories], dtype=torch.long),
             self._coco.boxes(rows),
             bins,
-            name=str(entry["file_name"]),
+            name=name_of(entry),
             group=group,
-            where=f"{path} (named in {self.source})",
+            where=self._where(entry),
         )
 
     def _check_bins(self, distribution: SceneDistribution | None) -> None:
@@ -182,7 +221,7 @@ class CocoTarget(AnnotatedPhotographs):
     def _log_left_out(self, names: Sequence[str], objects: Sequence[str]) -> None:
         """Count the boxes of categories that are no objects, which ``unmatched=leave_out`` leaves out."""
         strange = {name for name in names if self._classes.object_of(name) not in (None, *objects)}
-        known = {entry["id"]: entry["name"] for entry in self._coco.document["categories"]}
+        known = {entry["id"]: str(entry["name"]) for entry in self._coco.document["categories"]}
         counts = Counter(known[item["category_id"]] for item in self._coco.annotations)
         left_out = {name: counts[name] for name in sorted(strange) if counts[name]}
         if left_out:
@@ -210,3 +249,8 @@ class CocoTarget(AnnotatedPhotographs):
         counts = ", ".join(f"{len(own)} of {part}" for part, own in chosen.items())
         _log.info("%s takes %s", where, counts)
         return chosen
+
+
+def _order(entry: Entry) -> tuple[bool, Any]:
+    """Return what entries are sorted by: numbers by value, then texts."""
+    return isinstance(entry["id"], str), entry["id"]

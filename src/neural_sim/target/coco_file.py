@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import logging
+import posixpath
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +14,87 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.documents import read_json
+from neural_sim.pictures import Header, by
+from neural_sim.target.classes import ClassMap
+
+_log = logging.getLogger(__name__)
 
 REQUIRED: dict[str, tuple[str, ...]] = {
     "images": ("id", "file_name"),
     "categories": ("id", "name"),
     "annotations": ("image_id", "category_id", "bbox"),
 }
+OPTIONAL = ("width", "height", "iscrowd")
+LARGEST = 1e9
+"""Pixels that no picture has; also keeps out what is not finite."""
 Entry = dict[str, Any]
 COCO_KIND = ("category", "categories")
 """What COCO calls a class, and several."""
+
+
+def is_number(value: object) -> bool:
+    """Tell whether a value of JSON is a finite number of pixels."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
+
+
+def _check_id(value: object, where: str) -> None:
+    whole = isinstance(value, float) and value.is_integer()  # 1.0 is 1
+    if isinstance(value, bool) or not (isinstance(value, (int, str)) or whole):
+        raise ValueError(f"{where}: want a whole number or a text, got {value!r:.80}")
+
+
+def _check_file_name(value: object, where: str) -> None:
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{where}: want the name of a file, got {value!r:.80}")
+
+
+def _check_name(value: object, where: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(f"{where}: want a name, got {value!r:.80}")
+
+
+def _check_box(value: object, where: str) -> None:
+    numbers = value if isinstance(value, list) and all(map(is_number, value)) else []
+    if len(numbers) != 4 or numbers[2] < 0 or numbers[3] < 0:
+        raise ValueError(
+            f"{where} must be x, y, width, height: four finite numbers, width and height positive, got {value!r:.80}"
+        )
+
+
+def _check_side(value: object, where: str) -> None:
+    if value is not None and not (is_number(value) and value >= 0):  # pyright: ignore[reportOperatorIssue]
+        raise ValueError(f"{where}: want a number of pixels, got {value!r:.80}")
+
+
+def _check_crowd(value: object, where: str) -> None:
+    if value not in (0, 1, None):
+        raise ValueError(f"{where}: want 0 or 1, got {value!r:.80}")
+
+
+CHECKS: dict[str, Callable[[object, str], None]] = {
+    "id": _check_id, "image_id": _check_id, "category_id": _check_id, "file_name": _check_file_name,
+    "name": _check_name, "bbox": _check_box, "width": _check_side, "height": _check_side, "iscrowd": _check_crowd,
+}  # fmt: skip
+
+
+def name_of(entry: Entry) -> str:
+    """Return an image entry's ``file_name`` with ``/``, as tools on Windows do not write it."""
+    return posixpath.normpath(entry["file_name"].replace("\\", "/"))
+
+
+def listed_size(entry: Entry) -> tuple[int | float, int | float] | None:
+    """Return the width and height of an image entry, None where it does not say both."""
+    width, height = entry.get("width"), entry.get("height")
+    return (width, height) if width and height else None  # tools that do not know it write 0
+
+
+def refuse_size(entry: Entry, header: Header, where: str) -> None:
+    """Raise ``ValueError`` for a picture that, as it is shown, has another size than its entry says."""
+    listed = listed_size(entry)
+    if listed is not None and listed != header.shown:
+        raise ValueError(
+            f"{where} is listed with {by(listed)} pixels, but has {by(header.shown)}{header.turning}"
+        )
 
 
 @dataclass(frozen=True)
@@ -32,10 +106,13 @@ class CocoFile:
 
     @classmethod
     def read(cls, path: Path) -> CocoFile:
-        """Read a file.
+        """Read and check a file.
+
+        Annotations of images that the file does not list, and boxes without a side, are counted in the log.
 
         Raises:
-            ValueError: not JSON, or a section, an entry's key or a box's side that is missing.
+            ValueError: not JSON; a section or a key that is missing; an id, a name or a box that is none; an id or a
+                file of several images; or annotations of which no image is listed.
         """
         document = read_json(path)
         for section, keys in REQUIRED.items():
@@ -43,12 +120,67 @@ class CocoFile:
             if not isinstance(entries, list):
                 raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
             for number, entry in enumerate(entries):
+                where = f"{path}: {section}[{number}]"
                 missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
                 if missing:
-                    raise ValueError(f"{path}: {section}[{number}] lacks {missing}")
-                if section == "annotations" and len(entry["bbox"]) != 4:
-                    raise ValueError(f"{path}: annotations[{number}].bbox must be x, y, width, height")
-        return cls(path, document)
+                    raise ValueError(f"{where} lacks {missing}")
+                for key, check in CHECKS.items():
+                    if key in entry and key in (*keys, *OPTIONAL):
+                        check(entry[key], f"{where}.{key}")
+        file = cls(path, document)
+        file._check_unique("images", "id", "file_name")
+        file._check_unique("images", "file_name", "id")
+        file._check_unique("categories", "id", "name")
+        file._check_orphans()
+        empty = sum(not file._has_size(item) for item in file.annotations)
+        if empty:
+            _log.warning("%s: %d boxes without a width or a height are left out", path, empty)
+        return file
+
+    def _check_unique(self, section: str, key: str, other: str) -> None:
+        """Raise ``ValueError`` for two entries with one value of ``key``."""
+        first: dict[Any, int] = {}
+        for number, entry in enumerate(self.document[section]):
+            before = first.setdefault(entry[key], number)
+            if before != number:
+                raise ValueError(
+                    f"{self.path}: {section}[{before}] and [{number}] ({self.document[section][before][other]!r} and "
+                    f"{entry[other]!r}) have one {key}, {entry[key]!r}: whose annotations are whose is not known"
+                )
+
+    def check_declared(self) -> None:
+        """Raise ``ValueError`` for an annotation of a category that is not declared."""
+        declared = {entry["id"] for entry in self.document["categories"]}
+        names = {entry["id"]: entry["file_name"] for entry in self.images}
+        for number, item in enumerate(self.annotations):
+            if item["category_id"] not in declared:
+                shown = names.get(item["image_id"], item["image_id"])
+                raise ValueError(
+                    f"{self.path}: category ids {[item['category_id']]} of {shown} are not declared "
+                    f"(annotations[{number}])"
+                )
+
+    def _check_orphans(self) -> None:
+        """Count annotations of images that are not listed in the log, or raise ``ValueError`` if all are."""
+        ids = {entry["id"] for entry in self.images}
+        strange = [number for number, item in enumerate(self.annotations) if item["image_id"] not in ids]
+        if not strange:
+            return
+        example = f"annotations[{strange[0]}].image_id is {self.annotations[strange[0]]['image_id']!r}"
+        if len(strange) < len(self.annotations):
+            _log.warning(
+                "%s: %d of %d annotations are of images that it does not list, such as %s",
+                self.path, len(strange), len(self.annotations), example,
+            )  # fmt: skip
+        elif ids:
+            raise ValueError(
+                f"{self.path}: no annotation is of an image that it lists: {example}, images[0].id is "
+                f"{self.images[0]['id']!r}"
+            )
+
+    @staticmethod
+    def _has_size(item: Entry) -> bool:
+        return item["bbox"][2] > 0 and item["bbox"][3] > 0
 
     @property
     def images(self) -> list[Entry]:
@@ -63,7 +195,28 @@ class CocoFile:
     @property
     def category_names(self) -> list[str]:
         """The names of the categories."""
-        return [entry["name"] for entry in self.document["categories"]]
+        return [str(entry["name"]) for entry in self.document["categories"]]
+
+    @property
+    def used_names(self) -> list[str]:
+        """The names of the categories that have annotations."""
+        used = {item["category_id"] for item in self.annotations}
+        return [str(entry["name"]) for entry in self.document["categories"] if entry["id"] in used]
+
+    def refuse_strange(self, classes: ClassMap, objects: Sequence[str]) -> None:
+        """Refuse categories that are no objects; those without annotations are counted in the log instead.
+
+        Raises:
+            ValueError: as :meth:`ClassMap.refuse` does.
+        """
+        used = self.used_names
+        classes.refuse(used, objects)
+        idle = [name for name in self.category_names if name not in used]
+        strange = sorted(name for name in idle if classes.object_of(name) not in (None, *objects))
+        if strange:
+            _log.warning(
+                "%s: categories %s are no objects and have no annotation: left out", self.path, strange
+            )
 
     @property
     def crowds(self) -> int:
@@ -72,27 +225,22 @@ class CocoFile:
 
     def by_id(self, labels: Mapping[str, int | None]) -> dict[Any, int | None]:
         """Return the labels of categories by their ids; ``labels`` are by their names."""
-        return {entry["id"]: labels.get(entry["name"]) for entry in self.document["categories"]}
+        return {entry["id"]: labels.get(str(entry["name"])) for entry in self.document["categories"]}
 
     def rows_by_image(self, labels: Mapping[Any, int | None]) -> dict[Any, list[int]]:
-        """Return the places of annotations by image id: those of objects, without crowds.
+        """Return the places of annotations by image id: those of objects, without crowds and empty boxes.
 
         Args:
             labels: label by category id, None for a category that is no object.
-
-        Raises:
-            ValueError: an annotation of a category that is not declared.
         """
-        names = {entry["id"]: entry["file_name"] for entry in self.images}
         rows: dict[Any, list[int]] = {}
         for row, item in enumerate(self.annotations):
-            image = item["image_id"]
-            if item["category_id"] not in labels:
-                raise ValueError(
-                    f"{self.path}: category ids {[item['category_id']]} of {names.get(image, image)} are not declared"
-                )
-            if not item.get("iscrowd", 0) and labels[item["category_id"]] is not None:
-                rows.setdefault(image, []).append(row)
+            if (
+                self._has_size(item)
+                and not item.get("iscrowd", 0)
+                and labels[item["category_id"]] is not None
+            ):
+                rows.setdefault(item["image_id"], []).append(row)
         return rows
 
     def boxes(self, rows: Iterable[int]) -> Float[Tensor, "b 4"]:

@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from PIL import Image
 from torch import Tensor
 
+from neural_sim.pictures import read_header
 from neural_sim.target.classes import ClassMap
-from neural_sim.target.coco_file import COCO_KIND, CocoFile
+from neural_sim.target.coco_file import COCO_KIND, CocoFile, name_of, refuse_size
 from neural_sim.target.photographs import Boxes, PhotoFiles, padded
 from neural_sim.types import LabelledImages
 
@@ -30,8 +30,8 @@ class Truth:
     whose ``file_name`` is its path below the photographs' folder or below the file's, else the only one of its name.
 
     Raises:
-        ValueError: no such file, one that is not in COCO form, a category without a class, or no entry for any of the
-            photographs.
+        ValueError: no such file, one that is not in COCO form, a category without a class, no entry for any of the
+            photographs, or one that says another size.
     """
 
     path: Path
@@ -43,12 +43,15 @@ class Truth:
         if not self.path.is_file():
             raise ValueError(f"predict.annotations: no such file: {self.path}")
         _ = self.labels
+        self._file.check_declared()
         found, total = len(self.entries), len(self.photos.paths)
         if not found:
             raise ValueError(
                 f"predict.annotations: {self.path} has no entry for any of the {total} pictures of "
                 f"predict.images, such as {self.photos.name(self.photos.paths[0])}"
             )
+        for path, entry in self.entries.items():
+            refuse_size(entry, read_header(path), f"predict.annotations: {self.path}: {path}")
         if found < total:
             _log.warning(
                 "%s: no entry for %d of %d pictures; they are not scored", self.path, total - found, total
@@ -73,7 +76,7 @@ class Truth:
         source = f"predict.annotations: {self.path}"
         classes = ClassMap(self.categories, source, "predict.categories", COCO_KIND, None)
         classes.check_listed(names)
-        classes.refuse(names, self.class_names)
+        self._file.refuse_strange(classes, self.class_names)
         return self._file.by_id(classes.labels(names, self.class_names))
 
     @cached_property
@@ -88,7 +91,7 @@ class Truth:
     @cached_property
     def entries(self) -> dict[Path, dict[str, Any]]:
         """The file's image entries by photograph."""
-        by_name = {str(entry["file_name"]): entry for entry in self._file.images}
+        by_name = {name_of(entry): entry for entry in self._file.images}
         by_last: dict[str, list[dict[str, Any]]] = {}
         for name, entry in by_name.items():
             by_last.setdefault(Path(name).name, []).append(entry)
@@ -110,19 +113,9 @@ class Truth:
             _log.warning("%s: %d crowds are left out", self.path, self._file.crowds)
         return self._file.rows_by_image(self.labels)
 
-    def boxes(self, path: Path, photo: Image.Image) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:
-        """Return (x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry, without crowds.
-
-        Raises:
-            ValueError: a photograph of another size than its entry says.
-        """
+    def boxes(self, path: Path) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:
+        """Return (x0, y0, x1, y1) in pixels, and class indices, of a photograph that has an entry, without crowds."""
         entry = self.entries[path]
-        listed = entry.get("width", photo.width), entry.get("height", photo.height)
-        if listed != photo.size:
-            raise ValueError(
-                f"predict.annotations: {self.path}: {entry['file_name']} is listed with {listed[0]} x {listed[1]} "
-                f"pixels, {path} has {photo.width} x {photo.height}"
-            )
         rows = self._rows.get(entry["id"], [])
         labels = [self.labels[self._file.annotations[row]["category_id"]] for row in rows]
         return self._file.boxes(rows), torch.tensor(labels, dtype=torch.long)

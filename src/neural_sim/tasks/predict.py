@@ -68,7 +68,7 @@ class PredictTask(Task):
             paths = photos.paths[start : start + self.batch_size]
             pictures = [photos.read(path) for path in paths]
             for path, picture, found in zip(paths, pictures, detect(saved, pictures), strict=True):
-                known = truth.boxes(path, picture) if truth and path in truth.entries else None
+                known = truth.boxes(path) if truth and path in truth.entries else None
                 drawn = draw(picture, found, saved.class_names, self.draw_above, known[0] if known else None)
                 save_picture(drawn, folder / "pictures", photos.name(path))
                 if truth is None or known is not None:

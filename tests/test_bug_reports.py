@@ -1,0 +1,135 @@
+"""Inputs of public bug reports, as the scripts beside the repository lay them out: right, or refused with the file."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared_inputs import laid_out
+
+from neural_sim.objects.files import MeshFiles
+from neural_sim.objects.folder import MeshFolder
+from neural_sim.objects.photos import Photos
+from neural_sim.pictures import check_headers, read_picture
+from neural_sim.synthesis.background import PhotoFolder
+from neural_sim.target.coco import CocoTarget
+from neural_sim.target.folders import FolderTarget
+from neural_sim.target.photographs import PhotoFiles
+from neural_sim.types import LabelledImages
+
+NAMES = ["mug", "can"]
+
+
+def loaded(path: Path) -> LabelledImages:
+    return CocoTarget(path).load(NAMES, 60, 80)
+
+
+def test_01_boxes_lie_on_the_objects_of_turned_photographs(tmp_path):
+    images = loaded(laid_out("01", tmp_path) / "labels.json")
+    for image, boxes in zip(images.images, images.boxes.tolist(), strict=True):
+        rows, columns = np.nonzero((image[0] - image[1]).numpy() > 0.5)
+        found = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        assert np.abs(np.subtract(found, boxes[0])).max() <= 1
+
+
+def test_02_one_id_of_several_images_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"labels\.json: .*'000\.png' and '001\.png'.* id, 20250116"):
+        loaded(laid_out("02", tmp_path) / "labels.json")
+
+
+def test_03_annotations_of_no_image_are_refused(tmp_path):
+    out = laid_out("03", tmp_path)
+    for name in ("labels", "orphans", "mixed"):
+        with pytest.raises(ValueError, match=rf"{name}\.json: no annotation is of an image that it lists"):
+            loaded(out / f"{name}.json")
+
+
+def test_04_boxes_that_are_none_are_named(tmp_path):
+    out = laid_out("04", tmp_path)
+    places = {"category_null": "category_id", "category_list": "category_id", "image_list": "image_id"}
+    for path in sorted(out.glob("*.json")):
+        if path.stem == "labels":
+            assert len(loaded(path)) == 6
+            continue
+        place = places.get(path.stem, "bbox")
+        with pytest.raises(ValueError, match=rf"{path.name}: annotations\[0\].*{place}"):
+            loaded(path)
+
+
+def test_05_backslashes_are_read_and_a_number_is_no_name(tmp_path):
+    out = laid_out("05", tmp_path)
+    assert loaded(out / "labels.json").present.sum() == 6
+    with pytest.raises(ValueError, match=r"number\.json: images\[0\]\.file_name: .*got 7"):
+        loaded(out / "number.json")
+
+
+def test_06_sixteen_bits_and_floats_are_grey(tmp_path):
+    out = laid_out("06", tmp_path)
+    means = [float(image.mean()) for image in loaded(out / "labels.json").images]
+    assert 0.3 < means[0] < 0.5 and means == sorted(means, reverse=True) and means[5] < 0.3
+    photos = PhotoFiles(str(out / "*.*"), "predict.images")
+    for name in ("picture.png", "float.tif"):
+        values = np.asarray(photos.read(out / name))[0]
+        assert np.abs(values[:, 0].astype(float) - np.linspace(0, 255, 80)).max() < 1.1
+    captures = Photos(out / "captures")
+    depth, masks = (
+        captures.pictures(name).rgba(captures.captures[name].frames[0]) for name in ("photo16", "mask16")
+    )
+    assert 0.1 < float(depth[..., :3].mean()) < 0.9
+    assert set(masks[..., 3].unique().tolist()) == {0.0, 1.0}
+    placements = [captures.placement(name) for name in ("photo16", "mask16")]
+    assert placements[0].radius == placements[1].radius
+
+
+def test_08_pictures_above_pillows_limit_are_named_before_anything_is_computed(tmp_path):
+    out = laid_out("08", tmp_path)
+    for read in (
+        lambda: loaded(out / "labels.json"), lambda: PhotoFolder(out / "backgrounds"),
+        lambda: check_headers(PhotoFiles(str(out / "pictures"), "predict.images").paths, "predict.images"),
+        lambda: Photos(out / "captures"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"0\.png.*not a readable image .*exceeds limit"):
+            read()
+
+
+def test_09_large_metadata_is_named(tmp_path):
+    out = laid_out("09", tmp_path)
+    with pytest.raises(ValueError, match=r"000\.png \(named in .*not a readable image"):
+        loaded(out / "labels.json")
+    try:
+        read_picture(out / "001.png")
+    except ValueError as error:
+        assert "001.png: not a readable image" in str(error)
+
+
+def test_10_leftovers_of_a_mac_are_left_out(tmp_path, caplog):
+    out = laid_out("10", tmp_path)
+    with caplog.at_level(logging.WARNING):
+        assert len(PhotoFolder(out / "backgrounds").files) == 6
+        assert len(FolderTarget(out / "by_class").photographs(NAMES)) == 12
+        assert len(PhotoFiles(str(out / "pictures"), "predict.images").paths) == 6
+        for folder in ("meshes", "macosx"):
+            meshes: MeshFiles = MeshFolder(out / folder)
+            assert meshes.names() == ["box"]
+    assert caplog.text.count("leftovers of other programs are left out, such as") == 6
+
+
+def test_20_a_root_category_is_left_out(tmp_path, caplog):
+    out = laid_out("20", tmp_path)
+    with caplog.at_level(logging.WARNING):
+        assert loaded(out / "labels.json").present.sum() == 6
+    assert "['shelf-objects'] are no objects and have no annotation: left out" in caplog.text
+
+
+def test_24_an_opaque_alpha_channel_is_no_mask(tmp_path):
+    with pytest.raises(ValueError, match=r"000\.png: nothing says which of its pixels are the object's"):
+        Photos(laid_out("24", tmp_path)).placement("ball")
+
+
+def test_15_turned_photographs_of_captures_are_as_stored_or_refused_by_their_exif(tmp_path):
+    out = laid_out("15", tmp_path)
+    stored = Photos(out, ["stored"])
+    frame = stored.captures["stored"].frames[0]
+    assert stored.pictures("stored").rgba(frame).shape == (90, 120, 4)
+    with pytest.raises(ValueError, match=r"90 x 120 pixels, .*say 120 x 90; its EXIF orientation 6 shows"):
+        Photos(out, ["upright"])
