@@ -25,6 +25,15 @@ def asleep():
 def in_compiled_code():
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
 
+def after_colmap():
+    from pathlib import Path
+    from neural_sim.objects.colmap import read_colmap
+    folder = Path(os.environ["FOLDER"])
+    try:
+        read_colmap(folder, "pot")
+    except ValueError:
+        time.sleep(60)
+
 def swallowing():
     while True:
         try:
@@ -84,6 +93,19 @@ def test_a_signal_ends_the_process_wherever_it_is(signum, status, body, printed)
     time.sleep(0.1)
     found = _end(process, signum)
     assert found == (status, printed.format(signum.name), [LINE.format(signum.name)])
+
+
+def test_sigterm_still_ends_a_command_that_has_read_a_colmap_model(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="the extra photos is not installed")
+    (tmp_path / "cameras.txt").write_text("no model\n", encoding="utf-8")
+    monkeypatch.setenv("FOLDER", str(tmp_path))
+    process = _begin([sys.executable, "-c", PROGRAM.replace("{body}", "after_colmap")])
+    assert process.stdout.readline() == "begun\n"
+    while f"pycolmap{os.sep}" not in Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8"):
+        time.sleep(0.1)
+    time.sleep(3.0)
+    found = _end(process, signal.SIGTERM)
+    assert found[0] == 143 and found[2][-1:] == [LINE.format("SIGTERM")]
 
 
 def test_what_was_set_before_is_there_again_afterwards():

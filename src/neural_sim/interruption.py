@@ -82,6 +82,23 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
+def signals_kept() -> Iterator[None]:
+    """Take signals back from a library that is imported inside and handles them in compiled code.
+
+    pycolmap's logging does: at SIGTERM it prints a stack from within the signal, which can wait for ever for the lock
+    of an allocation that the signal interrupted.
+    """
+    before = {signum: signal.getsignal(signum) for signum in SIGNALS}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for signum, handler in before.items():
+                if handler is not None:  # None: set by compiled code before, and unknown to Python
+                    signal.signal(signum, handler)
+
+
+@contextmanager
 def ctrl_c_as_exception() -> Iterator[None]:
     """Let Ctrl-C raise KeyboardInterrupt, for what it ends in the ordinary way."""
     if threading.current_thread() is not threading.main_thread():

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from neural_sim.extras import require
+from neural_sim.interruption import signals_kept
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.pictures import by, read_header
 
@@ -48,7 +49,8 @@ def read_colmap(folder: Path, name: str) -> Capture:
             f"{folder}: holds no COLMAP model; want one of {', '.join(MODELS)} with cameras.bin or .txt"
         )
     require("photos", str(model))
-    import pycolmap
+    with signals_kept():
+        import pycolmap
 
     try:
         read = pycolmap.Reconstruction(str(model))
