@@ -83,8 +83,8 @@ class Hypergradient(Generic[Adjoint_co]):
     gradients: dict[str, Float[Tensor, "k"]]
     errors: dict[str, Float[Tensor, "k"]]
     adjoint: Adjoint_co
-    p_values: dict[str, Mapping[str, float]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    p_values: dict[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
+    seconds: dict[str, float] = field(default_factory=dict[str, float])
 
     @property
     def products(self) -> int:

@@ -108,7 +108,7 @@ class InnerProblem:
         weights = self.weights[index] if subset_weights is None else subset_weights
         if subset is not None and subset_weights is None:
             weights = weights * (self.weights.sum() / weights.sum())
-        chunks = zip(index.split(self.chunk_size), weights.split(self.chunk_size), strict=True)
+        chunks = zip(torch.split(index, self.chunk_size), torch.split(weights, self.chunk_size), strict=True)
         terms: list[Term] = [
             lambda params, rows=rows, weight=weight: self.losses(params, rows) @ weight
             for rows, weight in chunks
@@ -183,18 +183,19 @@ def curvature_rows(
     ``wanted`` random ones (0: all), of the first ``drawn``, which were drawn from p_psi, and of the others, which are
     photographs, in proportion to the weight of each part, which its rows keep.
     """
-    count, parts = len(weights), []
+    count = len(weights)
     if not 0 < wanted < count:
         return torch.arange(count), weights
+    rows: list[Tensor] = []
+    scaled: list[Tensor] = []
     for first, last in ((0, drawn), (drawn, count)):
         size, mass = last - first, float(weights[first:last].sum())
         if size == 0:
             continue
         few = min(size, max(1, round(wanted * mass))) if size < count else wanted
-        rows = first + torch.randperm(size, generator=generator)[:few]
-        parts.append((rows, torch.full((few,), mass / few)))
-    rows, scaled = (torch.cat(column) for column in zip(*parts, strict=True))
-    return rows, scaled
+        rows.append(first + torch.randperm(size, generator=generator)[:few])
+        scaled.append(torch.full((few,), mass / few))
+    return torch.cat(rows), torch.cat(scaled)
 
 
 def _relative_change(

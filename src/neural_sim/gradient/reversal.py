@@ -233,7 +233,7 @@ def _differenced(
     """Take central differences of losses and gradients, without waiting for a device."""
     unit, scale = _displacement(theta, along, torch.finfo(theta.dtype).eps ** (1 / 3))
     inputs = tuple(values.detach().requires_grad_(with_inputs) for values in examples.of(rows))
-    sides = []
+    sides: list[tuple[Tensor, ...]] = []
     for point in (theta + unit, theta - unit):
         leaf = point.detach().requires_grad_()
         with torch.enable_grad():

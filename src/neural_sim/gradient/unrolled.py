@@ -73,8 +73,8 @@ class Accumulated:
         """
         if not self.inputs or self.inputs_of is None:
             raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
-        parts = []
-        for rows, chunk in zip(index.split(chunk_size), images.split(chunk_size), strict=True):
+        parts: list[Tensor] = []
+        for rows, chunk in zip(torch.split(index, chunk_size), torch.split(images, chunk_size), strict=True):
             rows = rows.to(self.inputs[0].device)
             leaf = chunk.detach().requires_grad_()
             with torch.enable_grad():
@@ -244,7 +244,7 @@ class _Scoring:
         along = scores(
             self.losses, step.params, step.along, torch.cat(rows), self.chunk_size, "central_difference"
         )
-        parts = along.split([part.numel() for part in rows])
+        parts = torch.split(along, [part.numel() for part in rows])
         means = [part.mean() for part in parts]
         scale = weight * self.per_bin / len(columns)
         # An offset common to a group has no effect, but adds noise where probes are scored unequally often. It is

@@ -1,4 +1,4 @@
-"""What the derivatives of several trainings say together: their mean, its variance, whether it differs from zero."""
+"""Evidence of the derivatives of several trainings: their mean, its variance, and whether it differs from zero."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ class Average:
     which a derivative was computed from, and that between trainings (of other initial parameters, batches and images),
     :attr:`between`. A derivative of which a component is not finite counts for nothing.
 
-    Args:
-        directions, variances: the derivatives, and their variances by images.
+    Attributes:
+        directions: the derivatives.
+        variances: their variances by images.
         moves: how often the object has moved since.
         momentum: factor of a derivative's weight for every move.
     """
@@ -30,11 +31,12 @@ class Average:
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"], momentum: float = 1.0) -> Average:
+        """Begin without a derivative."""
         nothing = psi.new_zeros(0, *psi.shape)
         return Average(nothing, nothing, nothing[..., 0].long(), momentum)
 
     def joined(self, direction: Float[Tensor, "objects k"], variance: Float[Tensor, "objects k"]) -> Average:
-        """The mean with one more derivative, at the present psi."""
+        """Add one more derivative, at the present psi."""
         known = (direction.isfinite() & variance.isfinite()).all(1, keepdim=True)
         new = (direction.where(known, 0.0), variance.where(known, torch.inf))
         return replace(
@@ -45,16 +47,17 @@ class Average:
         )
 
     def moved(self, objects: Bool[Tensor, "objects"]) -> Average:
-        """The mean after some ``objects`` have moved."""
+        """Let the derivatives of some ``objects`` that have moved decay."""
         return replace(self, moves=self.moves + objects.long())
 
     @property
     def between(self) -> Float[Tensor, "objects"]:
-        """Variance of a component between trainings, estimated from an object's derivatives at one psi: their scatter
-        beyond that of their images. What the median object's ratio of the two would give counts as one more pair of
-        derivatives of each: a ratio, because objects' derivatives differ in size, and the median, so that one object
-        whose derivatives scatter wildly does not hide those of others. 0 where no object has two derivatives at one
-        psi.
+        """Variance of a component between trainings, 0 where no object has two derivatives at one psi.
+
+        It is estimated from an object's derivatives at one psi: their scatter beyond that of their images. What the
+        median object's ratio of the two would give counts as one more pair of derivatives of each: a ratio, because
+        objects' derivatives differ in size, and the median, so that one object whose derivatives scatter wildly does
+        not hide those of others.
         """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):
@@ -70,9 +73,7 @@ class Average:
 
     @property
     def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
-        """The squares of derivatives' differences from their mean at one psi, beyond what their images explain, and the
-        degrees of freedom.
-        """
+        """Squared differences of derivatives from their mean at one psi, beyond those of images; degrees of freedom."""
         known = self.variances.isfinite().all(2)
         excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
         freedom = torch.zeros_like(excess)
@@ -103,7 +104,7 @@ class Average:
 
     @property
     def variance(self) -> Float[Tensor, "objects k"]:
-        """Of the mean's components."""
+        """Variances of the mean's components."""
         weights = self._weights
         known = self.variances.isfinite()
         each = torch.where(known, self.variances, 0.0) + self.between[:, None]
@@ -112,8 +113,10 @@ class Average:
 
     @property
     def p_values(self) -> Float[Tensor, "objects"]:
-        """Of the null that all components of the mean are equal: a chi-square test with k - 1 degrees of freedom, each
-        component over its own variance. 1 without observations, 0 without noise.
+        """P-values of the null that all components of the mean are equal.
+
+        By a chi-square test with k - 1 degrees of freedom, each component over its own variance. 1 without
+        observations, 0 without noise.
         """
         value, variance = self.value, self.variance
         exact = (variance == 0.0).all(1)

@@ -18,10 +18,14 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ProbeSet:
-    """``per_bin`` images of every bin of every factor of every object, bin after bin, with their features.
+    """A stratified sample: images of every bin of every factor of every object, with their features.
 
-    The bins of an illumination are its anchor lights. ``probes``, by object and by the factor's name, are rows of
-    ``cached``; empty for objects that were left out.
+    The bins of an illumination are its anchor lights.
+
+    Attributes:
+        probes: by object and by the factor's name, rows of ``cached``, bin after bin; empty for objects left out.
+        cached: the images' features.
+        per_bin: images of every bin.
     """
 
     probes: list[dict[str, Probes]]
@@ -54,8 +58,7 @@ class ProbeSet:
         return ProbeSet(probes, CachedSet.streamed(detector, backbone, drawn()), per_bin)
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """These probes with the next ``fresh.per_bin`` of every bin, cyclically by the iteration ``turn``, replaced by
-        ``fresh`` ones.
+        """Replace the next ``fresh.per_bin`` probes of every bin, cyclically by the iteration ``turn``.
 
         Raises:
             ValueError: for more fresh probes a bin than there are places.
