@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from PIL import Image
 
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.records import LearnedPsi
@@ -92,6 +93,7 @@ def test_the_target_s_distribution_is_known_where_it_is_rendered_or_stated(
 ):
     """Else no detector is called matched, and nothing can be drawn from it."""
     labels = tmp_path / "labels.json"
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     entry = {"id": 1, "file_name": "a.png", "height": 8, "width": 8}
     labels.write_text(json.dumps({"images": [entry], "annotations": [], "categories": []}))
     photographs = ["target=coco", f"target.annotations={labels}"] if target == "coco" else []

@@ -147,10 +147,10 @@ def test_a_report_has_rows_of_real_only_synthetic_only_and_both(folder, capsys):
             graph.compared(context.results(graph.learned))[row].trained
         ).cost.detector_steps
         assert steps == 16, row
-    shown = graph.compared(context.results(graph.learned))["views_only"].trained.shown(context.results)
-    for pictures, views in zip(shown.pictures, graph.views, strict=True):
+    of_views = graph.compared(context.results(graph.learned))["views_only"].trained
+    for subject, views in zip(context.results(of_views.scene).subjects, graph.views, strict=True):
         seen = context.results(views).images[:8]  # views.held_out=2 more are not trained on
-        area = pictures[..., 3].mean((1, 2))
+        area = subject.pictures[..., 3].mean((1, 2))
         torch.testing.assert_close(area, seen[..., 3].mean((1, 2)), atol=0.01, rtol=0.0)
 
 
