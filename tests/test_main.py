@@ -89,7 +89,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
         ("outer.iterations=many", "outer.iterations"),
         ("outer.iterations=0", "outer.iterations"),
         ("+outer.speed=3", "outer.speed: unknown key"),
-        ("outer.on_untrusted=ignore", "outer.trust.on_untrusted"),
+        ("outer.trust.on_untrusted=ignore", "outer.trust.on_untrusted"),
         ("outer.trust.shrink=2", "outer.trust.shrink"),
         ("solver.damping.margin=0", "solver.damping"),
         ("parameter.pose.temperature=0", "parameter.pose.temperature"),
