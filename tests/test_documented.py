@@ -91,6 +91,7 @@ def _known_keys():
         package = re.match(r"# @package (\S+)", path.read_text(encoding="utf-8"))
         place = package[1] if package else ".".join(path.relative_to(CONF).parent.parts)
         prefix = "" if place in ("_global_", "") else f"{place}."
+        yield place
         yield from _keys(OmegaConf.to_container(OmegaConf.load(path)), prefix)
 
 

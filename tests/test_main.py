@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from PIL import Image
 
 from neural_sim.main import OwnFolder, UserError, build, conf_directory, context_of
 
@@ -176,8 +177,9 @@ def test_experiments_set_no_key_that_a_scale_sets():
 def test_every_scale_goes_with_labelled_photographs(scale, tmp_path):
     annotations = tmp_path / "val.json"
     annotations.write_text(
-        json.dumps({"images": [{"id": 1, "file_name": "a"}], "categories": [], "annotations": []})
+        json.dumps({"images": [{"id": 1, "file_name": "a.png"}], "categories": [], "annotations": []})
     )
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     made = build(_config("target=coco", f"target.annotations={annotations}", f"scale={scale}"))
     assert made.imaging.target.annotations == str(annotations)
     assert made.training.image_size == made.config["budget"]["training"]["image_size"]

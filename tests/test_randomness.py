@@ -7,7 +7,7 @@ import torch
 
 from neural_sim.randomness import STREAMS, stream
 
-RUN = [name for name in STREAMS if name.partition(" ")[0] not in ("common", "certificate")]
+RUN = [name for name in STREAMS if name.partition(" ")[0] != "common"]
 
 
 def test_streams_keep_their_seeds():
@@ -16,14 +16,14 @@ def test_streams_keep_their_seeds():
     assert seeds == {
         "detector": 8_000_025, "psi": 8_000_026, "photographs": 8_000_027, "fine-tuning": 8_000_028,
         "target parts": 7, "target val": 16_000_024, "target test": 16_000_025, "target train": 16_000_026,
-        "common images": 16_000_024, "common training": 16_000_025, "certificate": 8,
+        "common images": 16_000_024, "common training": 16_000_025,
     }  # fmt: skip
 
 
 def test_a_parents_first_seed_is_added_whatever_was_drawn_from_it():
     parent = torch.Generator().manual_seed(100)
     torch.rand(3, generator=parent)
-    assert stream(0, "certificate", parent).initial_seed() == 101
+    assert stream(0, "common images", parent).initial_seed() == 100 + 2_000_003
     assert stream(2, "common training", parent).initial_seed() == 100 + 3 * 2_000_003 + 1
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from PIL import Image
 
 from neural_sim.main import UserError, _with, conf_directory, context_of
 from neural_sim.stages.reconstruction import ReconstructionStage
@@ -148,6 +149,8 @@ def _labels(folder):
         "categories": [],
     }
     path.write_text(json.dumps(document))
+    for image in document["images"]:
+        Image.new("RGB", (8, 8)).save(folder / image["file_name"])
     return path
 
 

@@ -62,7 +62,15 @@ def test_estimates_without_derivative_are_biased_by_the_whole_truth(scene):
         assert row.bias == pytest.approx(expected, rel=1e-2)
 
 
-@pytest.mark.parametrize("wrong", [{"values": ()}, {"values": (0.1, 0.0)}, {"rounds": 1}, {"draws": 0}])
-def test_bad_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match="temperatures"):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"values": ()}, r"Temperatures\.values: want 1 or more values, got \[\]"),
+        ({"values": (0.1, 0.0)}, r"Temperatures\.values\[1\]: want more than 0, got 0\.0"),
+        ({"rounds": 1}, r"Temperatures\.rounds: want at least 2, got 1"),
+        ({"draws": 0}, r"Temperatures\.draws: want at least 2, got 0"),
+    ],
+)
+def test_bad_settings_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
         Temperatures(**wrong)

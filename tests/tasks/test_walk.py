@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 from neural_sim.detector.metrics import evaluate
 from neural_sim.detector.saved import SavedDetector
 from neural_sim.detector.training import train_detector
-from neural_sim.main import conf_directory, context_of
+from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.randomness import stream
 from neural_sim.report import tracking
 from neural_sim.report.run_tracking import LiveRun
@@ -158,10 +158,10 @@ def test_photographs_that_cannot_be_used_are_refused_before_fields_are_fitted(fo
     target = ["target=coco", f"target.annotations={path}"]
     paths = [f"paths.store={tmp_path / 'store'}", f"paths.mlflow={folder / 'mlflow.db'}"]
     with initialize_config_dir(str(conf_directory()), version_base="1.3"):
-        context, steps = context_of(compose("config", [*small, *target, *paths]), tmp_path)
-    with pytest.raises(ValueError, match="not a readable image"):
-        walk(context, steps)
-    assert context.account.seconds.keys() <= {"target_sets"}
+        config = compose("config", [*small, *target, *paths])
+    with pytest.raises(UserError, match="not a readable image"):
+        context_of(config, tmp_path)
+    assert not (tmp_path / "store").exists()
 
 
 def test_weights_that_do_not_exist_are_refused_before_anything_is_made(folder, returned):
