@@ -1,4 +1,4 @@
-"""Where the configuration files are, and how what is wrong in them is told."""
+"""Find the configuration files, translate old keys, and word the errors in them."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ GONE: dict[str, str] = {
     "outer.certify_per_bin": "it belonged to outer.certify=retrained, which is a reference of the tests now",
     "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/numerics.md); boxes are fixed labels",
 }
-"""What to say of keys and choices (``key=value``) that no longer exist. A key stands for all keys below it, too."""
+"""The message for each key or choice (``key=value``) that no longer exists. A key stands for all keys below it, too."""
 
 MOVED: dict[str, str] = {
     "outer.steps=checked": "outer/steps=trust_region",

@@ -112,7 +112,7 @@ def ctrl_c_as_exception() -> Iterator[None]:
 
 
 class _Ending:
-    """What the first signal sets off; those after it change nothing."""
+    """The end of a command at its first signal; later ones change nothing."""
 
     def __init__(self) -> None:
         self.error: Interrupted | None = None

@@ -1,4 +1,4 @@
-"""What each anchor or point should predict, and the losses of what it does predict.
+"""Targets of anchors and points, and the losses of their predictions.
 
 Losses are elementwise and smooth, so that their Hessians say what a finite step sees.
 """
@@ -21,7 +21,7 @@ IGNORED = -2
 
 @dataclass(frozen=True)
 class Targets:
-    """What each anchor of each image should predict; the anchors of an anchor-free detector are its points.
+    """The class and the box that each anchor should predict; the anchors of an anchor-free detector are its points.
 
     ``labels`` is the class index of the anchor's box, ``BACKGROUND`` or ``IGNORED`` (overlap between the two
     thresholds). ``deltas`` is the box in the detector's code (of an anchor: centre shift in anchor sizes, log size

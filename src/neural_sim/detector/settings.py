@@ -13,10 +13,10 @@ from neural_sim.ranges import Ascending, Fraction, NonNegative, Positive, Positi
 
 Architecture = Literal["micro", "tiny", "resnet18", "resnet50"]
 Activation = Literal["silu", "relu"]
-"""Of backbone, pyramid and head; relu is torchvision's own."""
+"""The activation of backbone, pyramid and head; relu is torchvision's own."""
 BetweenZeroAndOne = Annotated[float, Gt(0), Lt(1)]
 Normalisation = Literal["group", "none"]
-"""Of the pyramid and the head, see :func:`backbones.group_norm`."""
+"""The normalisation of the pyramid and the head, see :func:`backbones.group_norm`."""
 BoxLoss = Literal["pseudo_huber", "l1"]
 ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
     "micro": (8, 16),

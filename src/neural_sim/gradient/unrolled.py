@@ -150,7 +150,7 @@ class Unrolled:
 
     @property
     def recording(self) -> Recording:
-        """What a training must record for it."""
+        """The parts of a training that this adjoint needs recorded."""
         return Recording(self.part, self.max_memory_mb)
 
     def doubts(self, adjoint: UnrolledAdjoint) -> list[str]:

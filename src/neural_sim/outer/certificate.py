@@ -28,7 +28,7 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 
 
 Actions = dict[str, dict[str, Action]]
-"""What happens to the steps, by object and factor. A trusted step waits where a checked loop does not take it yet."""
+"""The fate of each step, by object and factor. A trusted step waits where a trust region does not take it yet."""
 
 
 @validated
@@ -145,7 +145,7 @@ class Certificate:
 
     @property
     def stopped(self) -> bool:
-        """Whether the loop ends here."""
+        """True if the loop ends here."""
         return "stopped" in self._taken
 
     @property

@@ -1,4 +1,4 @@
-"""What a derivative by psi needs of rendered images: losses by row, the path from psi to an image, recorded steps."""
+"""Differentiate through rendered images: losses by row, the path from psi to an image, recorded steps."""
 
 from __future__ import annotations
 

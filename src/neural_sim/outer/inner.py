@@ -40,7 +40,7 @@ def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterat
 
 
 def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
-    """Whether images come from a pool: where images are not differentiated and the light is fixed."""
+    """Tell whether images come from a pool: they do where no image is differentiated and the light is fixed."""
     return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
@@ -69,7 +69,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class LoopInputs:
-    """What a psi loop begins with.
+    """The inputs of a psi loop.
 
     Attributes:
         detector: the detector.
@@ -205,7 +205,7 @@ class InnerLoop:
 
     @property
     def device(self) -> torch.device:
-        """Where the loop trains."""
+        """The device on which the loop trains."""
         return self.objective.cached.device
 
     @property

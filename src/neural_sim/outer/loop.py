@@ -1,4 +1,4 @@
-"""What all outer loops share: psi, an iteration's cost and record, the Trainer; and the loop of rewards."""
+"""The base of all outer loops (psi, costs, records, the Trainer), and the loop of rewards."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class OuterLoop(pl.LightningModule):
         return last
 
     def _lengths(self, values: Mapping[str, Tensor]) -> list[float]:
-        """By object, in the order of the scene's."""
+        """Return the length of each object's value, in the order of the scene's objects."""
         return [float(values[name].norm()) for name in self.scene.names] if values else []
 
 
