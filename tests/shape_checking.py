@@ -8,7 +8,7 @@ import inspect
 import typing
 
 import jaxtyping
-from beartype import beartype
+from beartype import BeartypeConf, beartype
 
 
 def checked(function):
@@ -21,7 +21,7 @@ def checked(function):
     if not shapes:
         return function
     function.__annotations__ = shapes
-    return beartype(function)
+    return beartype(function, conf=BeartypeConf(is_pep484_tower=True))
 
 
 def _resolved(hint, function):

@@ -109,10 +109,13 @@ class AppearanceField(RadianceField):
     def decode(
         self,
         raw: Float[Tensor, "samples channels"],
-        directions: Float[Tensor, "samples 3"],
+        directions: Float[Tensor, "samples 3"] | None,
         gain: Float[Tensor, "*samples width"],
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        """Density and colour of table rows under one gain, or one for each sample."""
+        """Return density and colour of table rows under one gain, or one for each sample.
+
+        A field without view dependence needs no directions.
+        """
         hidden = functional.silu(self.into(self.seen(raw, directions)))
         if gain.ndim == 1:
             logits = functional.linear(hidden, self.out.weight * gain, self.out.bias)
@@ -120,9 +123,12 @@ class AppearanceField(RadianceField):
             logits = self.out(hidden * gain)
         return self.grid.density(raw), torch.sigmoid(raw[:, 1:4] + logits)
 
-    def seen(self, raw: Tensor, directions: Tensor) -> Float[Tensor, "*samples inputs"]:
-        """What the head sees of table rows (or of their rates) and directions."""
-        return torch.cat([raw[..., 1:], directions], -1) if self.directed else raw[..., 1:]
+    def seen(self, raw: Tensor, directions: Tensor | None) -> Float[Tensor, "*samples inputs"]:
+        """Return the head's inputs from table rows (or their rates) and directions."""
+        if not self.directed:
+            return raw[..., 1:]
+        assert directions is not None
+        return torch.cat([raw[..., 1:], directions], -1)
 
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
@@ -180,7 +186,7 @@ class LitField(RadianceField):
         return self._decode(self.field.grid.raw(positions), directions)
 
     def _decode(
-        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]
+        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"] | None
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         return self.field.decode(raw, directions, self.gain)
 

@@ -202,12 +202,13 @@ class GridField(RadianceField):
         return functional.softplus(self.density_gain * raw[:, 0]) / self.edge
 
     def decode(
-        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"]
+        self, raw: Float[Tensor, "samples channels"], directions: Float[Tensor, "samples 3"] | None
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        """Density and colour of table rows."""
+        """Return density and colour of table rows; a field without view dependence needs no directions."""
         sigma = self.density(raw)
         if self.head is None:
             return sigma, torch.sigmoid(raw[:, 1:4])
+        assert directions is not None
         return sigma, torch.sigmoid(self.head(torch.cat([raw[:, 1:], directions], -1)))
 
     def query(
@@ -248,7 +249,7 @@ class GridField(RadianceField):
 
     @torch.no_grad()
     def trace_as(
-        self, decode: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
+        self, decode: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
         termination: float, span: Span | None, skip_empty: bool, surface: Surface | None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
         """``trace`` with density and colour of table rows by ``decode``; ``directed``: it wants samples' directions."""
@@ -256,9 +257,9 @@ class GridField(RadianceField):
         extinction = Extinction(len(rays.origins), termination, rays.origins)
 
         def visit(wave: Wave) -> Tensor:
-            directions = rays.directions
+            directions = None
             if directed:
-                directions = directions.index_select(0, wave.ray.index_select(0, wave.row))
+                directions = rays.directions.index_select(0, wave.ray.index_select(0, wave.row))
             sigma, rgb = decode(self._raw_of(wave), directions)
             optical = sigma * self.step
             depth, reached, alive = extinction.enter(wave, optical)
