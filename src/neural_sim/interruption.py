@@ -8,12 +8,14 @@ hears of the signal at once, says that the process ends and after ``LIMIT`` seco
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 
 from typing_extensions import override
@@ -109,6 +111,45 @@ def ctrl_c_as_exception() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def this_process() -> str:
+    """Return a name of this process that no other one ever has: its host and boot, namespace, number and start."""
+    return f"{_machine()} {_namespace()} {os.getpid()} {_start_of(os.getpid())}"
+
+
+def has_ended(process: str) -> bool:
+    """Tell whether the process of a :func:`this_process` has ended; False where this one cannot know."""
+    try:
+        machine, namespace, pid, start = process.split(" ")
+    except ValueError:
+        return False
+    if not start or machine.partition("/")[0] != platform.node():
+        return False
+    if machine != _machine():  # the host has started again since
+        return True
+    return namespace == _namespace() and _start_of(int(pid)) != start
+
+
+def _machine() -> str:
+    with suppress(OSError):
+        return f"{platform.node()}/{Path('/proc/sys/kernel/random/boot_id').read_text().strip()}"
+    return f"{platform.node()}/"
+
+
+def _namespace() -> str:
+    """Return in which count of processes numbers are: containers of one host have their own."""
+    with suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
+
+
+def _start_of(pid: int) -> str:
+    """Return when a process began, in ticks since the boot; empty where there is none, or no /proc."""
+    with suppress(OSError, IndexError):
+        # The name, in parentheses, may have spaces; the start is the 20th field after it (proc(5)).
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    return ""
 
 
 class _Ending:

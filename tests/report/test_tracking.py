@@ -7,6 +7,7 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
+from neural_sim.interruption import this_process
 from neural_sim.report import tracking
 
 
@@ -159,6 +160,56 @@ def test_runs_come_back_with_their_files_the_latest_first(uri, tmp_path):
     assert found[1].fetch("b.json").read_text() == "0"
     with pytest.raises(ValueError, match=r"no experiment 'other', only \['gap'\]"):
         tracking.logged_runs(uri, "other")
+
+
+def test_runs_of_processes_that_are_gone_are_closed_by_the_next(uri, caplog):
+    """A run as kill -9 leaves it, one of a living process, one of another machine, and one of another program."""
+    client = tracking.connect(uri)
+    machine, space, pid, start = this_process().split(" ")
+    owners = {
+        "dead": f"{machine} {space} {pid} {int(start) - 1}",
+        "before the last boot": f"{machine}0 {space} {pid} {start}",
+        "alive": this_process(),
+        "in another container": f"{machine} {space}0 {pid} 1",
+        "elsewhere": f"other/{machine.partition('/')[2]} {space} 1 1",
+        "unknown": "",
+    }
+    runs = {
+        name: client.create_run(
+            "0", tags={**tracking.SOURCE, tracking.PROCESS: owner}, run_name=name
+        ).info.run_id
+        for name, owner in owners.items()
+    }
+    runs["foreign"] = client.create_run("0", tags={tracking.PROCESS: owners["dead"]}).info.run_id
+    with caplog.at_level("INFO"), opened(uri) as run:
+        assert client.get_run(run.run_id).info.status == "RUNNING"
+    status = {name: client.get_run(run_id).info.status for name, run_id in runs.items()}
+    assert status == {
+        "dead": "KILLED", "before the last boot": "KILLED", "alive": "RUNNING",
+        "in another container": "RUNNING", "elsewhere": "RUNNING", "unknown": "RUNNING", "foreign": "RUNNING",
+    }  # fmt: skip
+    assert f"run {runs['dead']} (dead) is KILLED" in caplog.text
+    assert client.get_run(runs["dead"]).data.tags["error"] == "its process ended without closing it"
+
+
+def test_a_run_that_kill_9_left_open_is_closed(uri):
+    worker = subprocess.Popen([sys.executable, "-c", KILLED, uri], stdout=subprocess.PIPE, text=True)
+    assert worker.stdout.readline() == "open\n"
+    worker.kill()
+    worker.wait()
+    (left,) = tracking.logged_runs(uri, "gap")
+    assert left.status == "RUNNING"
+    assert tracking.close_abandoned(tracking.connect(uri)) == [left.run_id]
+    assert [run.status for run in tracking.logged_runs(uri, "gap")] == ["KILLED"]
+
+
+KILLED = """
+import sys, time
+from neural_sim.report import tracking
+with tracking.opened(sys.argv[1], "gap", "killed", {}, {}):
+    print("open", flush=True)
+    time.sleep(600)
+"""
 
 
 WORKER = """

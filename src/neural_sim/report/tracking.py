@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neural_sim.interruption import Interrupted, last_act
+from neural_sim.interruption import Interrupted, has_ended, last_act, this_process
 from neural_sim.report.provenance import commit
 
 _log = logging.getLogger(__name__)
@@ -26,6 +26,10 @@ TRAINING = "workflowType=machine_learning"
 COMMIT = "mlflow.source.git.commit"
 """The tag from which MLflow shows the commit of a run's code, or ``UNKNOWN``."""
 UNKNOWN = "unknown"
+SOURCE = {"source": "neural-sim"}
+"""The tag of every run that this program opens."""
+PROCESS = "neural-sim.process"
+"""The tag that says which process opened a run."""
 BATCH = 100
 """Rows of one kind in a request; MLflow takes no more parameters at once."""
 
@@ -163,6 +167,7 @@ def opened(
     """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after SIGTERM or Ctrl-C.
 
     A new SQLite store is created, and every store written to, under a lock, so that workers of a sweep can share it.
+    Runs that a killed process of this machine left open are closed first, see :func:`close_abandoned`.
 
     Args:
         uri: of the store.
@@ -183,8 +188,9 @@ def opened(
         try:
             client = connect(uri)
             with _guard(uri):
+                close_abandoned(client)
                 experiment_id = _experiment_id(client, uri, experiment)
-                tags = {**tags, "source": "neural-sim", COMMIT: commit() or UNKNOWN}
+                tags = {**tags, **SOURCE, PROCESS: this_process(), COMMIT: commit() or UNKNOWN}
                 created = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
         except MlflowException as error:
             raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error
@@ -197,6 +203,27 @@ def opened(
         run.close("KILLED" if _interrupted(error) else "FAILED", error)
         raise
     run.close("FINISHED")
+
+
+def close_abandoned(client: Any) -> list[str]:
+    """End runs of processes of this machine that no longer exist: killed outright, they could not do it themselves.
+
+    Returns:
+        The ids of the runs, which are now KILLED; a line in the log names each.
+    """
+    source = " and ".join(f"tags.{key} = '{value}'" for key, value in SOURCE.items())
+    ids = [experiment.experiment_id for experiment in client.search_experiments()]
+    found = client.search_runs(ids, f"attributes.status = 'RUNNING' and {source}") if ids else []
+    closed: list[str] = []
+    for run in found:
+        if has_ended(run.data.tags.get(PROCESS, "")):
+            client.set_tag(run.info.run_id, "error", "its process ended without closing it")
+            client.set_terminated(run.info.run_id, "KILLED")
+            _log.info(
+                "mlflow: run %s (%s) is KILLED: its process is gone", run.info.run_id, run.info.run_name
+            )
+            closed.append(run.info.run_id)
+    return closed
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
