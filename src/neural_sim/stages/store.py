@@ -44,6 +44,23 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Audit:
+    """What lies in a store.
+
+    Attributes:
+        sound: entries whose content is what was written.
+        damaged: the others.
+        left: files that are no entries: half written by killed runs, or set aside as damaged.
+        bytes: size of the sound entries.
+    """
+
+    sound: list[Path]
+    damaged: list[Path]
+    left: list[Path]
+    bytes: int
+
+
+@dataclass(frozen=True)
 class Store:
     """Results under ``root/<kind>/<key>.pt``, with the key's description beside each as JSON."""
 
@@ -86,6 +103,24 @@ class Store:
         """Whether there is a file of the result; it is not read."""
         return self._path(kind, key).is_file()
 
+    def audit(self) -> Audit:
+        """Check the content of every entry against its sum, and list what is no entry; nothing is changed."""
+        sound, damaged, size = [], [], 0
+        for path in sorted(self.root.glob("*/[!.]*.pt")):
+            try:
+                with path.open("rb") as file:
+                    _checked_header(file)
+                    size += file.seek(0, os.SEEK_END)
+                sound.append(path)
+            except (_Damage, OSError):
+                damaged.append(path)
+        left = [
+            *self.root.glob("*/.*.pt.*"),
+            *self.root.glob("*/.*.json.*"),
+            *self.root.glob(f"*/*{DAMAGED}"),
+        ]
+        return Audit(sound, damaged, sorted(left), size)
+
     def _path(self, kind: str, key: str) -> Path:
         return self.root / kind / f"{key}.pt"
 
@@ -118,12 +153,7 @@ def _read(path: Path) -> Entry | None:
     """Return an entry, None where there is none. Raises :class:`_Damage`."""
     try:
         with path.open("rb") as file:
-            header = file.readline(len(_header("", 0)))
-            if not header.startswith(_HEADER[:16].encode()):
-                raise _Damage("it has no sum of its content, as entries of older versions")
-            if header != _header(_sha256(file), file.tell() - len(header)):
-                raise _Damage("its content is not what its first line says")
-            file.seek(len(header))
+            file.seek(_checked_header(file))
             stored = torch.load(file, weights_only=True)
     except FileNotFoundError:
         return None
@@ -135,6 +165,16 @@ def _read(path: Path) -> Entry | None:
     if not isinstance(stored, dict) or stored.keys() != {"value", "seconds"}:
         raise _Damage(f"it holds a {type(stored).__name__}, want value and seconds")
     return Entry(stored["value"], stored["seconds"], reused=True)
+
+
+def _checked_header(file: BinaryIO) -> int:
+    """Return the length of an entry's first line, of which the rest is found true. Raises :class:`_Damage`."""
+    header = file.readline(len(_header("", 0)))
+    if not header.startswith(_HEADER[:16].encode()):
+        raise _Damage("it has no sum of its content, as entries of older versions")
+    if header != _header(_sha256(file), file.tell() - len(header)):
+        raise _Damage("its content is not what its first line says")
+    return len(header)
 
 
 def _save(content: Mapping[str, Any], file: BinaryIO) -> None:
