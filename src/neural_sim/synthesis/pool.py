@@ -24,7 +24,7 @@ from neural_sim.types import PinholeCamera, SceneDraw
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
     """Return the number of combinations of bins, and of maps of each that give every bin at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
-    return cells, math.ceil(per_bin * max(factor.bins for factor in factors) / cells)
+    return cells, math.ceil(per_bin * max((factor.bins for factor in factors), default=1) / cells)
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,15 @@ class PooledSubject:
         return RenderedObject(self.drawn.select(index), maps[..., :3], maps[..., 3])
 
 
-def pool_of(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
+def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> Scene:
     """Render at least ``per_bin`` maps of every bin of every factor and object, and return a scene that draws these.
+
+    Args:
+        scene: of fields.
+        per_bin: maps of every bin; also of every anchor light, if ``lights``.
+        generator: of what the bins do not say.
+        lights: render each map under lights of random weights, Dirichlet with parameter 1/2, instead of refusing lights
+            that move. Draws from this pool then follow psi in their bins, not in their light.
 
     Raises:
         ValueError: for fewer than one, or a light that moves with psi.
@@ -104,11 +111,14 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
     if per_bin < 1:
         raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
     distribution = scene.distribution
-    if distribution.lights:
+    if distribution.lights and not lights:
         raise ValueError("outer.pool_per_bin: a pool has no images under a light that moves, want 0")
     factors = distribution.binned
     cells, per_cell = pool_cells(factors, per_bin)
-    every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
+    per_cell = max(per_cell, math.ceil(per_bin * distribution.lights / cells))
+    every = torch.zeros(1, 0, dtype=torch.long)
+    if factors:
+        every = torch.cartesian_prod(*(torch.arange(factor.bins) for factor in factors)).view(cells, -1)
     bins = every.repeat_interleave(per_cell, 0)
     named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
     subjects = []
@@ -116,8 +126,17 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
         # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
         noise = distribution.draw_noise(per_cell, generator, subject.dtype)
         noise = noise.select(torch.arange(per_cell).repeat(cells))
-        part = scene.render(label, distribution.at_bins(named, noise))
+        draw = distribution.at_bins(named, noise)
+        if distribution.lights:
+            draw = replace(draw, weights=_mixed_lights(len(draw), distribution.lights, generator))
+        part = scene.render(label, draw)
         maps = torch.cat([part.rgb, part.opacity[..., None]], -1)
         pooled = (maps * 255).round().to(torch.uint8)
         subjects.append(PooledSubject(subject.name, pooled, part.draw, per_cell))
     return replace(scene, subjects=tuple(subjects))
+
+
+def _mixed_lights(count: int, lights: int, generator: torch.Generator) -> Float[Tensor, "count lights"]:
+    """Draw weights from the Dirichlet distribution with parameter 1/2: squares of normal numbers, normalised."""
+    squares = torch.randn(count, lights, generator=generator).square()
+    return squares / squares.sum(-1, keepdim=True)

@@ -1,0 +1,156 @@
+"""Crops about labelled boxes with what the box itself says, and augmentations that cover what renders lack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated
+
+import torch
+from annotated_types import Ge, Le
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import affine_grid, avg_pool2d, grid_sample
+from torchvision.ops import roi_align
+
+from neural_sim.ranges import Fraction, NonNegative, validated
+from neural_sim.types import LabelledImages
+
+SIDE = 32
+"""Pixels a side of what the network sees."""
+MARGIN = 1.5
+"""Side of a stored crop in sides of the box, so that a turn or a shift finds pixels."""
+_STORED = 44
+_SHOWN = 1.1  # side of what the network sees, in sides of the box
+BOX_NUMBERS = 5
+"""Numbers that describe a box."""
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Square crops about boxes.
+
+    Attributes:
+        pixels: in [0, 1], ``MARGIN`` sides of the box across; what lies outside of the image is grey.
+        boxes: logarithms of width and height as fractions of the image's, the centre from -1 to 1, and whether the box
+            touches the border.
+        labels: class of each.
+        rows: its image in the set.
+    """
+
+    pixels: Float[Tensor, "n 3 side side"]
+    boxes: Float[Tensor, "n numbers"]
+    labels: Int[Tensor, "n"]
+    rows: Int[Tensor, "n"]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def select(self, index: Tensor) -> Crops:
+        """Select some."""
+        return Crops(*(getattr(self, part.name)[index] for part in fields(Crops)))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Crops]) -> Crops:
+        """Join several sets."""
+        return Crops(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Crops)))
+
+
+def crops_of(images: LabelledImages, whole: bool) -> Crops:
+    """Cut out all labelled boxes, image by image; the whole images where boxes mean nothing (``whole``)."""
+    rows, columns = images.present.nonzero().unbind(1)
+    height, width = images.images.shape[-2:]
+    edges = images.boxes.new_tensor([width, height, width, height])
+    boxes = images.boxes[rows, columns]
+    if whole:
+        boxes = (edges * edges.new_tensor([0.0, 0.0, 1.0, 1.0])).expand(len(rows), 4)
+    size = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1.0)
+    centre = 0.5 * (boxes[:, :2] + boxes[:, 2:])
+    half = 0.5 * MARGIN * size.amax(1, keepdim=True)
+    regions = torch.cat([rows[:, None].to(boxes), centre - half, centre + half], 1)
+    # Around the image lies grey: a crop is of what is there minus grey, plus grey.
+    ratio = max(1, round(float(2.0 * half.median()) / _STORED)) if len(rows) else 1
+    pixels = roi_align(images.images - 0.5, regions, _STORED, sampling_ratio=ratio, aligned=True) + 0.5
+    touches = ((boxes < 1.0) | (boxes > edges - 1.0))[:, :2].any(1) | (boxes[:, 2:] > edges[2:] - 1.0).any(1)
+    numbers = torch.cat(
+        [(size / edges[2:]).log(), 2.0 * centre / edges[2:] - 1.0, touches[:, None].to(boxes)], 1
+    )
+    return Crops(pixels, numbers, images.labels[rows, columns], rows)
+
+
+@validated
+@dataclass(frozen=True)
+class Augmentation:
+    """Changes of crops at random, so that renders cover what photographs have.
+
+    Args:
+        roll_deg: largest turn in the image plane either way, in degrees; 180 for cameras held at any roll.
+        exposure: largest change of brightness either way, in stops; contrast and colour change with it.
+        blur: largest part of a crop's detail that is lost.
+        noise: largest standard deviation of pixel noise.
+        occlusion: part of the crops of which a rectangle is hidden.
+        jitter: largest error of a box's sides, as a part of them.
+    """
+
+    roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0
+    exposure: NonNegative = 0.5
+    blur: Fraction = 0.8
+    noise: Fraction = 0.04
+    occlusion: Fraction = 0.3
+    jitter: Annotated[float, Ge(0), Le(0.5)] = 0.08
+
+    def __call__(self, crops: Crops, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return what the network sees of the crops, and the numbers of their boxes."""
+        n, like = len(crops), crops.pixels
+
+        def either(*shape: int) -> Tensor:
+            return (2.0 * torch.rand((n, *shape), generator=generator) - 1.0).to(like)
+
+        zoom, shift = self.jitter * either(), self.jitter * either(2)
+        seen = _sampled(like, math.radians(self.roll_deg) * either(), zoom.exp(), shift)
+        soft = avg_pool2d(
+            avg_pool2d(seen, 3, 1, 1, count_include_pad=False), 3, 1, 1, count_include_pad=False
+        )
+        seen = seen + self.blur * either(1, 1, 1).abs() * (soft - seen)
+        gain = (math.log(2.0) * self.exposure * (either(1, 1, 1) + 0.2 * either(3, 1, 1))).exp()
+        mean = seen.mean((2, 3), keepdim=True)
+        seen = (mean + (seen - mean) * (0.3 * self.exposure * either(1, 1, 1)).exp()) * gain
+        seen = seen + self.noise * either(1, 1, 1).abs() * torch.randn(seen.shape, generator=generator).to(
+            seen
+        )
+        seen = self._hidden(seen, generator).clamp(0.0, 1.0)
+        numbers = crops.boxes.clone()
+        numbers[:, :2] += zoom[:, None] + 0.5 * self.jitter * either(2)
+        numbers[:, 2:4] += self.jitter * either(2)
+        return seen - 0.5, numbers
+
+    def _hidden(self, seen: Tensor, generator: torch.Generator) -> Tensor:
+        n, at = len(seen), torch.arange(SIDE) + 0.5
+        u = torch.rand((5, n, 1), generator=generator)
+        across = (at - SIDE * u[0]).abs() < SIDE * (0.08 + 0.17 * u[1])
+        down = (at - SIDE * u[2]).abs() < SIDE * (0.08 + 0.17 * u[3])
+        covers = (across[:, None, :] & down[:, :, None] & (u[4] < self.occlusion)[..., None])[:, None]
+        other = seen[torch.randperm(n, generator=generator)].flip(
+            3
+        )  # of another crop: something, not a colour
+        return torch.where(covers.to(seen.device), other, seen)
+
+
+def plain(crops: Crops) -> tuple[Tensor, Tensor]:
+    """Return what the network sees of crops as they are, and the numbers of their boxes."""
+    zero = crops.pixels.new_zeros(len(crops))
+    seen = _sampled(crops.pixels, zero, zero + 1.0, torch.stack([zero, zero], 1))
+    return seen - 0.5, crops.boxes
+
+
+def _sampled(pixels: Tensor, roll: Tensor, zoom: Tensor, shift: Tensor) -> Float[Tensor, "n 3 side side"]:
+    """Sample the middle of stored crops, turned, scaled and shifted (in sides of the box)."""
+    if not len(pixels):
+        return pixels.new_zeros(0, 3, SIDE, SIDE)
+    scale = _SHOWN / MARGIN * zoom
+    cosine, sine = scale * roll.cos(), scale * roll.sin()
+    moved = shift / MARGIN
+    matrix = torch.stack([cosine, -sine, moved[:, 0], sine, cosine, moved[:, 1]], -1).view(-1, 2, 3)
+    grid = affine_grid(matrix, [len(pixels), 3, SIDE, SIDE], align_corners=False)
+    return grid_sample(pixels, grid, padding_mode="border", align_corners=False)

@@ -1,0 +1,106 @@
+"""psi read off a target's labelled boxes, in seconds and without a detector: the estimate by label shift.
+
+    estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
+
+Renders of all bins, from a pool that is rendered once, train a small classifier of bins (:mod:`.network`); it reads the
+target's boxes, and expectation maximisation over its calibrated posteriors (:mod:`mixture`) gives the distribution of
+every object and factor, with an interval for each bin, a test against where psi stands, and a test of fit
+(:mod:`evidence`). ``Estimate.psi`` moves only where both tests allow it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.baseline.label_shift.crops import crops_of
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.mixture import Cells
+from neural_sim.baseline.label_shift.network import BinNetwork
+from neural_sim.baseline.label_shift.reading import Reader
+from neural_sim.baseline.label_shift.renders import known_crops, parted, pool_for
+from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.synthesis.scene import Scene
+from neural_sim.types import LabelledImages
+
+Groups = Mapping[str, Mapping[str, Sequence[Sequence[int]]]]
+"""Bins, numbered from 1, that an object's symmetry makes the same, by object and factor."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the target shows.
+
+    Attributes:
+        factors: object by object, each factor of psi.
+        psi: where it stands now, with what moves moved.
+        images: that were rendered or composed.
+        cpu_seconds: spent, by what: pool, images, network, evidence.
+    """
+
+    factors: tuple[FactorEstimate, ...]
+    psi: Float[Tensor, "objects K"]
+    images: int = 0
+    cpu_seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the target shows, for people."""
+        return [one.sentence for one in self.factors]
+
+
+@dataclass
+class _Clock:
+    spent: dict[str, float] = field(default_factory=dict)
+    last: float = field(default_factory=time.process_time)
+
+    def __call__(self, what: str) -> None:
+        now = time.process_time()
+        self.spent[what], self.last = self.spent.get(what, 0.0) + now - self.last, now
+
+
+def estimate(
+    scene: Scene,
+    validation: LabelledImages,
+    psi: Float[Tensor, "objects K"],
+    settings: LabelShift,
+    generator: torch.Generator,
+    groups: Groups | None = None,
+    whole: bool = False,
+) -> Estimate:
+    """Read psi off the boxes of ``validation``.
+
+    Args:
+        scene: of pooled renders (:func:`~neural_sim.synthesis.pool.pool_of`), or of fields, of which a pool is rendered
+            here.
+        validation: labelled images of the target.
+        psi: where it stands.
+        settings: how.
+        generator: of everything that is drawn.
+        groups: bins that look the same; None: every bin looks different.
+        whole: read whole images instead of boxes, for ``task=classification``.
+    """
+    clock = _Clock()
+    pool = pool_for(scene, settings.per_bin, generator)
+    clock("pool")
+    sides = parted(pool, settings.held_out)
+    training, held = (known_crops(part, settings.compositions, generator, whole) for part in sides)
+    clock("images")
+    distribution = scene.distribution
+    cells = Cells(tuple(f.bins for f in distribution.binned))
+    network = BinNetwork.drawn(len(scene.names), cells.count, distribution.lights, generator)
+    settings.fitting(training, network, settings.augmentation, generator)
+    clock("network")
+    target = crops_of(validation.to("cpu"), whole)
+    reader = Reader(settings, distribution, network, training, held, target, generator)
+    found, moved = [], psi.detach().cpu().double().clone()
+    for label, name in enumerate(scene.names):
+        own, moved[label] = reader.read(label, name, moved[label], (groups or {}).get(name, {}))
+        found += own
+    clock("evidence")
+    return Estimate(tuple(found), moved, len(training.crops) + len(held.crops), clock.spent)

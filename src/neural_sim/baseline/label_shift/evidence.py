@@ -1,0 +1,136 @@
+"""What a target shows of one object and factor, and how far that can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+Finding = Literal["moves", "stays", "fits no render", "too few boxes"]
+
+
+@dataclass(frozen=True)
+class Span:
+    """Probabilities ``p`` with the ends of their intervals."""
+
+    p: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @staticmethod
+    def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
+        """Return intervals that cover this part of the draws."""
+        tail = 0.5 * (1.0 - covered)
+        ends = (p, drawn.quantile(tail, 0), drawn.quantile(1.0 - tail, 0))
+        return Span(*(tuple(end.tolist()) for end in ends))
+
+
+@dataclass(frozen=True)
+class FactorEstimate:
+    """One object's distribution of a factor as the target's boxes show it.
+
+    Attributes:
+        name: the object.
+        factor: of psi.
+        boxes: that were read.
+        p: probabilities of the bins, or weights of the lights, most probable.
+        low: lower ends of their intervals.
+        high: upper ends.
+        groups: bins (from 1) that look the same; their parts of a group's probability are psi's.
+        p_value: of the null that the target is where psi stands.
+        strange: part of the boxes that look like fewer than 5 % of the renders do.
+        accuracy: part of held-out renders whose group of bins is told right; None for lights.
+        finding: whether psi ``moves`` to it; ``stays``, since the target may be where psi stands; or does not move
+            because too many boxes look like no render, or there are too few.
+    """
+
+    name: str
+    factor: str
+    boxes: int
+    p: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    groups: tuple[tuple[int, ...], ...]
+    p_value: float
+    strange: float
+    accuracy: float | None
+    finding: Finding
+
+    @property
+    def sentence(self) -> str:
+        """What the target shows, for people."""
+        if self.finding == "too few boxes":
+            return f"{self.name}: {self.boxes} boxes are too few to read its {self.factor} off"
+        if self.finding == "fits no render":
+            return (
+                f"{self.name}: {self.strange:.0%} of its boxes look like no render of it (5 % would), so its "
+                f"{self.factor} is not read off them"
+            )
+        shown = ", ".join(
+            f"{_called(group)} ({self.low[group[0] - 1]:.2f} to {self.high[group[0] - 1]:.2f})"
+            for group in self._largest
+        )
+        ending = (
+            f"; psi stays, it may be right already (p = {self.p_value:.2g})"
+            if self.finding == "stays"
+            else ""
+        )
+        return f"your target shows the {self.name} from {self.factor} {shown}{ending}"
+
+    @property
+    def _largest(self) -> list[tuple[int, ...]]:
+        """The groups that make up most, at most three."""
+        ordered = sorted(self.groups, key=lambda group: -sum(self.p[b - 1] for b in group))
+        shown, total = [], 0.0
+        for group in ordered[:3]:
+            shown.append(group)
+            total += sum(self.p[b - 1] for b in group)
+            if total > 0.75:
+                break
+        return shown
+
+
+def _called(group: Sequence[int]) -> str:
+    return ("bin " if len(group) == 1 else "bins ") + "/".join(str(b) for b in group)
+
+
+@dataclass(frozen=True)
+class Strangeness:
+    """How far features are from those of renders: the Mahalanobis distance to the nearest cell (Lee et al. 2018).
+
+    Attributes:
+        means: of the features of every cell's renders.
+        precision: inverse of the covariance that all cells have in common.
+    """
+
+    means: Float[Tensor, "cells d"]
+    precision: Float[Tensor, "d d"]
+
+    @staticmethod
+    def of(features: Float[Tensor, "n d"], cells: Int[Tensor, "n"], shrinkage: float = 0.1) -> Strangeness:
+        """Fit means and covariance, which is drawn towards a multiple of the identity by ``shrinkage``."""
+        own, index = cells.unique(return_inverse=True)
+        counts = torch.bincount(index, minlength=len(own)).to(features)
+        means = (
+            features.new_zeros(len(own), features.shape[1]).index_add_(0, index, features) / counts[:, None]
+        )
+        left = features - means[index]
+        covariance = left.T @ left / max(len(features) - len(own), 1)
+        size = covariance.diagonal().mean().clamp_min(1e-12)
+        eye = torch.eye(len(covariance), dtype=features.dtype)
+        return Strangeness(means, torch.linalg.inv((1.0 - shrinkage) * covariance + shrinkage * size * eye))
+
+    def __call__(self, features: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
+        """Compute the squared distance of each."""
+        apart = features[:, None, :] - self.means
+        return (apart @ self.precision * apart).sum(-1).amin(-1)
+
+    def part_above(self, quantile: float, known: Float[Tensor, "n d"], seen: Float[Tensor, "m d"]) -> float:
+        """Return the part of ``seen`` that is farther away than the quantile of ``known``; 0 of none."""
+        if not len(seen) or not len(known):
+            return 0.0
+        return float((self(seen) > self(known).quantile(quantile)).double().mean())

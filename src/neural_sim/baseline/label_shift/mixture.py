@@ -1,0 +1,241 @@
+"""The mixture of bins that explains a sample: expectation maximisation, posterior draws and a test (pure functions).
+
+A classifier trained on renders of equally frequent cells c (a bin of every factor) gives the posterior q(c | x) of a
+box x, in proportion to the likelihood p(x | c). Boxes of the target are a mixture p(x) = sum_c p_c p(x | c), whose
+maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 2002, Eq. 2.10)
+
+    p_c <- mean_n r_n(c),    r_n(c) = p_c q(c | x_n) / sum_d p_d q(d | x_n).
+
+Here p is a product of the factors' distributions, so each factor's is the margin of the r_n, and a Dirichlet prior adds
+``prior`` boxes to every bin.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+Probabilities = tuple[Float[Tensor, "*batch k"], ...]
+"""Of every factor's bins."""
+
+
+class Status(enum.Enum):
+    """How an expectation maximisation ended."""
+
+    CONVERGED = "no probability changes by more than the tolerance"
+    MAX_STEPS = "step budget spent: the likelihood is flat, so the bins cannot be told apart"
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """The mixture found.
+
+    Attributes:
+        p: of every factor.
+        log_likelihood: of the boxes, relative to that of the classifier's constant.
+        status: of the search.
+        steps: taken.
+    """
+
+    p: Probabilities
+    log_likelihood: Float[Tensor, "*batch"]
+    status: Status
+    steps: int
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The combinations of ``sizes`` bins of the factors, the last factor's bins changing fastest."""
+
+    sizes: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of combinations."""
+        return int(np.prod(self.sizes))
+
+    def joint(self, p: Probabilities) -> Float[Tensor, "*batch cells"]:
+        """Multiply the factors' probabilities."""
+        whole = p[0]
+        for own in p[1:]:
+            whole = (whole[..., :, None] * own[..., None, :]).flatten(-2)
+        return whole
+
+    def margins(self, counts: Float[Tensor, "*batch cells"]) -> Probabilities:
+        """Sum up what lies in every bin of each factor."""
+        table = counts.unflatten(-1, self.sizes)
+        first = counts.ndim - 1
+        axes = range(first, first + len(self.sizes))
+        return tuple(
+            table.sum([axis for axis in axes if axis != own]) if len(axes) > 1 else table for own in axes
+        )
+
+    def bins(self, index: Int[Tensor, "n"]) -> tuple[Int[Tensor, "n"], ...]:
+        """Return every factor's bins in given combinations."""
+        return tuple(torch.unravel_index(index, self.sizes))
+
+    def index(self, bins: Int[Tensor, "n factors"]) -> Int[Tensor, "n"]:
+        """Return the combinations of given bins."""
+        index = torch.zeros(len(bins), dtype=torch.long)
+        for own, size in zip(bins.unbind(1), self.sizes, strict=True):
+            index = index * size + own
+        return index
+
+
+def grouped(
+    likelihood: Float[Tensor, "boxes cells"], cells: Cells, within: Sequence[Float[Tensor, "k groups"]]
+) -> Float[Tensor, "boxes merged"]:
+    """Merge bins that cannot be told apart.
+
+    Args:
+        likelihood: of each box in every cell.
+        cells: the combinations of bins.
+        within: of every factor, column g the distribution over the bins of group g.
+
+    Returns:
+        The likelihood in every combination of groups.
+    """
+    table = likelihood.unflatten(-1, cells.sizes)
+    for axis, matrix in enumerate(within, 1):
+        table = (table.movedim(axis, -1) @ matrix.to(table)).movedim(-1, axis)
+    return table.flatten(1)
+
+
+def maximise(
+    likelihood: Float[Tensor, "*batch boxes cells"],
+    cells: Cells,
+    prior: float,
+    fixed: Mapping[int, Float[Tensor, "k"]] | None = None,
+    steps: int = 1000,
+    tolerance: float = 1e-7,
+) -> Mixed:
+    """Find the most probable mixture by expectation maximisation from equal probabilities.
+
+    Args:
+        likelihood: of each box in every cell, up to a factor for each box; not negative, one above 0 in every box.
+        cells: the combinations of bins.
+        prior: boxes that the Dirichlet prior adds to every bin.
+        fixed: distributions that are given, by the position of their factor.
+        steps: at most.
+        tolerance: largest change of a probability in the last step.
+    """
+    like = likelihood.double()
+    batch, fixed = like.shape[:-2], fixed or {}
+    p = tuple(
+        fixed[i].double().expand(*batch, size) if i in fixed else like.new_full((*batch, size), 1.0 / size)
+        for i, size in enumerate(cells.sizes)
+    )
+    status, taken = Status.MAX_STEPS, steps
+    for step in range(1, steps + 1):
+        counts = _expected(like, cells.joint(p))
+        new = tuple(
+            old if i in fixed else _normalised(own + prior)
+            for i, (old, own) in enumerate(zip(p, cells.margins(counts), strict=True))
+        )
+        change = max(float((a - b).abs().max()) for a, b in zip(new, p, strict=True))
+        p = new
+        if change <= tolerance:
+            status, taken = Status.CONVERGED, step
+            break
+    return Mixed(p, log_likelihood(like, cells.joint(p)), status, taken)
+
+
+def log_likelihood(
+    likelihood: Float[Tensor, "*batch boxes cells"], joint: Float[Tensor, "*batch cells"]
+) -> Float[Tensor, "*batch"]:
+    """Compute the logarithm of the boxes' likelihood in a mixture."""
+    return (likelihood * joint[..., None, :]).sum(-1).clamp_min(1e-300).log().sum(-1)
+
+
+def _expected(like: Tensor, joint: Tensor) -> Float[Tensor, "*batch cells"]:
+    weighted = like * joint[..., None, :]
+    return (weighted / weighted.sum(-1, keepdim=True).clamp_min(1e-300)).sum(-2)
+
+
+def _normalised(counts: Tensor) -> Tensor:
+    return counts / counts.sum(-1, keepdim=True)
+
+
+def posterior(
+    likelihood: Float[Tensor, "boxes cells"],
+    cells: Cells,
+    prior: float,
+    generator: torch.Generator,
+    chains: int = 100,
+    burn: int = 40,
+    kept: int = 10,
+) -> Probabilities:
+    """Draw mixtures from their posterior by Gibbs sampling: cells of the boxes given p, then p given their numbers.
+
+    The Dirichlet prior has the parameter ``prior`` + 1, whose mode :func:`maximise` finds.
+
+    Returns:
+        ``chains`` x ``kept`` draws of every factor's probabilities, [draws, k].
+    """
+    like = likelihood.double()
+    random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
+    p = tuple(like.new_full((chains, size), 1.0 / size) for size in cells.sizes)
+    drawn: list[Probabilities] = []
+    for step in range(burn + kept):
+        weighted = (like * cells.joint(p)[:, None, :]).cumsum(-1)
+        level = torch.from_numpy(random.random((chains, len(like)))) * weighted[..., -1]
+        chosen = (weighted <= level[..., None]).sum(-1).clamp_max(cells.count - 1)
+        counts = torch.zeros(chains, cells.count, dtype=torch.float64)
+        counts.scatter_add_(1, chosen, torch.ones(chosen.shape, dtype=torch.float64))
+        p = tuple(
+            _normalised(torch.from_numpy(random.standard_gamma((own + 1.0 + prior).numpy())))
+            for own in cells.margins(counts)
+        )
+        if step >= burn:
+            drawn.append(p)
+    return tuple(torch.cat(own) for own in zip(*drawn, strict=True))
+
+
+def ratio_test(
+    likelihood: Float[Tensor, "boxes cells"],
+    cells: Cells,
+    null: Mapping[int, Float[Tensor, "k"]],
+    known: tuple[Float[Tensor, "m cells"], Int[Tensor, "m"]],
+    prior: float,
+    draws: int,
+    generator: torch.Generator,
+) -> float:
+    """Compute the p-value of the null that some factors have given distributions, by parametric bootstrap.
+
+    The statistic is twice the logarithm of the ratio of likelihoods. Under the null it is that of as many boxes of the
+    ``known`` ones, with cells drawn from the null (and for other factors from what fits best under it): what the
+    classifier gets wrong there, it gets wrong here.
+
+    Args:
+        likelihood: of each box in every cell.
+        cells: the combinations of bins.
+        null: the distributions that are tested, by the position of their factor.
+        known: boxes of known cells: their likelihoods, and their cells. Every cell has one at least.
+        prior: see :func:`maximise`.
+        draws: of the bootstrap; the smallest p-value is 1 / (``draws`` + 1).
+        generator: of all draws.
+    """
+    observed, under = _statistic(likelihood[None], cells, null, prior)
+    joint = cells.joint(tuple(own[0] for own in under))
+    known_likelihood, known_cells = known
+    weights = joint[known_cells] / torch.bincount(known_cells, minlength=cells.count)[known_cells]
+    rows = torch.multinomial(weights, draws * len(likelihood), replacement=True, generator=generator)
+    drawn, _ = _statistic(known_likelihood[rows].view(draws, *likelihood.shape), cells, null, prior)
+    return (1 + int((drawn >= observed).sum())) / (draws + 1)
+
+
+def _statistic(
+    likelihood: Tensor, cells: Cells, null: Mapping[int, Tensor], prior: float
+) -> tuple[Float[Tensor, "batch"], Probabilities]:
+    free = maximise(likelihood, cells, prior, tolerance=1e-5, steps=300)
+    if len(null) == len(cells.sizes):
+        p = tuple(null[i].double()[None] for i in range(len(null)))
+        return 2.0 * (free.log_likelihood - log_likelihood(likelihood.double(), cells.joint(p))), p
+    held = maximise(likelihood, cells, prior, null, tolerance=1e-5, steps=300)
+    return 2.0 * (free.log_likelihood - held.log_likelihood), held.p

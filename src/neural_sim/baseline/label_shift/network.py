@@ -1,0 +1,195 @@
+"""The classifier of bins: one small network for all objects, told which object a crop shows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy, mse_loss
+
+from neural_sim.baseline.label_shift.crops import BOX_NUMBERS, Augmentation, Crops, plain
+from neural_sim.ranges import Positive, PositiveInt, validated
+
+_WIDTHS = (24, 48, 64, 96)
+_FEATURES = 96
+_OF_BOX = 24
+
+
+@dataclass(frozen=True)
+class Known:
+    """Crops of renders, whose scene parameters are known.
+
+    Attributes:
+        crops: the crops.
+        cells: each one's combination of bins.
+        weights: each one's weights of the lights, without columns where the light is fixed.
+    """
+
+    crops: Crops
+    cells: Int[Tensor, "n"]
+    weights: Float[Tensor, "n lights"]
+
+    def select(self, index: Tensor) -> Known:
+        """Select some."""
+        return Known(self.crops.select(index), self.cells[index], self.weights[index])
+
+
+class PerObject(nn.Module):
+    """A linear layer whose weights are an object's own."""
+
+    def __init__(self, objects: int, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(objects, outputs, inputs) / math.sqrt(inputs))
+        self.bias = nn.Parameter(torch.zeros(objects, outputs))
+
+    def forward(self, values: Float[Tensor, "n i"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n o"]:
+        """Apply each crop's object's layer."""
+        return torch.einsum("noi,ni->no", self.weight[labels], values) + self.bias[labels]
+
+
+class BinNetwork(nn.Module):
+    """From a crop, its box and its object to logits of the cells and weights of the lights.
+
+    Convolutions are common to all objects; each scales and shifts their last features, reads its boxes by a layer of
+    its own and ends in one.
+    """
+
+    @staticmethod
+    def drawn(objects: int, cells: int, lights: int, generator: torch.Generator) -> BinNetwork:
+        """Return an untrained network."""
+        with torch.random.fork_rng([]):
+            torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+            return BinNetwork(objects, cells, lights)
+
+    def __init__(self, objects: int, cells: int, lights: int) -> None:
+        super().__init__()
+        self.cells = cells
+        layers: list[nn.Module] = []
+        for i, (inputs, outputs) in enumerate(zip((3, *_WIDTHS), _WIDTHS, strict=False)):
+            size = 5 if i == 0 else 3
+            stride = 1 if i == len(_WIDTHS) - 1 else 2
+            layers += [
+                nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False),
+                nn.BatchNorm2d(outputs),
+                nn.ReLU(),
+            ]
+        self.convolutions = nn.Sequential(*layers)
+        self.joined = nn.Linear(_WIDTHS[-1] * 16, _FEATURES)
+        self.style = nn.Embedding(objects, 2 * _FEATURES)
+        nn.init.zeros_(self.style.weight)
+        self.box = PerObject(objects, BOX_NUMBERS, _OF_BOX)
+        self.last = PerObject(objects, _FEATURES + _OF_BOX, cells + lights)
+
+    def forward(
+        self,
+        seen: Float[Tensor, "n 3 side side"],
+        boxes: Float[Tensor, "n numbers"],
+        labels: Int[Tensor, "n"],
+    ) -> tuple[Float[Tensor, "n cells"], Float[Tensor, "n lights"], Float[Tensor, "n features"]]:
+        """Return logits of the cells, weights of the lights, and the features that they are read from."""
+        image = self.joined(self.convolutions(seen).flatten(1))
+        scale, shift = self.style(labels).chunk(2, -1)
+        features = torch.cat([image * (1.0 + scale) + shift, self.box(boxes, labels)], -1).relu()
+        outputs = self.last(features, labels)
+        return outputs[:, : self.cells], outputs[:, self.cells :], features
+
+
+@validated
+@dataclass(frozen=True)
+class Fitting:
+    """How the network is trained.
+
+    Args:
+        epochs: over all crops.
+        batch_size: crops a step.
+        learning_rate: of Adam at its highest, in one cycle.
+        weight_decay: decoupled.
+    """
+
+    epochs: PositiveInt = 12
+    batch_size: PositiveInt = 64
+    learning_rate: Positive = 4e-3
+    weight_decay: Positive = 1e-2
+
+    def __call__(
+        self,
+        known: Known,
+        network: BinNetwork,
+        augmentation: Augmentation,
+        generator: torch.Generator,
+    ) -> None:
+        """Train the network in place on augmented crops."""
+        steps = self.epochs * math.ceil(len(known.crops) / self.batch_size)
+        optimiser = torch.optim.AdamW(
+            network.parameters(), self.learning_rate, weight_decay=self.weight_decay
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, self.learning_rate, total_steps=steps)
+        network.train()
+        for _ in range(self.epochs):
+            order = torch.randperm(len(known.crops), generator=generator)
+            for rows in order.tensor_split(steps // self.epochs):
+                part = known.select(rows)
+                seen, boxes = augmentation(part.crops, generator)
+                logits, weights, _ = network(seen, boxes, part.crops.labels)
+                loss = cross_entropy(logits, part.cells) if network.cells > 1 else logits.sum() * 0.0
+                if part.weights.shape[1]:
+                    loss = loss + 10.0 * mse_loss(weights, part.weights)
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a network says of crops: logits of the cells, guesses of the lights' weights, features behind both."""
+
+    logits: Float[Tensor, "n cells"]
+    weights: Float[Tensor, "n lights"]
+    features: Float[Tensor, "n features"]
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+@torch.no_grad()
+def outputs_of(network: BinNetwork, crops: Crops) -> Outputs:
+    """Apply the network to crops as they are, float64."""
+    network.eval()
+    seen, boxes = plain(crops)
+    rows = torch.arange(len(crops)).split(256)
+    parts = [network(seen[part], boxes[part], crops.labels[part]) for part in rows]
+    return Outputs(*(torch.cat(part).double() for part in zip(*parts, strict=True)))
+
+
+def calibrate(
+    logits: Float[Tensor, "n cells"], cells: Int[Tensor, "n"], ridge: float = 1.0
+) -> tuple[float, Float[Tensor, "cells"]]:
+    """Find the temperature and the biases that make held-out posteriors calibrated (Alexandari et al. 2020, BCTS).
+
+    Args:
+        logits: of held-out renders of one object.
+        cells: their true ones.
+        ridge: weight of the biases' squares, in renders; keeps those of few renders near 0.
+
+    Returns:
+        Calibrated logits are ``logits`` / temperature + biases.
+    """
+    log_t = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    bias = torch.zeros(logits.shape[1], dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([log_t, bias], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        loss = (
+            cross_entropy(logits * (-log_t).exp() + bias, cells, reduction="sum")
+            + ridge * bias.square().sum()
+        )
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    return float(log_t.detach().exp()), bias.detach() - bias.detach().mean()

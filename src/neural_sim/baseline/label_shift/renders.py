@@ -1,0 +1,69 @@
+"""Crops of renders whose scene parameters are known, from a pool of all bins that is rendered once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from neural_sim.baseline.label_shift.crops import Crops, crops_of
+from neural_sim.baseline.label_shift.mixture import Cells
+from neural_sim.baseline.label_shift.network import Known
+from neural_sim.synthesis.pool import PooledSubject, pool_of
+from neural_sim.synthesis.scene import Scene
+
+
+def pool_for(scene: Scene, per_bin: int, generator: torch.Generator) -> Scene:
+    """Return the scene itself where its renders are pooled, else one of renders of all its bins and lights."""
+    if all(isinstance(subject, PooledSubject) for subject in scene.subjects):
+        return scene
+    return pool_of(scene, per_bin, generator, lights=scene.distribution.lights > 0)
+
+
+def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
+    """Part the renders of every cell in those to train on and those held out."""
+    sides: tuple[list[PooledSubject], list[PooledSubject]] = ([], [])
+    for subject in pool.subjects:
+        assert isinstance(subject, PooledSubject)
+        count = min(max(1, round(held_out * subject.per_cell)), subject.per_cell - 1)
+        if count < 1:
+            raise ValueError(
+                f"label_shift: want two renders of every combination of bins, got {subject.per_cell}"
+            )
+        within = torch.arange(len(subject.maps)) % subject.per_cell
+        for side, rows, each in zip(
+            sides, (within >= count, within < count), (subject.per_cell - count, count), strict=True
+        ):
+            index = rows.nonzero()[:, 0]
+            maps = subject.maps[index.to(subject.maps.device)]
+            side.append(PooledSubject(subject.name, maps, subject.drawn.select(index), each))
+    return replace(pool, subjects=tuple(sides[0])), replace(pool, subjects=tuple(sides[1]))
+
+
+def known_crops(part: Scene, compositions: int, generator: torch.Generator, whole: bool) -> Known:
+    """Compose images of uniform bins over fresh backgrounds and cut out their boxes."""
+    distribution, subject = part.distribution, part.subjects[0]
+    assert isinstance(subject, PooledSubject)
+    psi = distribution.uniform.expand(len(part.subjects), -1)
+    parts: list[Known] = []
+    for _ in range(compositions):
+        drawn = part.training_set(psi, len(subject.maps), generator)
+        crops = crops_of(drawn.images.to("cpu"), whole)
+        place = torch.full((len(part.subjects), len(drawn)), -1)
+        for label, rows in enumerate(drawn.rows):
+            place[label, rows] = torch.arange(len(rows))
+        index = place[crops.labels, crops.rows]
+        chosen = torch.zeros(len(crops), len(distribution.binned), dtype=torch.long)
+        weights = torch.zeros(len(crops), distribution.lights)
+        for label, own in enumerate(drawn.objects):
+            mine = crops.labels == label
+            chosen[mine] = own.draw.bins[index[mine]]
+            if own.draw.weights is not None:
+                weights[mine] = own.draw.weights[index[mine]].float()
+        cell = Cells(tuple(f.bins for f in distribution.binned)).index(chosen)
+        parts.append(Known(crops, cell, weights))
+    return Known(
+        Crops.concatenate([p.crops for p in parts]),
+        torch.cat([p.cells for p in parts]),
+        torch.cat([p.weights for p in parts]),
+    )

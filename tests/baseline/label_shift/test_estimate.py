@@ -1,0 +1,152 @@
+"""The whole estimate on painted objects, whose bins show as the place of a bright patch."""
+
+import pytest
+import torch
+
+from neural_sim.baseline.label_shift.crops import Augmentation
+from neural_sim.baseline.label_shift.estimate import LabelShift, estimate
+from neural_sim.baseline.label_shift.network import Fitting
+from neural_sim.parameter.distributions import total_variation
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.parameter.zoom import Zoom
+from neural_sim.synthesis.background import ProceduralClutter
+from neural_sim.synthesis.pool import PooledSubject
+from neural_sim.synthesis.scene import Scene
+from neural_sim.synthesis.synthesizer import Synthesizer
+from neural_sim.types import PinholeCamera
+
+SIDE, EACH = 48, 24
+COLOURS = {"lamp": (0.9, 0.8, 0.2), "cup": (0.2, 0.8, 0.9)}
+SETTINGS = LabelShift(fitting=Fitting(epochs=8), draws=99)
+
+
+def painted(name, distribution):
+    """A pool of grey squares, as large as the zoom's bin says, with a patch where the pose's bin says."""
+    factors, generator = distribution.binned, torch.Generator().manual_seed(len(name))
+    cells = torch.cartesian_prod(*(torch.arange(f.bins) for f in factors)).view(-1, len(factors))
+    bins = cells.repeat_interleave(EACH, 0)
+    noise = distribution.draw_noise(len(bins), generator)
+    draw = distribution.at_bins({f.name: own for f, own in zip(factors, bins.unbind(1), strict=True)}, noise)
+    maps = torch.zeros(len(bins), SIDE, SIDE, 4, dtype=torch.uint8)
+    for row, own in enumerate(bins):
+        half = 13 if len(factors) == 1 else (16, 8)[own[1]]
+        low, high = SIDE // 2 - half, SIDE // 2 + half
+        maps[row, low:high, low:high] = torch.tensor([90, 90, 90, 255], dtype=torch.uint8)
+        down, across = divmod(int(own[0]), 2)
+        patch = torch.tensor([int(255 * c) for c in COLOURS[name]] + [255], dtype=torch.uint8)
+        top, left = low + down * half, low + across * half
+        maps[row, top + 2 : top + half - 2, left + 2 : left + half - 2] = patch
+    return PooledSubject(name, maps, draw, EACH)
+
+
+def scene_of(*parameters, **synthesis):
+    distribution = SceneDistribution.of(parameters)
+    subjects = tuple(painted(name, distribution) for name in COLOURS)
+    synthesizer = Synthesizer(ProceduralClutter(), **synthesis)
+    return Scene(subjects, PinholeCamera(SIDE, SIDE, 0.7), synthesizer, distribution)
+
+
+def target_of(scene, p, count=40, seed=7):
+    """Images of the target, of an object whose first factor has the probabilities ``p`` and of one at psi's."""
+    psi = scene.distribution.uniform.expand(2, -1).clone()
+    factor = scene.distribution.factors[0]
+    psi[0, : factor.size] = factor.psi_of(torch.tensor(p, dtype=torch.float64))
+    return scene.training_set(psi, count, torch.Generator().manual_seed(seed)).images
+
+
+P = [0.7, 0.1, 0.1, 0.1]
+
+
+@pytest.fixture(scope="module")
+def posed():
+    scene = scene_of(Pose(bins=4))
+    return scene, target_of(scene, P), scene.distribution.uniform.expand(2, -1)
+
+
+def read(scene, target, psi, **more):
+    return estimate(scene, target, psi, SETTINGS, torch.Generator().manual_seed(0), **more)
+
+
+@pytest.fixture(scope="module")
+def found(posed):
+    return read(*posed)
+
+
+def test_the_object_that_differs_moves_to_what_its_boxes_show_and_the_other_stays(posed, found):
+    lamp, cup = found.factors
+    assert float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) < 0.1
+    assert lamp.finding == "moves" and lamp.p_value <= 0.05
+    assert all(low <= p <= high for low, p, high in zip(lamp.low, P, lamp.high, strict=True))
+    assert cup.finding == "stays" and cup.p_value > 0.05
+    distribution = posed[0].distribution
+    p = distribution.probabilities(found.psi)["pose"][0]
+    torch.testing.assert_close(p, torch.tensor(lamp.p, dtype=torch.float64), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(found.psi[1], distribution.uniform)
+
+
+def test_the_sentence_says_the_bin_with_its_interval(found):
+    lamp = found.factors[0]
+    assert f"the lamp from pose bin 1 ({lamp.low[0]:.2f} to {lamp.high[0]:.2f})" in lamp.sentence
+    assert "psi stays" in found.factors[1].sentence
+
+
+def test_the_same_seed_gives_the_same_estimate(posed, found):
+    assert read(*posed).factors == found.factors
+
+
+def test_boxes_that_look_like_no_render_move_nothing(posed):
+    scene, target, psi = posed
+    noise = torch.rand(target.images.shape, generator=torch.Generator().manual_seed(1))
+    strange = type(target)(noise, target.boxes, target.labels, target.bins)
+    result = read(scene, strange, psi)
+    assert {one.finding for one in result.factors} == {"fits no render"}
+    torch.testing.assert_close(result.psi, psi.double())
+    assert "look like no render" in result.factors[0].sentence
+
+
+def test_bins_that_look_the_same_are_one_group_whose_parts_are_those_of_psi(posed):
+    scene, target, psi = posed
+    result = read(scene, target, psi, groups={"lamp": {"pose": [[1, 2], [3, 4]]}})
+    lamp = result.factors[0]
+    assert lamp.p[0] == pytest.approx(lamp.p[1]) and lamp.p[2] == pytest.approx(lamp.p[3])
+    assert sum(lamp.p[:2]) == pytest.approx(0.8, abs=0.12)
+
+
+def test_few_boxes_move_nothing(posed):
+    scene, target, psi = posed
+    result = read(scene, target.select(torch.arange(5)), psi)
+    assert [one.finding for one in result.factors] == ["too few boxes"] * 2
+    assert [one.boxes for one in result.factors] == [5, 0]
+
+
+def test_whole_images_and_several_objects_an_image_are_read_too():
+    scene = scene_of(Pose(bins=4), objects_per_image=(1, 2), shift=0.4)
+    target, psi = target_of(scene, P, 60), scene.distribution.uniform.expand(2, -1)
+    lamp = read(scene, target, psi).factors[0]
+    assert lamp.boxes > 60 and lamp.finding == "moves"
+    scene = scene_of(Pose(bins=4), shift=0.0)
+    lamp = read(scene, target_of(scene, P), psi, whole=True).factors[0]
+    assert lamp.finding == "moves" and float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) < 0.15
+
+
+def test_products_are_read_by_the_joint_posterior_and_every_factor_is_tested():
+    scene = scene_of(Pose(bins=4), Zoom(bins=2))
+    result = read(scene, target_of(scene, P, 60), scene.distribution.uniform.expand(2, -1))
+    findings = {(one.name, one.factor): one.finding for one in result.factors}
+    assert findings == {
+        ("lamp", "pose"): "moves",
+        ("lamp", "zoom"): "stays",
+        ("cup", "pose"): "stays",
+        ("cup", "zoom"): "stays",
+    }
+
+
+def test_augmented_crops_keep_their_shape_and_differ(posed):
+    from neural_sim.baseline.label_shift.crops import crops_of, plain
+
+    crops = crops_of(posed[1], whole=False)
+    seen, boxes = Augmentation(roll_deg=180.0, occlusion=1.0)(crops, torch.Generator().manual_seed(0))
+    still, own = plain(crops)
+    assert seen.shape == still.shape and boxes.shape == own.shape
+    assert bool(seen.isfinite().all()) and float((seen - still).abs().mean()) > 0.02
