@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torchvision.models import get_model, get_model_weights, resnet
 from torchvision.ops import FrozenBatchNorm2d
+from typing_extensions import override
 
 from neural_sim.detector.settings import SAVED
 
@@ -24,7 +25,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def group_norm(channels: int) -> nn.GroupNorm:
-    """Groups of 8 channels: the batch plays no part, so that an image's loss is its own."""
+    """Normalise in groups of 8 channels, without the batch, so that an image's loss depends on no other image."""
     return nn.GroupNorm(max(1, channels // 8), channels)
 
 
@@ -38,7 +39,7 @@ def set_activation(module: nn.Module, activation: str) -> None:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside the identity; width and size stay."""
+    """Two convolutions added to their input; width and size stay."""
 
     def __init__(self, channels: int, activation: str) -> None:
         super().__init__()
@@ -52,6 +53,7 @@ class ResidualBlock(nn.Module):
         )
         self.activation = act()
 
+    @override
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         return self.activation(x + self.body(x))
 
@@ -89,6 +91,7 @@ class Stages(nn.Module):
         self._under, self._ends, self.strides, self.channels = under, dict(ends), strides, dict(channels)
         self.add_module(under, nn.ModuleDict(children))
 
+    @override
     def forward(self, x: Float[Tensor, "n c h w"]) -> tuple[Tensor, ...]:
         maps = {}
         for name, child in self.get_submodule(self._under).named_children():
@@ -98,8 +101,9 @@ class Stages(nn.Module):
         return tuple(maps[stride] for stride in self.strides)
 
     def divided(self, layers: int) -> tuple[Stages, LastStages]:
-        """The backbone as two, of which the second has the last ``layers`` stages. They share its parameters, and each
-        has those that it needs by their own names.
+        """Divide the backbone in two, the second with the last ``layers`` stages.
+
+        Both share its parameters, each those that it needs, under their own names.
 
         Raises:
             ValueError: not at least 1 stage, or not fewer than there are.
@@ -127,20 +131,22 @@ class Stages(nn.Module):
 
 
 class LastStages(nn.Module):
-    """The last stages of a backbone, from the maps of the first ones to all that the whole backbone gives; parameters
-    ``backbone.*``. Of the first ones' maps, the last is continued, and the first ``kept`` are the backbone's own.
+    """The last stages of a backbone, which turn the maps of the first stages into all maps; parameters ``backbone.*``.
+
+    The last of the given maps is continued; the first ``kept`` are among the backbone's maps as they are.
     """
 
     def __init__(self, stages: Stages, kept: int) -> None:
         super().__init__()
         self.backbone, self._kept = stages, kept
 
+    @override
     def forward(self, maps: Sequence[Tensor]) -> tuple[Tensor, ...]:
         return (*maps[: self._kept], *self.backbone(maps[-1]))
 
 
 def strided_backbone(plan: Plan, strides: tuple[int, ...], activation: str) -> Stages:
-    """Four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
+    """Build four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
     stages: dict[str, nn.Module] = {}
     before = 3
     for number, (after, residual) in enumerate(zip(plan.widths, plan.residual, strict=True)):
@@ -160,7 +166,7 @@ def strided_backbone(plan: Plan, strides: tuple[int, ...], activation: str) -> S
 def resnet_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
 ) -> Stages:
-    """A torchvision ResNet without its classifier.
+    """Build a torchvision ResNet without its classifier.
 
     With weights its batch normalisation is frozen; without, group normalisation stands in its place, because
     a frozen normalisation that has seen no data normalises nothing.
@@ -179,7 +185,7 @@ def resnet_backbone(
 
 
 def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
-    """State dictionary of a torchvision ResNet, without the classifier and counters.
+    """Load the state dictionary of a torchvision ResNet, without the classifier and counters.
 
     ``weights`` is the path of a file holding such a state dictionary, else one of torchvision's weight names
     (``DEFAULT``, ``IMAGENET1K_V1``, ...), which torchvision downloads or takes from its cache.
@@ -216,7 +222,7 @@ def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
 def build_backbone(
     architecture: str, strides: tuple[int, ...], activation: str, weights: str | None
 ) -> Stages:
-    """The backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
+    """Build a backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
 
     Raises:
         ValueError: for weights that do not exist or do not fit.

@@ -18,7 +18,7 @@ from neural_sim.types import LabelledImages
 def cached_features(
     detector: Detector, backbone: Parameters, images: Tensor, batch_size: int = 64
 ) -> tuple[Tensor, ...]:
-    """Feature maps [n, channels, height, width] of all images [n, 3, H, W] in [0, 1], one tensor for each level.
+    """Compute feature maps [n, channels, height, width] of images [n, 3, H, W] in [0, 1], one tensor for each level.
 
     They are computed batch by batch on the backbone's device, without a graph.
 
@@ -34,8 +34,12 @@ def cached_features(
 
 @dataclass(frozen=True)
 class CachedSet:
-    """Features of n images under the frozen backbone, one tensor [n, ...] for each level, and the targets of their
-    anchors: the inputs of the predictor's loss.
+    """The inputs of the predictor's loss on n images, under a frozen backbone.
+
+    Attributes:
+        detector: the detector.
+        features: one tensor [n, ...] for each level.
+        targets: those of the images' anchors.
     """
 
     detector: Detector
@@ -49,7 +53,7 @@ class CachedSet:
     def of(
         detector: Detector, backbone: Parameters, images: LabelledImages, batch_size: int = 64
     ) -> CachedSet:
-        """The features and targets of ``images``, on the backbone's device; the images may be on another."""
+        """Compute features and targets of ``images`` on the backbone's device; the images may be on another."""
         features = cached_features(detector, backbone, images.images, batch_size)
         device = features[0].device
         return CachedSet(
@@ -60,8 +64,12 @@ class CachedSet:
     def streamed(
         detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
     ) -> CachedSet:
-        """As of one set of all images, in the same batches, with no more images in memory than one of ``sets`` and a
-        batch. Raises ``ValueError`` for no set.
+        """Do as :meth:`of` with all images in one set, in the same batches.
+
+        No more images are in memory than one of ``sets`` and a batch.
+
+        Raises:
+            ValueError: no set.
         """
         parts: list[CachedSet] = []
         waiting: list[LabelledImages] = []
@@ -77,7 +85,7 @@ class CachedSet:
 
     @staticmethod
     def concatenate(parts: Sequence[CachedSet]) -> CachedSet:
-        """The images of all ``parts``, of one detector and size, one after the other."""
+        """Join the images of all ``parts``, which are of one detector and size."""
         targets = Targets(
             torch.cat([part.targets.labels for part in parts]),
             torch.cat([part.targets.deltas for part in parts]),
@@ -91,11 +99,11 @@ class CachedSet:
         return self.targets.labels.device
 
     def losses(self, params: Parameters, index: Tensor) -> Float[Tensor, "n"]:
-        """Losses of the images ``index``."""
+        """Compute the losses of the images ``index``."""
         return self.detector.losses_of(self.outputs(params, index), self.targets.select(index))
 
     def outputs(self, params: Parameters, index: Tensor) -> Outputs:
-        """The detector's outputs on the images ``index``."""
+        """Compute the detector's outputs on the images ``index``."""
         return self.detector.outputs(params, tuple(level[index] for level in self.features))
 
     @property
@@ -106,18 +114,18 @@ class CachedSet:
     def losses_from(
         self, params: Parameters, inputs: tuple[Tensor, ...], index: Tensor
     ) -> Float[Tensor, "n"]:
-        """Losses of the images ``index`` from given rows of :attr:`inputs`, differentiable in these."""
+        """Compute losses of the images ``index`` from given rows of :attr:`inputs`, differentiable in these."""
         targets = Targets(self.targets.labels[index], inputs[-1])
         return self.detector.per_image_loss(params, inputs[:-1], targets)
 
     def select(self, index: Tensor) -> CachedSet:
-        """The set of the images ``index``."""
+        """Return the set of the images ``index``."""
         index = index.to(self.device)
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))
 
     def replaced(self, index: Tensor, others: CachedSet) -> CachedSet:
-        """The set with the images ``index`` replaced by ``others``."""
+        """Return the set with the images ``index`` replaced by ``others``."""
         place = index.to(self.device)
         features = tuple(
             level.index_copy(0, place, new) for level, new in zip(self.features, others.features, strict=True)
@@ -127,12 +135,12 @@ class CachedSet:
         return CachedSet(self.detector, features, Targets(labels, deltas))
 
     def double(self) -> CachedSet:
-        """The same in float64."""
+        """Return the set in float64."""
         targets = Targets(self.targets.labels, self.targets.deltas.double())
         return CachedSet(self.detector, tuple(level.double() for level in self.features), targets)
 
     def mean_terms(self, chunk_size: int = 32) -> list[Callable[[Parameters], Tensor]]:
-        """The mean loss as a sum of terms, each of at most ``chunk_size`` images."""
+        """Return the mean loss as a sum of terms, each of at most ``chunk_size`` images."""
         count = len(self.targets)
         return [
             lambda params, rows=rows: self.losses(params, rows).sum() / count

@@ -25,8 +25,9 @@ from neural_sim.ranges import NonNegative, validated
 
 @validated
 class Classifier(BackboneDetector):
-    """Classifies images of one size, each of which shows one object. An image without an object (label -1) has no
-    loss.
+    """A classifier of images of one size that show one object each.
+
+    An image without an object (label -1) has no loss.
 
     See :class:`BackboneDetector` for the arguments, which it checks.
     """
@@ -47,8 +48,9 @@ class Classifier(BackboneDetector):
         self._predictor = nn.Sequential(OrderedDict(head=nn.Linear(self._widths[0], num_classes)))
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """The backbone's last map, averaged over the image, [n, c]; in the psi loop, where its last stages
-        train, the map before them.
+        """Average the backbone's last map over the image, [n, c].
+
+        In the psi loop, which trains the last stages, return the map before them.
 
         Raises:
             ValueError: where the images are not of the classifier's size.
@@ -57,14 +59,14 @@ class Classifier(BackboneDetector):
         return (maps.mean((2, 3)) if self._last is None else maps,)
 
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
-        """Logits [n, 1, classes], and for the box a code of zeros [n, 1, 4], which says nothing."""
+        """Return logits [n, 1, classes], and for the box a code of zeros [n, 1, 4], which says nothing."""
         predictor, (values,) = self.completed(trainable, features)
         pooled = values if self._last is None else values.mean((2, 3))
         logits = functional_call(self._predictor, predictor, (pooled,), strict=True)[:, None]
         return logits, logits.new_zeros((*logits.shape[:2], 4))
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """The class of each image's boxes, ``IGNORED`` without one.
+        """Return the class of each image's boxes, ``IGNORED`` without one.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or an image shows objects of two classes.
@@ -75,13 +77,13 @@ class Classifier(BackboneDetector):
         return Targets(classes, boxes.new_zeros((len(classes), 1, 4)))
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Cross-entropy of each image's class, 0 for an image without one."""
+        """Compute the cross-entropy of each image's class, 0 for an image without one."""
         logits, labels = outputs[0][:, 0], targets.labels
         wanted = logits.gather(1, labels.clamp(min=0))[:, 0]
         return (logits.logsumexp(1) - wanted) * (labels[:, 0] >= 0)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n 1 classes"]:
-        """The logits of softmax probabilities, log p / (1 - p)."""
+        """Return the logits of softmax probabilities, log(p / (1 - p))."""
         logits = outputs[0]
         itself = torch.eye(logits.shape[-1], dtype=torch.bool, device=logits.device)
         others = torch.where(itself, -torch.inf, logits[..., None, :]).logsumexp(-1)
@@ -90,13 +92,13 @@ class Classifier(BackboneDetector):
     def decode(
         self, code: Float[Tensor, "*n 4"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:
-        """The whole image."""
+        """Return the whole image as the box."""
         height, width = self.image_size
         return torch.zeros_like(code) + code.new_tensor([0.0, 0.0, width, height])
 
 
 def class_of(labels: Int[Tensor, "n boxes"]) -> Int[Tensor, "n"]:
-    """The class of each image, -1 for an image without a box.
+    """Return the class of each image, -1 for an image without a box.
 
     Raises:
         ValueError: an image with boxes of two classes.

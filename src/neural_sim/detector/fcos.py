@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchvision.models.detection.fcos import FCOSClassificationHead, FCOSRegressionHead
 from torchvision.ops import clip_boxes_to_image
+from typing_extensions import override
 
 from neural_sim.detector.backbones import group_norm
 from neural_sim.detector.losses import Targets, assign_points, focal_loss
@@ -29,9 +30,11 @@ from neural_sim.ranges import NonNegative, PositiveInt, validated
 
 
 class FcosHead(nn.Module):
-    """torchvision's two branches; the code is the distances to the left, upper, right and lower side of the box in
-    strides, and the centre-ness logit. Distances are positive by softplus, where torchvision's ReLU has no curvature
-    and at negative values no gradient; ``activation`` relu keeps that.
+    """torchvision's two branches.
+
+    The code has the distances to the left, upper, right and lower side of the box in strides, and the centre-ness
+    logit. Softplus keeps distances positive: torchvision's ReLU, which ``activation`` relu keeps, has no curvature, and
+    no gradient at negative values.
     """
 
     def __init__(self, settings: Head, num_classes: int, activation: str) -> None:
@@ -50,6 +53,7 @@ class FcosHead(nn.Module):
                         layer.bias = None
         self.positive = F.relu if activation == "relu" else F.softplus
 
+    @override
     def forward(self, levels: list[Tensor]) -> dict[str, Tensor]:
         codes, head = [], self.regression_head
         for level in levels:
@@ -95,7 +99,7 @@ class Fcos(PyramidDetector):
         self.ranges = _of_points(points.ranges(min(self.image_size)), self.anchors_per_level)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Targets of every point, see :func:`losses.assign_points`.
+        """Assign a target to every point, see :func:`losses.assign_points`.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.
@@ -105,8 +109,10 @@ class Fcos(PyramidDetector):
         return assign_points(points, strides, ranges, boxes, labels, self._radius)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Focal loss, loss of the generalised intersection over union (Rezatofighi et al. 2019) and centre-ness loss of
-        each image, each a sum over points by the number of foreground points.
+        """Add up the focal, box and centre-ness losses of each image.
+
+        The box loss is that of the generalised intersection over union (Rezatofighi et al. 2019). Each is a sum over
+        points divided by the number of foreground points.
         """
         (logits, code), labels = outputs, targets.labels
         wanted = (labels[..., None] == torch.arange(self.num_classes, device=labels.device)).to(logits.dtype)
@@ -119,6 +125,7 @@ class Fcos(PyramidDetector):
         off_centre = F.softplus(code[..., 4]) - centred * code[..., 4]
         return (focal + (apart + off_centre) * foreground).sum(-1) / foreground.sum(-1).clamp(min=1)
 
+    @override
     def decode(
         self, code: Float[Tensor, "*n 5"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:
@@ -130,7 +137,7 @@ class Fcos(PyramidDetector):
         return clip_boxes_to_image(boxes.reshape(-1, 4), self.image_size).reshape(boxes.shape)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
-        """Logits of torchvision's scores, the geometric means of class probability and centre-ness."""
+        """Return logits of torchvision's scores, the geometric means of class probability and centre-ness."""
         logits, code = outputs
         log = 0.5 * (F.logsigmoid(logits) + F.logsigmoid(code[..., 4:]))
         log = log.clamp_max(-torch.finfo(log.dtype).eps)  # a score of 1 has no logit
@@ -138,7 +145,7 @@ class Fcos(PyramidDetector):
 
 
 def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
-    """Of boxes about a common point, from its distances to their four sides; ``theirs`` have an area."""
+    """Compute it for boxes about a common point, from its distances to their sides; ``theirs`` have an area."""
     least, most = torch.minimum(ours, theirs), torch.maximum(ours, theirs)
     inside, hull, area, other = (_area(part) for part in (least, most, ours, theirs))
     union = area + other - inside
@@ -146,7 +153,7 @@ def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) 
 
 
 def centreness(distances: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
-    """How near a point is to the centre of its box (Tian et al. 2019, Eq. 3), from its distances to the sides."""
+    """Measure how near a point is to its box's centre (Tian et al. 2019, Eq. 3), from its distances to the sides."""
     before, after = distances[..., :2], distances[..., 2:]
     return (torch.minimum(before, after) / torch.maximum(before, after)).prod(-1).sqrt()
 

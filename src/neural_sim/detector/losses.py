@@ -122,7 +122,11 @@ def assign_points(
 
 
 def _present(boxes: Tensor, labels: Tensor) -> Tensor:
-    """Which rows are no padding. Raises ``ValueError`` where one of these has no area."""
+    """Find the rows that are no padding.
+
+    Raises:
+        ValueError: such a row without an area.
+    """
     present = labels >= 0
     empty = present & (boxes[..., 2:] - boxes[..., :2] <= 0).any(-1)
     if bool(empty.any()):

@@ -1,4 +1,4 @@
-"""What predictions are scored by: average precision by the COCO definitions, or top-1 accuracy."""
+"""Score predictions: average precision by the COCO definitions, or top-1 accuracy."""
 
 from __future__ import annotations
 
@@ -18,8 +18,13 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class AveragePrecision:
-    """``ap`` is the mean over overlaps 0.50 to 0.95 and classes, ``ap50`` that at an overlap of 0.50; both by class
-    name, too. A class without a box is nan and stays out of the means.
+    """Average precision; a class without a box is nan and stays out of the means.
+
+    Attributes:
+        ap: the mean over overlaps 0.50 to 0.95 and classes.
+        ap50: the mean over classes at an overlap of 0.50.
+        per_class: ``ap`` by class name.
+        per_class_ap50: ``ap50`` by class name.
     """
 
     ap: float
@@ -29,14 +34,17 @@ class AveragePrecision:
 
     @property
     def mean(self) -> float:
-        """Over classes."""
+        """The mean over classes."""
         return self.ap
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """``accuracy`` is the mean over classes of the fraction of a class's images whose best class is right; by class
-    name, too. A class without an image is nan and stays out of the mean.
+    """Top-1 accuracy; a class without an image is nan and stays out of the mean.
+
+    Attributes:
+        accuracy: the mean over classes of the fraction of a class's images whose best class is right.
+        per_class: that fraction by class name.
     """
 
     accuracy: float
@@ -44,22 +52,22 @@ class Accuracy:
 
     @property
     def mean(self) -> float:
-        """Over classes."""
+        """The mean over classes."""
         return self.accuracy
 
 
 TestScore = AveragePrecision | Accuracy
 IN_FULL: dict[Score, str] = {"AP": "AP (0.50 to 0.95)", "accuracy": "Top-1 accuracy"}
-"""Scores as tables call them."""
+"""The names of scores in tables."""
 
 
 def of_document(document: Mapping[str, Any]) -> TestScore:
-    """The score whose fields a document has, such as results.json or the store keeps."""
+    """Return the score whose fields a document has, such as those that results.json or the store keeps."""
     return AveragePrecision(**document) if "ap" in document else Accuracy(**document)
 
 
 def mean_of(document: Mapping[str, Any]) -> float:
-    """The mean over classes of such a document."""
+    """Return the mean over classes of such a document."""
     return document["ap"] if "ap" in document else document["accuracy"]
 
 
@@ -69,7 +77,7 @@ def evaluate(
     class_names: Sequence[str],
     score: Score = "AP",
 ) -> TestScore:
-    """The score of ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
+    """Score ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
 
     Raises:
         ValueError: where there are no images, predictions and images differ in number, a label has no name, or an image
@@ -102,7 +110,7 @@ def evaluate(
 
 
 def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:
-    """The class of each image's best prediction, -1 without one."""
+    """Return the class of each image's best prediction, -1 without one."""
     best = [p["labels"][p["scores"].argmax()] if len(p["scores"]) else -1 for p in predictions]
     return torch.tensor([int(label) for label in best])
 

@@ -10,6 +10,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
+from typing_extensions import override
 
 from neural_sim.detector.losses import Targets, proximal_loss
 from neural_sim.detector.optimiser import AdamW, State
@@ -23,7 +24,7 @@ Batch = tuple[tuple[Tensor, ...], Targets]
 @validated
 @dataclass(frozen=True)
 class Optimisation:
-    """How a detector is trained: AdamW with linear warm-up and cosine decay to zero.
+    """A training of a detector: AdamW with linear warm-up and cosine decay to zero.
 
     Args:
         epochs, batch_size: the budget of steps.
@@ -40,7 +41,7 @@ class Optimisation:
 
 
 class DetectorModule(pl.LightningModule):
-    """Minimises the detector's mean loss over ``learned``.
+    """A training of the parameters ``learned`` by the detector's mean loss.
 
     Batches are (inputs, targets). Inputs are the images (one tensor [n, 3, h, w]) where the backbone is learned,
     else the features of the frozen backbone (one tensor for each level).
@@ -85,11 +86,11 @@ class DetectorModule(pl.LightningModule):
             self._recorder = Recorder(recording, AdamW(self._decay()), total_steps, _flat(self._values))
 
     def parameters_by_name(self) -> Parameters:
-        """The learned parameters as they are now, detached copies."""
+        """Return detached copies of the learned parameters as they are now."""
         return {name: value.detach().clone() for name, value in zip(self._names, self._values, strict=True)}
 
     def trajectory(self, rows: Sequence[Tensor]) -> Trajectory:
-        """The steps done, on batches of these ``rows``.
+        """Return the steps done, on batches of these ``rows``.
 
         Raises:
             ValueError: where nothing was to be recorded.
@@ -98,6 +99,7 @@ class DetectorModule(pl.LightningModule):
             raise ValueError("DetectorModule: want a recording for a trajectory, got None")
         return self._recorder.trajectory(tuple(rows), _flat(self._values))
 
+    @override
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         inputs, targets = batch
         learned = dict(zip(self._names, self._values, strict=True))
@@ -110,12 +112,14 @@ class DetectorModule(pl.LightningModule):
             return loss
         return loss + proximal_loss(learned, self._anchor, self.detector.proximal)
 
+    @override
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning's own version refuses frozen dataclasses.
         inputs, targets = batch
         moved = Targets(targets.labels.to(device), targets.deltas.to(device))
         return tuple(x.to(device) for x in inputs), moved
 
+    @override
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         if self._recorder is None:
             return
@@ -134,10 +138,12 @@ class DetectorModule(pl.LightningModule):
 
         self._recorder.step(state, lambda: _flat(gradients), optimizer.param_groups[0]["lr"])
 
+    @override
     def on_train_epoch_end(self) -> None:
         self._epochs.append(len(self._sizes) - self.steps_done)
         self.steps_done = len(self._sizes)
 
+    @override
     def on_train_end(self) -> None:
         # One transfer to the host for all losses: one in each epoch would stall the device.
         losses = torch.stack(self._losses).cpu().double().split(self._epochs)
@@ -145,6 +151,7 @@ class DetectorModule(pl.LightningModule):
         pairs = zip(losses, sizes, strict=True)
         self.epoch_losses = [float((loss * size).sum() / size.sum()) for loss, size in pairs]
 
+    @override
     def configure_optimizers(self) -> dict:
         decayed = [value for value in self._values if value.ndim > 1]
         others = [value for value in self._values if value.ndim <= 1]
@@ -157,7 +164,7 @@ class DetectorModule(pl.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def _decay(self) -> Tensor:
-        """The weight decay of each entry of the learned parameters."""
+        """Return the weight decay of each entry of the learned parameters."""
         decays = [self.how.weight_decay if value.ndim > 1 else 0.0 for value in self._values]
         return torch.cat(
             [
@@ -174,5 +181,5 @@ class DetectorModule(pl.LightningModule):
 
 
 def _flat(tensors: Iterable[Tensor]) -> Tensor:
-    """Copies of all entries in one vector."""
+    """Copy all entries into one vector."""
     return torch.cat([tensor.detach().reshape(-1) for tensor in tensors])

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.ops import FeaturePyramidNetwork
 from torchvision.ops.feature_pyramid_network import ExtraFPNBlock
+from typing_extensions import override
 
 from neural_sim.detector.backbones import ACTIVATIONS, IMAGENET_MEAN, IMAGENET_STD, group_norm, set_activation
 from neural_sim.detector.settings import Anchors, Head
@@ -28,6 +29,8 @@ class NormalisedBackbone(nn.Module):
         super().__init__()
         self.backbone = backbone
 
+    @override
+    @override
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         mean, std = (_channels(values, images) for values in (IMAGENET_MEAN, IMAGENET_STD))
         # A third faster on a CPU than the default layout, in both directions.
@@ -35,13 +38,15 @@ class NormalisedBackbone(nn.Module):
 
 
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
-    """A number for each channel, created on the device of ``like`` without a copy."""
+    """Return a number for each channel, created on the device of ``like`` without a copy."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 
 class CoarserLevels(ExtraFPNBlock):
-    """Levels past the backbone's last map C5: P6 a convolution of stride 2 on C5, P7 one on the activated P6, and so on
-    (Lin et al. 2017, Sec. 4). A level is never smaller than one pixel.
+    """Levels past the backbone's last map C5 (Lin et al. 2017, Sec. 4).
+
+    P6 is a convolution of stride 2 on C5, P7 one on the activated P6, and so on. A level is never smaller than one
+    pixel.
     """
 
     def __init__(self, in_channels: int, channels: int, count: int, activation: str) -> None:
@@ -50,6 +55,7 @@ class CoarserLevels(ExtraFPNBlock):
         self.convs = nn.ModuleList(nn.Conv2d(width, channels, 3, stride=2, padding=1) for width in widths)
         self.activation = ACTIVATIONS[activation]()
 
+    @override
     def forward(
         self, results: list[Tensor], x: list[Tensor], names: list[str]
     ) -> tuple[list[Tensor], list[str]]:
@@ -69,6 +75,8 @@ class Predictor(nn.Module):
         self.fpn = fpn
         self.head = head
 
+    @override
+    @override
     def forward(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
         pyramid = self.fpn(OrderedDict((str(level), x) for level, x in enumerate(features)))
         return self.head(list(pyramid.values()))
@@ -77,7 +85,7 @@ class Predictor(nn.Module):
 def build_predictor(
     in_channels: list[int], levels: int, head: nn.Module, settings: Head, activation: str
 ) -> Predictor:
-    """The pyramid of ``levels``, those past the last of ``in_channels`` included, and the head."""
+    """Build the pyramid of ``levels``, those past the last of ``in_channels`` included, and the head."""
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
@@ -90,7 +98,7 @@ def build_predictor(
 def fixed_anchors(
     settings: Anchors, image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
-    """Anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
+    """Return anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
     scale = 1.0 if settings.reference is None else min(image_size) / settings.reference
     sizes = tuple(tuple(scale * size for size in level) for level in settings.sizes)
     generator, strides = AnchorGenerator(sizes, (tuple(settings.ratios),) * len(sizes)), settings.strides
@@ -104,7 +112,7 @@ def fixed_anchors(
 def initialise(
     module: nn.Module, generator: torch.Generator, prior_probability: float | None = None
 ) -> dict[str, Tensor]:
-    """A state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
+    """Draw a state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
 
     Convolutions with a bias start at standard deviation 0.01 in a predictor's ``head``, and the bias of its layer
     ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1); others keep the variance of their

@@ -1,4 +1,4 @@
-"""What detectors on a backbone have in common: initial values, which of them are trained, features of images.
+"""The common part of detectors on a backbone: initial values, which of them are trained, features of images.
 
 The modules here are only the network's shape. Their values always come in as an argument, so that training losses can
 be differentiated any number of times. Most detectors have torchvision's feature pyramid on the backbone, and a head
@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call
+from typing_extensions import override
 
 from neural_sim.detector.backbones import (
     IMAGENET_MEAN,
@@ -73,12 +74,13 @@ class BackboneDetector(Detector):
         self._widths = [body.channels[stride] for stride in strides]
 
     def in_loop(self, layers: int | None) -> BackboneDetector:
-        """As the base class says. None: the last stage of our small backbones, and none of a ResNet's, which have
-        millions of parameters.
+        """Return the detector with its last stages trained in the psi loop, as the base class says.
+
+        None means the last stage of our small backbones, and none of a ResNet's, which have millions of parameters.
 
         Raises:
-            ValueError: of a backbone with published weights, whose normalisation is frozen; fewer than 0 stages, or not
-                fewer than there are.
+            ValueError: stages of a backbone with published weights, whose normalisation is frozen; fewer than 0
+                stages, or not fewer than there are.
         """
         if layers is None:
             layers = int(self._settings.architecture in PLANS)
@@ -94,7 +96,7 @@ class BackboneDetector(Detector):
         return looped
 
     def init(self, generator: torch.Generator) -> Parameters:
-        """Fresh parameters in float32 on the CPU; pretrained backbones keep their weights.
+        """Draw parameters in float32 on the CPU; pretrained backbones keep their weights.
 
         The dictionary also holds a frozen batch normalisation's statistics, so that it is complete.
 
@@ -114,25 +116,26 @@ class BackboneDetector(Detector):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of all parameters, by name."""
+        """Shapes of all parameters, by name."""
         state = {**self._backbone.state_dict(), **self._predictor.state_dict()}
         return {name: tuple(value.shape) for name, value in state.items()}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Names of everything that a full training changes: all but frozen statistics or a frozen backbone."""
+        """Name everything that a full training changes: all but frozen statistics or a frozen backbone."""
         learned = (self._predictor,) if self._settings.freeze else (self._backbone, self._predictor)
         names = {n for module in learned for n, _ in module.named_parameters()}
         return [name for name in params if name in names]
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """The backbone's parameters, but for those of the last stages that the psi loop trains, and all others."""
+        """Separate the backbone's parameters, without those that the psi loop trains, from all others."""
         last = set() if self._last is None else {name for name, _ in self._last.named_parameters()}
         backbone = {n: value for n, value in params.items() if n.startswith("backbone.") and n not in last}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Feature maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen. In the
-        psi loop, where its last stages train, those that come from the others.
+        """Compute maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
+
+        In the psi loop, which trains the last stages, these are the maps of the stages before.
 
         Raises:
             ValueError: where the images are not of the detector's size.
@@ -147,7 +150,7 @@ class BackboneDetector(Detector):
     def completed(
         self, trainable: Parameters, features: Sequence[Tensor]
     ) -> tuple[Parameters, Sequence[Tensor]]:
-        """The predictor's parameters, and all maps of the backbone."""
+        """Return the predictor's parameters, and all maps of the backbone."""
         if self._last is None:
             return trainable, features
         last = {name: value for name, value in trainable.items() if name.startswith("backbone.")}
@@ -155,7 +158,11 @@ class BackboneDetector(Detector):
         return predictor, functional_call(self._last, last, (tuple(features),), strict=True)
 
     def check_labels(self, labels: Tensor) -> None:
-        """Raises ``ValueError`` where a label is not below ``num_classes``."""
+        """Check that labels are below ``num_classes``.
+
+        Raises:
+            ValueError: a label that is not.
+        """
         if labels.numel() and int(labels.max()) >= self.num_classes:
             raise ValueError(f"assign: labels want to be below {self.num_classes}, got {int(labels.max())}")
 
@@ -202,6 +209,7 @@ class PyramidDetector(BackboneDetector):
         self.detections = detections
         self._predictor = build_predictor(self._widths, len(strides), network, head, activation)
 
+    @override
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
         predictor, maps = self.completed(trainable, features)
         out = functional_call(self._predictor, predictor, (maps,), strict=True)
@@ -209,6 +217,6 @@ class PyramidDetector(BackboneDetector):
 
 
 def _coarser(own: tuple[int, ...], strides: tuple[int, ...], available: tuple[int, ...]) -> tuple[int, ...]:
-    """Strides of the levels past the backbone's last, where as many as there are may follow it."""
+    """Return the strides of the levels past the backbone's last; none where its last map is not used."""
     last, count = available[-1], len(strides) - len(own)
     return tuple(last * 2**n for n in range(1, count + 1)) if last in own else ()

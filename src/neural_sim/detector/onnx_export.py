@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from typing_extensions import override
 
 from neural_sim.detector.onnx_nms import INPUTS, with_nms
 from neural_sim.detector.saved import SavedDetector
@@ -21,12 +22,13 @@ from neural_sim.extras import require
 
 OPSET = 18
 TOLERANCE = 1e-4
-"""Of scores, and of boxes as fractions of the image's longer side."""
+"""The largest difference of scores, and of boxes as fractions of the image's longer side."""
 
 
 class Decoded(nn.Module):
-    """Images [n, 3, h, w] in [0, 1] to the boxes [n, anchors, 4] of all anchors as (x0, y0, x1, y1) in pixels, and
-    their scores [n, anchors, classes] in [0, 1].
+    """A detector from images [n, 3, h, w] in [0, 1] to boxes and scores of all anchors.
+
+    Boxes [n, anchors, 4] are (x0, y0, x1, y1) in pixels, scores [n, anchors, classes] are in [0, 1].
     """
 
     def __init__(self, saved: SavedDetector) -> None:
@@ -36,6 +38,7 @@ class Decoded(nn.Module):
         for index, name in enumerate(self.names):
             self.register_buffer(f"p{index}", saved.params[name].detach().cpu())
 
+    @override
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
         params = {name: getattr(self, f"p{index}") for index, name in enumerate(self.names)}
         backbone, trainable = self.detector.split(params)
@@ -86,8 +89,10 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
 
 @torch.no_grad()
 def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "n 3 h w"]) -> float:
-    """Between torch and onnxruntime on a file without non-maximum suppression: of scores, and of boxes as fractions of
-    the image's longer side.
+    """Compare torch with onnxruntime on a file without non-maximum suppression.
+
+    Returns:
+        The largest difference of scores, and of boxes as fractions of the image's longer side.
     """
     import onnxruntime
 
@@ -107,7 +112,7 @@ def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's notices, which nobody can act on."""
+    """Silence the exporter's notices, which nobody can act on."""
     noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in noisy]
     with warnings.catch_warnings():

@@ -9,12 +9,13 @@ import torch
 from neural_sim.detector.saved import SavedDetector
 
 INPUTS = ("anchor_boxes", "anchor_scores")
-"""Outputs of the network that this continues."""
+"""The network's outputs, which suppression takes as inputs."""
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
-    """``model`` (an ``onnx.ModelProto`` with the outputs ``INPUTS``), continued as :meth:`Detector.predict` goes on:
-    the best candidates of each level, suppression within each class, the best ``limit`` of each image.
+    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, as :meth:`Detector.predict` does.
+
+    It takes the best candidates of each level, suppresses within each class, and keeps the best ``limit`` of an image.
     """
     import onnx
 
@@ -24,7 +25,7 @@ def with_nms(model: Any, saved: SavedDetector) -> Any:
 
 
 def _graph(saved: SavedDetector, opset: int, ir_version: int) -> str:
-    """In ONNX's textual syntax; names of the nodes' results begin with ``nms_``."""
+    """Write the graph in ONNX's textual syntax; names of the nodes' results begin with ``nms_``."""
     detector: Any = saved.detector
     settings, per_level = detector.detections, detector.anchors_per_level or [_anchors(saved)]
     anchors, classes = sum(per_level), len(saved.class_names)
@@ -79,7 +80,7 @@ suppression (float[n, {anchors}, 4] anchor_boxes, float[n, {anchors}, {classes}]
 
 
 def _anchors(saved: SavedDetector) -> int:
-    """How many anchors the detector has."""
+    """Count the detector's anchors."""
     backbone, trainable = saved.detector.split(saved.params)
     blank = torch.zeros(1, 3, *saved.image_size)
     with torch.no_grad():
@@ -87,7 +88,7 @@ def _anchors(saved: SavedDetector) -> int:
 
 
 def _level(number: int, first: int, last: int, candidates: int) -> str:
-    """Scores of one pyramid level, -1 where they are not among its best: no threshold lets these pass."""
+    """Keep the best scores of one pyramid level; the others become -1, which no threshold lets pass."""
     return f"""
     nms_from{number} = Constant<value = int64[1] {{{first}}}>()
     nms_to{number} = Constant<value = int64[1] {{{last}}}>()

@@ -30,9 +30,11 @@ class AdamW:
     floor: float | Float[Tensor, "n"] = 0.0
 
     def begin(self, theta: Float[Tensor, "n"]) -> State:
+        """Return the state before the first step."""
         return theta, torch.zeros_like(theta), torch.zeros_like(theta)
 
     def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
+        """Return the state after a step; ``done`` are the steps before it."""
         theta, first, second = state
         fast, slow = self.betas
         first = fast * first + (1.0 - fast) * gradient
@@ -43,7 +45,7 @@ class AdamW:
         return theta, first, second
 
     def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> AdamW:
-        """The rule to differentiate instead, after a training of ``done`` steps that ended in ``end``.
+        """Return the rule to differentiate instead, after a training of ``done`` steps that ended in ``end``.
 
         Its least denominator is ``fraction`` times the larger of the entry's in the last step and the root mean square
         of those of its tensor; itself for a ``fraction`` of 0. ``sizes`` are the numbers of entries of theta's tensors,
@@ -72,7 +74,7 @@ def pulled_back(
     done: int,
     cotangents: Sequence[Tensor],
 ) -> tuple[list[Tensor], Float[Tensor, "n"]]:
-    """Cotangents of a step's outcome pulled back onto its state, and onto its gradient.
+    """Pull cotangents of a step's outcome back onto its state, and onto its gradient.
 
     The caller adds that the gradient depends on theta: the batch's Hessian times the second.
     """
@@ -84,6 +86,6 @@ def pulled_back(
 
 
 def _root(values: Tensor) -> Tensor:
-    """Square root whose derivative at 0 is 0, not infinite: there an entry has had no gradient so far."""
+    """Take the square root with derivative 0 at 0, not infinity: there an entry has had no gradient so far."""
     positive = values > 0.0
     return torch.where(positive, values, 1.0).sqrt() * positive

@@ -18,12 +18,12 @@ from neural_sim.detector.settings import Detections
 
 Parameters = dict[str, Tensor]
 Score = Literal["AP", "accuracy"]
-"""What predictions are scored by: average precision (COCO's), or top-1 accuracy of each image's best class."""
+"""The score of predictions: average precision (COCO's), or top-1 accuracy of each image's best class."""
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
 
 
 def score_of(make: Callable[..., Detector]) -> Score:
-    """What the detectors of a constructor, as ``conf/detector`` makes it, are scored by."""
+    """Return the score of a constructor's detectors; the constructor is one that ``conf/detector`` makes."""
     while isinstance(make, functools.partial):
         make = make.func
     return getattr(make, "score", "AP")
@@ -44,8 +44,10 @@ class Best:
 
 
 class Detector(ABC):
-    """A detector for images of one size. It holds a shape and settings, never its parameters, which come in as an
-    argument, so that losses can be differentiated any number of times, in forward and in reverse mode.
+    """A detector for images of one size.
+
+    It holds a shape and settings, never its parameters, which come in as an argument, so that losses can be
+    differentiated any number of times, in forward and in reverse mode.
 
     A class is constructed with ``num_classes`` and ``image_size``, (height, width) in pixels, by name; other arguments
     come from its file in ``conf/detector``. It sets both attributes, and may set the others:
@@ -56,7 +58,7 @@ class Detector(ABC):
     - ``anchors_per_level``: how many anchors each level has, of which the best candidates are taken level by level;
       None: one level;
     - ``normalisation``: what features do first to the channels of images, for model files;
-    - ``score``: what its predictions are scored by.
+    - ``score``: the kind of score.
 
     "Anchors" are the places that outputs belong to, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
     defines the abstract methods; docs/extending.md has an example.
@@ -74,37 +76,40 @@ class Detector(ABC):
 
     @abstractmethod
     def init(self, generator: torch.Generator) -> Parameters:
-        """Fresh parameters in float32 on the CPU, all of them; names of the backbone's begin with ``backbone.``."""
+        """Draw all parameters, in float32 on the CPU; names of the backbone's begin with ``backbone.``."""
 
     @abstractmethod
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """The predictor's inputs for images in [0, 1]: tensors with a row for each image."""
+        """Compute the predictor's inputs from images in [0, 1]: tensors with a row for each image."""
 
     @abstractmethod
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
-        """Class logits and the code of the box of every anchor, differentiable in both arguments."""
+        """Compute class logits and the code of every anchor's box, differentiable in both arguments."""
 
     @abstractmethod
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """What every anchor should give; rows of label -1 are no boxes. Differentiable in the boxes."""
+        """Assign a target to every anchor, differentiable in the boxes; rows of label -1 are no boxes."""
 
     @abstractmethod
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """The loss of each image, of no other image's outputs."""
+        """Compute the loss of each image from its own outputs alone."""
 
     @abstractmethod
     def decode(
         self, code: Float[Tensor, "*n code"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:
-        """Boxes (x0, y0, x1, y1) in pixels, within the image: of all anchors, from a code [n, anchors, code], or of
-        those that ``anchor`` lists, from theirs [m, code]. Differentiable in the code.
+        """Decode boxes (x0, y0, x1, y1) in pixels, within the image, differentiable in the code.
+
+        The code is that of all anchors [n, anchors, code], or of those that ``anchor`` lists [m, code].
         """
 
     # --- what follows from it ---
 
     def in_loop(self, layers: int | None) -> Detector:
-        """The detector as the psi loop trains it, with the last ``layers`` stages of its backbone among what
-        :meth:`split` leaves to train; None: as many as a kind of detector proposes. The base class knows no stages.
+        """Return the detector as the psi loop trains it.
+
+        The last ``layers`` stages of its backbone are among what :meth:`split` leaves to train; None: as many as a kind
+        of detector proposes. The base class knows no stages.
 
         Raises:
             ValueError: where the backbone has no such stages.
@@ -116,29 +121,32 @@ class Detector(ABC):
         return self
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """What the psi loop freezes, which is what :meth:`features` takes: the backbone; and all other parameters."""
+        """Separate the backbone, which :meth:`features` takes and the psi loop freezes, from all other parameters."""
         backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Names of everything that a training outside the psi loop changes: all."""
+        """Name everything that a training outside the psi loop changes: all."""
         return list(params)
 
     def per_image_loss(
         self, trainable: Parameters, features: Sequence[Tensor], targets: Targets
     ) -> Float[Tensor, "n"]:
-        """:meth:`losses_of` the :meth:`outputs`. A jvp along v gives every image's score <dl_i / dtheta, v> in one
-        pass.
+        """Compute the losses of the outputs.
+
+        A jvp along v gives every image's score <dl_i / dtheta, v> in one pass.
         """
         return self.losses_of(self.outputs(trainable, features), targets)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
-        """Logits of the scores by which detections are ranked: those of the classes."""
+        """Return logits of the scores by which detections are ranked: those of the classes."""
         return outputs[0]
 
     def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
-        """At most ``per_class`` detections of each class in each image, of its ``candidates`` best logits after
-        non-maximum suppression. No score is too low: a box that is missed today should be able to rise.
+        """Choose at most ``per_class`` detections of each class in each image.
+
+        They are of its ``candidates`` best logits after non-maximum suppression. No score is too low: a box that is
+        missed today should be able to rise.
         """
         logits, code = self.ranking(outputs), outputs[1]
         top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
@@ -156,8 +164,11 @@ class Detector(ABC):
     def predict(
         self, params: Parameters, images: Float[Tensor, "n 3 h w"], batch_size: int = 64
     ) -> list[dict[str, Tensor]]:
-        """Detections of each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
-        :class:`Detections`.
+        """Detect objects in each image.
+
+        Returns:
+            For each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
+            :class:`Detections`.
         """
         backbone, trainable = self.split(params)
         detections, device = [], next(iter(trainable.values())).device
@@ -169,7 +180,7 @@ class Detector(ABC):
     def _chosen(
         self, scores: Float[Tensor, "n anchors classes"], code: Float[Tensor, "n anchors code"]
     ) -> list[dict[str, Tensor]]:
-        """The candidates of all images are chosen together and taken to the CPU, where each image has its own few."""
+        """Choose the candidates of all images together and take them to the CPU, where each image has its own few."""
         levels, first = [], 0
         for level in scores.split(list(self.anchors_per_level or [scores.shape[1]]), 1):
             best, index = level.flatten(1).topk(min(self.detections.candidates, level[0].numel()))
@@ -182,7 +193,7 @@ class Detector(ABC):
         return [self._suppressed(*image) for image in zip(*chosen, strict=True)]
 
     def _suppressed(self, best: Tensor, anchor: Tensor, labels: Tensor, moves: Tensor) -> dict[str, Tensor]:
-        """One image's detections of its candidates."""
+        """Return one image's detections among its candidates."""
         keep = best > self.detections.score_threshold
         best, anchor, labels, moves = (part[keep] for part in (best, anchor, labels, moves))
         boxes = self.decode(moves, anchor)

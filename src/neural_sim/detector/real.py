@@ -25,7 +25,7 @@ Fewer = Literal["refuse", "all"]
 @validated
 @dataclass(frozen=True)
 class Real:
-    """How labelled photographs, of the target's part ``train``, are used in training.
+    """The use of labelled photographs, of the target's part ``train``, in training.
 
     Args:
         mode: ``combined``: every training (warm start, psi loop, scored detectors) is on synthetic images and
@@ -58,16 +58,16 @@ class Real:
 
     @property
     def used(self) -> bool:
-        """Whether any photograph trains."""
+        """True if photographs train."""
         return self.mode != "none" and self.count != 0
 
     @property
     def combined(self) -> bool:
-        """Whether photographs are mixed with synthetic images."""
+        """True if photographs are mixed with synthetic images."""
         return self.used and self.mode == "combined"
 
     def number(self, available: int) -> int:
-        """How many of ``available`` photographs train.
+        """Return how many of ``available`` photographs train.
 
         Raises:
             ValueError: fewer photographs than ``count`` where that is refused, or none at all.
@@ -87,12 +87,18 @@ class Real:
         return count
 
     def of(self, available: int) -> Real:
-        """The same in terms of a ``count``, so that equal trainings have equal keys. Raises as ``number`` does."""
+        """Return the settings in terms of a ``count``, so that equal trainings have equal keys.
+
+        Raises:
+            ValueError: as :meth:`number`.
+        """
         return replace(self, count=self.number(available), fraction=None, fewer="refuse")
 
     def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
-        """Those that train: a random subset, the first of an order that depends on ``seed`` alone. Raises as ``number``
-        does.
+        """Choose those that train: the first of a random order that depends on ``seed`` alone.
+
+        Raises:
+            ValueError: as :meth:`number`.
         """
         available = 0 if photographs is None else len(photographs)
         count = self.number(available)
@@ -100,7 +106,7 @@ class Real:
         return photographs.select(torch.randperm(available, generator=stream(seed, "photographs"))[:count])
 
     def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:
-        """How batches are drawn of the ``synthetic`` images and the ``photographs`` after them; None: all alike."""
+        """Return how batches are drawn of ``synthetic`` images and the ``photographs`` after them; None: all alike."""
         if self.batch_fraction is None:
             return None
         real = min(max(1, round(self.batch_fraction * batch_size)), batch_size - 1)
@@ -133,7 +139,7 @@ class Sampling:
             )
 
     def batches(self, generator: torch.Generator) -> Iterator[Int[Tensor, "batch"]]:
-        """Rows of one batch after the other, without end."""
+        """Yield the rows of one batch after the other, without end."""
         starts = [sum(self.pools[:place]) for place in range(len(self.pools))]
         pools = zip(self.pools, self.per_batch, strict=True)
         drawn = [shuffled_passes(size, count, generator) for size, count in pools]
@@ -142,7 +148,7 @@ class Sampling:
 
     @property
     def weights(self) -> Float[Tensor, "N"]:
-        """Every image's weight in the mean loss of a batch, on average over batches; they sum to 1."""
+        """The images' weights in a batch's mean loss, on average over batches; they sum to 1."""
         total = sum(self.per_batch)
         pools = zip(self.pools, self.per_batch, strict=True)
         return torch.cat([torch.full((size,), count / (total * size)) for size, count in pools])
@@ -151,8 +157,9 @@ class Sampling:
 def shuffled_passes(
     size: int, per_batch: int, generator: torch.Generator
 ) -> Iterator[Int[Tensor, "per_batch"]]:
-    """``per_batch`` of the numbers below ``size`` at a time from shuffled passes over all: each is equally likely in
-    every batch.
+    """Yield ``per_batch`` of the numbers below ``size`` at a time, from shuffled passes over all of them.
+
+    Each is equally likely in every batch.
     """
     remaining = torch.zeros(0, dtype=torch.long)
     while True:

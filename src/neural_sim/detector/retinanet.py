@@ -8,6 +8,7 @@ from torch import Tensor
 from torchvision.models.detection._utils import BoxCoder
 from torchvision.models.detection.retinanet import RetinaNetHead
 from torchvision.ops import clip_boxes_to_image
+from typing_extensions import override
 
 from neural_sim.detector.backbones import group_norm
 from neural_sim.detector.losses import IGNORED, Targets, assign_anchors, box_loss, focal_loss
@@ -50,7 +51,7 @@ class RetinaNet(PyramidDetector):
         self.anchors, self.anchors_per_level = fixed_anchors(anchors, self.image_size)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Targets of every anchor, see :func:`losses.assign_anchors`.
+        """Assign a target to every anchor, see :func:`losses.assign_anchors`.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.
@@ -59,7 +60,7 @@ class RetinaNet(PyramidDetector):
         return assign_anchors(self.anchors.to(boxes), boxes, labels, *self._overlaps)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Focal loss plus box loss of each image, each a sum over anchors by the number of foreground anchors."""
+        """Add up focal and box loss of each image, each a sum over anchors by the number of foreground anchors."""
         (logits, deltas), costs = outputs, self._losses
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)
@@ -71,6 +72,7 @@ class RetinaNet(PyramidDetector):
         regression = box_loss(residual, costs.box, costs.box_delta).sum(-1) * foreground
         return (focal + regression).sum(-1) / foreground.sum(-1).clamp(min=1)
 
+    @override
     def decode(
         self, code: Float[Tensor, "*n 4"], anchor: Int[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*n 4"]:

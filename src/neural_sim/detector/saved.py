@@ -57,10 +57,11 @@ class SavedDetector:
 
     @cached_property
     def detector(self) -> Detector:
+        """The detector, built with its classes and image size."""
         return self.make(num_classes=len(self.class_names), image_size=self.image_size)
 
     def to(self, device: torch.device) -> SavedDetector:
-        """The same with its parameters on ``device``."""
+        """Return the detector with its parameters on ``device``."""
         return dataclasses.replace(self, params=placed(self.params, device))
 
     def save(self, folder: Path) -> Path:
@@ -184,7 +185,7 @@ def _params(path: Path, weights: Mapping[str, Any], file: Path) -> Parameters:
 
 
 def _normalisation(detector: Detector) -> dict[str, list[float]] | None:
-    """What the detector does to images in [0, 1], where it says so."""
+    """Return what the detector does first to images in [0, 1], where it says so."""
     stored = getattr(detector, "normalisation", None)
     return None if stored is None else {key: list(values) for key, values in stored.items()}
 
@@ -219,10 +220,13 @@ def _sha256(path: Path) -> str:
 
 
 def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str, Tensor]]:
-    """Detections of each photograph, best first, on the CPU: boxes [d, 4] as (x0, y0, x1, y1) in the photograph's
-    pixels and within it, scores [d], labels [d].
+    """Detect objects in photographs.
 
-    Photographs are letterboxed as those of a target set are. Detections that lie in the grey border alone are none.
+    Photographs are letterboxed as those of a target set are. Detections that lie in the grey border alone are left out.
+
+    Returns:
+        For each photograph, best first, on the CPU: boxes [d, 4] as (x0, y0, x1, y1) in its pixels and within it,
+        scores [d], labels [d].
     """
     if not photos:
         return []
@@ -237,9 +241,13 @@ def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str
 
 
 def described(make: Callable[..., Detector]) -> dict[str, Any]:
-    """``class`` and ``settings`` of a detector's constructor, as ``conf/detector`` makes it: a class, or a partial call
-    of one. All arguments but the classes and the image size are there, defaults too, which another version of the
-    project may change.
+    """Describe a detector's constructor, which ``conf/detector`` makes: a class, or a partial call of one.
+
+    ``settings`` has all arguments but the classes and the image size: defaults, too, since another version of the
+    project may change them.
+
+    Returns:
+        Its ``class`` and ``settings``.
 
     Raises:
         ValueError: an argument that is no number, string, sequence, mapping or dataclass of these.

@@ -155,8 +155,10 @@ class Losses:
 @validated
 @dataclass(frozen=True)
 class Detections:
-    """Which predictions are detections: per level, the ``candidates`` best scores above ``score_threshold``; then
-    non-maximum suppression within each class at ``nms_iou``, and the best ``limit`` are kept.
+    """The choice of detections among predictions.
+
+    The ``candidates`` best scores of each level above ``score_threshold`` go through non-maximum suppression within
+    each class at ``nms_iou``; the best ``limit`` of an image are kept.
     """
 
     score_threshold: Annotated[float, Ge(0), Lt(1)] = 0.05

@@ -89,8 +89,10 @@ class SmoothAP:
         return torch.zeros_like(detections.logits).index_add(0, candidates, added)
 
     def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
-        """Degree in [0, 1] to which each detection is a true positive, at each threshold: that of its overlap, times
-        that to which no better detection of the same box is one. The degrees of a box sum to at most 1.
+        """Compute the degree in [0, 1] to which each detection is a true positive, at each threshold.
+
+        It is that of its overlap, times that to which no better detection of the same box is one. The degrees of a box
+        sum to at most 1.
         """
         levels = detections.overlaps.new_tensor(THRESHOLDS)
         matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)

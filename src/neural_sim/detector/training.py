@@ -1,4 +1,4 @@
-"""Training a detector to the end of a fixed budget of steps, and measuring its loss."""
+"""Train a detector to the end of a fixed budget of steps."""
 
 from __future__ import annotations
 
@@ -56,14 +56,18 @@ class Training:
             )
 
     def of(self, epochs: int) -> Optimisation:
-        """A training of this many epochs."""
+        """Return the settings of a training of this many epochs."""
         return Optimisation(epochs, self.batch_size, self.learning_rate, self.weight_decay)
 
 
 @dataclass(frozen=True)
 class TrainingHistory:
-    """``losses``: mean training loss of each epoch, as met by the steps; ``steps``: optimiser steps done;
-    ``trajectory``: the steps themselves, where they were to be recorded.
+    """The course of a training.
+
+    Attributes:
+        losses: mean training loss of each epoch, as met by the steps.
+        steps: optimiser steps done.
+        trajectory: the steps themselves, where they were to be recorded.
     """
 
     losses: tuple[float, ...]
@@ -72,8 +76,9 @@ class TrainingHistory:
 
 
 class Batches:
-    """Inputs and targets in batches, in an order that the generator shuffles each epoch, or as ``sampling`` says;
-    ``drawn`` are their rows.
+    """Inputs and targets in batches, in an order that the generator shuffles each epoch, or as ``sampling`` says.
+
+    ``drawn`` has the rows of each batch so far.
 
     Raises:
         ValueError: a sampling of another number of images.
@@ -124,6 +129,10 @@ def train_detector(
     """Train from ``params``, which stay as they are.
 
     Args:
+        detector: the detector.
+        params: where the training starts.
+        generator: shuffles the batches.
+        how: the optimiser and its budget.
         images: on the device of ``params``; where they come as features, or the detector freezes its backbone, the
             pyramid and the head alone are trained.
         anchor: theta_0, which adds the detector's proximal term over what is trained to the loss; None: without it.

@@ -21,7 +21,7 @@ MEGABYTE = 2**20
 @validated
 @dataclass(frozen=True)
 class Recording:
-    """How much of a training is recorded.
+    """The part of a training that is recorded.
 
     Args:
         part: fraction of the steps, the last ones, that can be reversed.
@@ -34,11 +34,11 @@ class Recording:
     max_memory_mb: Positive = 2048.0
 
     def first(self, steps: int) -> int:
-        """The first of the recorded steps."""
+        """Return the first of the recorded steps."""
         return steps - max(1, math.ceil(self.part * steps))
 
     def keeps_gradients(self, steps: int, state_bytes: int, vector_bytes: int) -> bool:
-        """Whether the gradients of all recorded steps fit beside the states.
+        """Tell whether the gradients of all recorded steps fit into the limit with the states.
 
         Raises:
             ValueError: not even the states fit.
@@ -91,13 +91,13 @@ class Trajectory:
         return min(self.checkpoints)
 
     def segments(self) -> list[range]:
-        """The steps from checkpoint to checkpoint, the last ones first."""
+        """Return the steps from checkpoint to checkpoint, the last ones first."""
         starts = sorted(self.checkpoints)
         ends = [*starts[1:], len(self)]
         return [range(begin, end) for begin, end in zip(starts, ends, strict=True)][::-1]
 
     def replayed(self, segment: range, gradient_at: GradientAt) -> list[tuple[State, Float[Tensor, "n"]]]:
-        """The state before each step of a segment, and its gradient: as recorded, else ``gradient_at(theta, rows)``."""
+        """Return the state before each step of a segment, and its gradient: recorded, or by ``gradient_at``."""
         replayed, state = [], self.checkpoints[segment.start]
         for step in segment:
             gradient = self.gradients.get(step)
@@ -110,7 +110,7 @@ class Trajectory:
 
 
 def segment_length(steps: int) -> int:
-    """Steps between checkpoints for which the checkpoints and one segment's states take the least memory together."""
+    """Return the distance of checkpoints at which they and one segment's states take the least memory together."""
     return max(1, math.isqrt(max(0, steps - 1)) + 1)
 
 
@@ -153,7 +153,7 @@ class Recorder:
             self._gradients[number] = gradient()
 
     def trajectory(self, rows: tuple[Int[Tensor, "batch"], ...], end: Float[Tensor, "n"]) -> Trajectory:
-        """The recorded training, of these batches; ``end`` is theta after the last step."""
+        """Return the recorded training, of these batches; ``end`` is theta after the last step."""
         return Trajectory(self.rule, rows, tuple(self._rates), self._checkpoints, self._gradients, end)
 
 
