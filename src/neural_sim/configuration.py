@@ -12,7 +12,7 @@ class UserError(ValueError):
 
 
 def conf_directory() -> Path:
-    """The checkout's ``conf/`` where there is one, else the copy that travels in the wheel.
+    """Find the checkout's ``conf/``, or the copy that travels in the wheel.
 
     Raises:
         FileNotFoundError: neither exists.
@@ -29,8 +29,9 @@ LONGEST = 150
 
 
 def job_folder(number: int | str, overrides: str) -> str:
-    """Name of the folder of a sweep's job: its number and its overrides, cut where they are long. They are all in
-    ``.hydra/overrides.yaml`` of the folder.
+    """Name the folder of a sweep's job by its number and its overrides, cut where they are long.
+
+    All of them are in ``.hydra/overrides.yaml`` of the folder.
     """
     return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
 
@@ -140,12 +141,12 @@ def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] 
 
 
 def _with_parents(key: str) -> list[str]:
-    """A dotted key and the keys above it, the longest first."""
+    """Yield a dotted key and the keys above it, the longest first."""
     parts = key.split(".")
     return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message that is not empty; the name of its class without a message."""
+    """Return the first line of an error's message that is not empty; without a message, the name of its class."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     return lines[0].strip() if lines else type(error).__name__

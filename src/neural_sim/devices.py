@@ -16,6 +16,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.profiler import ProfilerActivity, profile
+from typing_extensions import override
 
 # Read when the profiler first runs, which otherwise writes lines of its own to the screen.
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")
@@ -29,7 +30,7 @@ CACHES = 32
 
 
 def device_of(accelerator: str) -> torch.device:
-    """The device of ``trainer.accelerator``, set to compute as the CPU does, in full float32.
+    """Return the device of ``trainer.accelerator``, set to compute as the CPU does, in full float32.
 
     Raises:
         ValueError: an unknown accelerator, or one this machine lacks.
@@ -61,12 +62,13 @@ class Resident(SingleDeviceStrategy):
     Lightning's own moves each tensor to the CPU after a fit and frees what the allocator keeps for the next one.
     """
 
+    @override
     def teardown(self) -> None:
         return
 
 
 def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False) -> Trainer:
-    """A Trainer for modules that lie on ``device``, with everything off that writes files or talks.
+    """Make a Trainer for modules that lie on ``device``, with everything off that writes files or talks.
 
     It leaves signals to ``interruption``: under SLURM it would otherwise ignore SIGTERM and requeue the job itself.
     """
@@ -85,7 +87,7 @@ def trainer_on(device: torch.device, max_epochs: int = 1, progress: bool = False
 
 
 def at_once(on_cpu: int, device: torch.device) -> int:
-    """A batch size: ``on_cpu``, which fits a CPU's cache, or ``CACHES`` times that on a GPU, where launches cost."""
+    """Return the batch size ``on_cpu``, which fits a cache, or ``CACHES`` times that on a GPU, where launches cost."""
     return on_cpu if device.type == "cpu" else CACHES * on_cpu
 
 
@@ -146,5 +148,5 @@ def peak_bytes(run: Callable[[], object], device: torch.device | None = None) ->
 
 
 def placed(tensors: dict[str, torch.Tensor], device: torch.device) -> dict[str, torch.Tensor]:
-    """The same on ``device``; those that are there already are not copied."""
+    """Return the tensors on ``device``; those that are there already are not copied."""
     return {name: tensor.to(device) for name, tensor in tensors.items()}

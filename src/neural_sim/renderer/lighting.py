@@ -55,7 +55,7 @@ class Lighting:
 
 
 def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
-    """What albedo is multiplied by, for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
+    """Return the factor of albedo for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
     shade = np.full((len(normals), 3), lighting.ambient)
     for light in lighting.lights:
         towards = np.asarray(light.direction, dtype=np.float64)

@@ -23,8 +23,9 @@ Quality = Literal["draft", "normal", "final"]
 
 @dataclass(frozen=True)
 class Omissions:
-    """The approximations of a quality: samples behind a transmittance of ``termination`` are skipped, and ``step``
-    multiplies the field's step.
+    """The approximations of a quality.
+
+    Samples behind a transmittance of ``termination`` are skipped, and ``step`` multiplies the field's step.
     """
 
     termination: float
@@ -71,7 +72,11 @@ class NerfRenderer:
         self.cull, self.skip_empty = cull, skip_empty
 
     def at(self, quality: Quality) -> Self:
-        """This renderer at another quality. Raises ``ValueError`` for one that there is not."""
+        """Return this renderer at another quality.
+
+        Raises:
+            ValueError: an unknown quality.
+        """
         return type(self)(quality, self.rays_per_chunk, cull=self.cull, skip_empty=self.skip_empty)
 
     @torch.no_grad()
@@ -100,8 +105,9 @@ class NerfRenderer:
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """What ``render`` gives, and the depth along the view axis, in object radii, at which a pixel's ray has lost
-        half of its light; 0 where it loses less, as opacities below 1/2 do.
+        """Render as ``render`` does, and the depth along the view axis, in object radii.
+
+        The depth is where a pixel's ray has lost half of its light; 0 where it loses less, at opacities below 1/2.
         """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
@@ -117,7 +123,7 @@ class NerfRenderer:
         camera_to_world: Float[Tensor, "views 4 4"],
         rates: Float[Tensor, "m views 4 4"],
     ) -> tuple[Maps, list[Maps]]:
-        """What ``render`` gives, and its m derivatives where the cameras move at ``rates`` (then a moving light's).
+        """Render as ``render`` does, with m derivatives where the cameras move at ``rates`` (then a moving light's).
 
         Rays' directions stay of unit length whatever the rates, so that those of a focal length can be among them.
         One pass computes both; memory beyond the maps is that of ``rays_per_chunk`` rays.

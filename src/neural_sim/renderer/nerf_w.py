@@ -54,7 +54,7 @@ class NerfWRenderer(NerfRenderer):
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """What ``render`` gives, and depth, see :meth:`NerfRenderer.render_surface`."""
+        """Render as ``render`` does, and depth, see :meth:`NerfRenderer.render_surface`."""
         field, weights = _checked(field, weights, len(camera_to_world))
         maps = camera_to_world.new_empty(len(camera_to_world), camera.height, camera.width, 5)
         for light, views in _groups(weights, maps.device):
@@ -73,7 +73,7 @@ class NerfWRenderer(NerfRenderer):
         weights: Float[Tensor, "views k"] | None = None,
         weight_rates: Float[Tensor, "q views k"] | None = None,
     ) -> tuple[Maps, list[Maps]]:
-        """What ``render`` gives, its m derivatives where cameras move at ``rates``, then q where weights do.
+        """Render as ``render`` does, with m derivatives where cameras move at ``rates``, then q where weights do.
 
         m or q may be 0. Opacity's derivatives by weights are exactly 0.
         """
@@ -118,8 +118,9 @@ class NerfWRenderer(NerfRenderer):
 def _checked(
     field: RadianceField, weights: Float[Tensor, "n k"] | None, count: int
 ) -> tuple[AppearanceField, Float[Tensor, "n k"]]:
-    """The field, which must have appearance codes, and weights [count, k] in its type, on their own device: draws are
-    on the CPU.
+    """Return the field, which must have appearance codes, and weights [count, k] in its type.
+
+    The weights stay on their own device: draws are on the CPU.
     """
     if not isinstance(field, AppearanceField):
         raise ValueError(
@@ -136,7 +137,7 @@ def _checked(
 def _groups(
     rows: Float[Tensor, "views c"], device: torch.device
 ) -> Iterator[tuple[Float[Tensor, "c"], Int[Tensor, "some"]]]:
-    """The distinct rows and the views of each, on ``device``; compared on the CPU."""
+    """Return the distinct rows and the views of each, on ``device``; rows are compared on the CPU."""
     different, number = rows.cpu().unique(dim=0, return_inverse=True)
     for place, row in enumerate(different.to(device)):
         yield row, (number == place).nonzero()[:, 0].to(device)

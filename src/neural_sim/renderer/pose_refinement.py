@@ -68,7 +68,7 @@ class PoseRefinement:
     seed: NonNegativeInt = 0
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
-        """The views at corrected poses. The last ``held_out`` views train no field, but their poses are corrected too.
+        """Return the views at corrected poses: the last ``held_out`` too, which train no field.
 
         What the photographs leave open, a similarity of all cameras, is chosen such that the cameras stay where they
         were on average.
@@ -110,8 +110,9 @@ class PoseRefinement:
 
 
 def reduce_views(views: PosedViews, size: int) -> PosedViews:
-    """The views with a longer side of at most ``size`` pixels, by the mean over each pixel's area. A reduced pixel is
-    known where all of its area is.
+    """Reduce views to a longer side of at most ``size`` pixels, by the mean over each pixel's area.
+
+    A reduced pixel is known where all of its area is.
     """
     camera = views.camera
     factor = size / max(camera.width, camera.height)
@@ -166,8 +167,10 @@ def _align(
 def gauss_newton_step(
     jacobian: Float[Tensor, "views n 6"], residual: Float[Tensor, "views n"]
 ) -> Float[Tensor, "views 6"]:
-    """Minimises the weighted squares of residual - jacobian step; the weights are those of Fair's loss (iteratively
-    reweighted least squares). Zero for a camera whose image no motion changes.
+    """Minimise the weighted squares of residual - jacobian step.
+
+    The weights are those of Fair's loss (iteratively reweighted least squares). The step is zero for a camera whose
+    image no motion changes.
     """
     weighted = jacobian / (1.0 + residual.abs() / FAIR)[..., None]
     normal = weighted.transpose(1, 2) @ jacobian
@@ -184,14 +187,14 @@ def fair_loss(residual: Tensor) -> Tensor:
 
 
 def _residuals(values: Maps, views: PosedViews) -> Float[Tensor, "views n"]:
-    """What the views show less the render, premultiplied."""
+    """Return what the views show less the render, premultiplied."""
     alpha = views.images[..., 3:]
     shown = Maps(views.images[..., :3] * alpha, alpha[..., 0])
     return _shown(_flat(shown) - _flat(values), views)
 
 
 def _shown(values: Float[Tensor, "views n"], views: PosedViews) -> Float[Tensor, "views n"]:
-    """The values, 0 at pixels that a photograph does not show."""
+    """Return the values, 0 at pixels that a photograph does not show."""
     return values if views.known is None else values * views.known.flatten(1).repeat_interleave(4, 1)
 
 
@@ -200,7 +203,7 @@ def _flat(maps: Maps) -> Float[Tensor, "views n"]:
 
 
 def pose_rates(poses: Float[Tensor, "views 4 4"]) -> Float[Tensor, "6 views 4 4"]:
-    """Derivatives of :func:`moved`: turns about a camera's own axes (1 / rad), motions along them (1 / radius)."""
+    """Differentiate :func:`moved` by turns about a camera's own axes (1 / rad) and motions along them (1 / radius)."""
     rates = poses.new_zeros(6, *poses.shape)
     for axis, unit in enumerate(torch.eye(3, dtype=poses.dtype, device=poses.device)):
         rates[axis, :, :3, :3] = poses[:, :3, :3] @ _cross(unit)
@@ -217,7 +220,7 @@ def moved(poses: Float[Tensor, "views 4 4"], step: Float[Tensor, "views 6"]) -> 
 
 
 def _cross(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """The matrices that map v to vector x v."""
+    """Return the matrices that map v to vector x v."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
@@ -225,14 +228,15 @@ def _cross(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:
-    """The angle in radians between rotations, exact for small ones, where arccos is not."""
+    """Return the angle in radians between rotations, exact for small ones, where arccos is not."""
     chord = (a - b).flatten(-2).norm(dim=-1) / math.sqrt(8.0)  # sine of half the angle
     return 2.0 * torch.asin(chord.clamp_max(1.0))
 
 
 def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -> Float[Tensor, "views 4 4"]:
-    """The poses under the similarity of least squares (Umeyama 1991) that takes their cameras to the given ones:
-    places, and points at one radius along each camera's axes, so that two cameras determine it.
+    """Move the poses by the similarity of least squares that takes their cameras to the given ones (Umeyama 1991).
+
+    It takes cameras' places, and points at one radius along each camera's axes, so that two cameras determine it.
     """
     matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
     similarity = torch.from_numpy(matrix).to(poses)

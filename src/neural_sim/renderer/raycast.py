@@ -79,7 +79,7 @@ def _silhouette(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _shifted(directions: np.ndarray, pose: np.ndarray, x: float, y: float) -> Float[np.ndarray, "rays 3"]:
-    """Unit directions moved by (x, y) on the image plane at distance 1, right and down."""
+    """Return unit directions moved by (x, y) on the image plane at distance 1, right and down."""
     right, up, backward = pose[:3, 0], pose[:3, 1], pose[:3, 2]
     on_plane = directions / -(directions @ backward)[:, None] + x * right - y * up
     return on_plane / np.linalg.norm(on_plane, axis=1, keepdims=True)

@@ -52,7 +52,7 @@ class LightRig:
             )
 
     def lights(self) -> tuple[Light, ...]:
-        """The k anchors."""
+        """Return the k anchors."""
         k = self.anchors
         height = [1.0 - (2.0 * i + 1.0) / k for i in range(k)]
         spread = zip(height, _spread(k, math.sqrt(5.0)), _spread(k, math.sqrt(2.0)), strict=True)
@@ -69,7 +69,11 @@ class LightRig:
         return Light(direction, dim + bright * (full - dim), temperature_colour(kelvin), self.fill)
 
     def lighting(self, weights: Sequence[float] | Float[Tensor, "k"]) -> Lighting:
-        """The anchors at these weights, of either sign. Raises ``ValueError`` for another number of them."""
+        """Return the anchors at these weights, of either sign.
+
+        Raises:
+            ValueError: another number of weights.
+        """
         values = [float(weight) for weight in weights]
         if len(values) != self.anchors:
             raise ValueError(f"lights: want {self.anchors} weights, got {len(values)}")

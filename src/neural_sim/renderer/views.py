@@ -107,7 +107,7 @@ def render_views(
     rig: LightRig | None = None,
     weights: Float[Tensor, "views k"] | None = None,
 ) -> PosedViews:
-    """Views of a normalised object with their cameras (OpenGL axes, object radii).
+    """Render views of a normalised object with their cameras (OpenGL axes, object radii).
 
     With a ``rig`` each view is lit by the anchors at its ``weights``; views that share weights are rendered together.
     """
@@ -150,7 +150,7 @@ class Views:
             self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
 
     def camera(self, image_size: int) -> PinholeCamera:
-        """The square camera of this field of view."""
+        """Return the square camera of this field of view."""
         return PinholeCamera(image_size, image_size, math.radians(self.field_of_view_deg))
 
     @property

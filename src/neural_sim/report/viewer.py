@@ -32,8 +32,9 @@ PER_BIN = 4
 
 @dataclass(frozen=True)
 class BinCamera:
-    """A camera drawn from a bin (from 0) of probability ``p``: its number in the draw and its pose (OpenGL axes, object
-    radii).
+    """A camera drawn from a bin (from 0) of probability ``p``.
+
+    It has its number in the draw and its pose (OpenGL axes, object radii).
     """
 
     bin: int
@@ -72,7 +73,7 @@ class Shots:
 
     @torch.no_grad()
     def picture(self, label: int, draw: SceneDraw, above: float = 0.3) -> UInt8[np.ndarray, "height width 3"]:
-        """The object before grey, with the boxes of the detector whose score is at least ``above``."""
+        """Render the object before grey, with the detector's boxes whose score is at least ``above``."""
         shown = self.scene.render(label, draw)
         behind = torch.full_like(shown.rgb, GREY).movedim(-1, 1)
         image = composite(shown.rgb, shown.opacity, behind).clamp(0.0, 1.0)
@@ -88,8 +89,9 @@ class Shots:
 
     @torch.no_grad()
     def cloud(self, label: int, views: int = 12, size: int = 96) -> tuple[np.ndarray, np.ndarray]:
-        """Points [n, 3] of the field's surface in object radii, and their colours [n, 3] in [0, 1]: what ``views``
-        renders round the object show, from every height and under equal weights of the lights.
+        """Return points [n, 3] of the field's surface in object radii, and their colours [n, 3] in [0, 1].
+
+        They are what ``views`` renders round the object show, from every height and under equal weights of the lights.
         """
         subject = self.scene.fields[label]
         turn = torch.arange(views) * (math.pi * (3.0 - math.sqrt(5.0)))  # a spiral of the golden angle
@@ -131,8 +133,9 @@ def colour(p: float, most: float) -> tuple[int, int, int]:
 
 
 class Viewer:
-    """The page: a 3D view of the field and of the cameras of one factor's bins, and sliders for a render beside it. A
-    click on a camera moves the sliders there.
+    """The page: a 3D view of the field and the cameras of one factor's bins, and sliders for a render next to it.
+
+    A click on a camera moves the sliders there.
 
     Args:
         shots: what it shows.
@@ -198,7 +201,7 @@ class Viewer:
         return self.shots.scene.names.index(self.object.value)
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"]:
-        """The render at the sliders."""
+        """Render the object at the sliders."""
         zoom = None if self.magnification is None else self.magnification.value
         weights = tuple(light.value for light in self.lights)
         draw = self.shots.draw(self.phi.value, self.rho.value, self.distance.value, zoom, weights)
@@ -215,12 +218,12 @@ class Viewer:
         self.show_picture()
 
     def show_field(self) -> None:
-        """The points of the chosen object."""
+        """Show the points of the chosen object."""
         points, colours = self.shots.cloud(self.label)
         self.server.scene.add_point_cloud("/field", points, colours, point_size=0.02)
 
     def show_bins(self) -> None:
-        """The cameras of the chosen object, distribution and factor, and the bins' probabilities."""
+        """Show the cameras of the chosen object, distribution and factor, and the bins' probabilities."""
         for frustum in self.frustums:
             frustum.remove()
         self.frustums = []

@@ -26,8 +26,10 @@ ENOUGH = 1.25
 def view_size_for(
     views: Views, camera: PinholeCamera, distribution: SceneDistribution, largest_radius: float
 ) -> int:
-    """Side in pixels of views that resolve at their nearest what ``camera`` does at its nearest and of its longest
-    focal length. ``largest_radius`` is the objects', in the unit of the distribution's distances.
+    """Return the side in pixels of views that resolve at their nearest what ``camera`` does.
+
+    The camera is taken at its nearest and at its longest focal length. ``largest_radius`` is the objects', in the unit
+    of the distribution's distances.
     """
     drawn = {factor.coordinate: factor for factor in distribution.binned}
     nearest = drawn["distance"].low if "distance" in drawn else distribution.ranges["distance"][0]
@@ -38,8 +40,10 @@ def view_size_for(
 
 
 def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
-    """The recipe for views with ``factor`` times as many pixels along each side: as many times the steps, and as many
-    times the cells of a grid as the nearest power of two. The number of halvings stays.
+    """Return the recipe for views with ``factor`` times as many pixels along each side.
+
+    It has as many times the steps, and as many times the cells of a grid as the nearest power of two. The number of
+    halvings stays.
     """
     fitting: Callable[..., Any] = recipe.fitting
     steps = math.ceil(recipe.steps * factor)
@@ -58,8 +62,9 @@ def finer_recipe(recipe: FieldRecipe, factor: float) -> FieldRecipe:
 
 
 def finer_fields(graph: Graph, camera: PinholeCamera, largest: int) -> tuple[FieldStage, ...]:
-    """The run's fields, or finer ones where images of ``camera`` would show the pixels of the run's views; these have
-    at most ``largest`` pixels a side. The log says what the views hold.
+    """Return the run's fields, or finer ones where images of ``camera`` would show the pixels of the run's views.
+
+    Finer views have at most ``largest`` pixels a side. The log says what the views hold.
     """
     views, recipe = graph.experiment.imaging.views, graph.experiment.imaging.field
     if not graph.objects.has_meshes:

@@ -30,17 +30,21 @@ class ReconstructionStage(Stage[trimesh.Trimesh]):
     resolution: int
 
     @property
+    @override
     def title(self) -> str:
         return f"reconstruction of {self.views.object}"
 
+    @override
     def make(self, results: Results) -> trimesh.Trimesh:
         return reconstruct(self.views.fitted(results), self.resolution)
 
+    @override
     def pack(self, value: trimesh.Trimesh) -> dict[str, Any]:
         colours = value.visual.vertex_colors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
         parts = {"vertices": value.vertices, "faces": value.faces, "colours": colours}
         return {name: torch.from_numpy(np.array(part)) for name, part in parts.items()}
 
+    @override
     def unpack(self, stored: Mapping[str, Any]) -> trimesh.Trimesh:
         vertices, faces, colours = (stored[name].numpy() for name in ("vertices", "faces", "colours"))
         return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)

@@ -45,7 +45,7 @@ class RenderedObject:
         return bins[:, 0] if bins.shape[1] else torch.full((len(bins),), -1)
 
     def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
-        """Some of the renders, without what reproduces or differentiates them."""
+        """Return some of the renders, without what reproduces or differentiates them."""
         there = index.to(self.rgb.device)
         return RenderedObject(self.draw.select(index), self.rgb[there], self.opacity[there])
 
@@ -67,8 +67,9 @@ class RenderedImages:
         return len(self.images)
 
     def without_maps(self) -> RenderedImages:
-        """The same without what composes the images again, which takes more memory than they do. Of the objects' maps
-        none is left, clones of nothing, since a view of nothing would hold all.
+        """Return the images without the maps that compose them again, which take more memory than the images.
+
+        Empty maps stay in their place: clones, since an empty view would keep all of the memory.
         """
         objects = tuple(
             replace(part, rgb=part.rgb[:0].clone(), opacity=part.opacity[:0].clone()) for part in self.objects
@@ -134,6 +135,7 @@ class Shared:
         return Shared(tuple(objects), layout, place, nuisance, own, synthesizer)
 
     def composed(self) -> RenderedImages:
+        """Compose all images."""
         count = range(len(self.objects))
         with torch.no_grad():
             parts = [self.images(rows) for rows in torch.arange(len(self.layout)).split(CHUNK)]
@@ -148,7 +150,7 @@ class Shared:
     def images(
         self, rows: Int[Tensor, "m"], columns: Int[Tensor, "m"] | None = None, maps: Maps | None = None
     ) -> LabelledImages:
-        """The images ``rows``; with ``maps`` in the place of their layers ``columns``."""
+        """Compose the images ``rows``; ``maps`` take the place of their layers ``columns``."""
         labels, place = self.layout.labels[rows], self.place[rows]
         like = self.objects[0]
         size = (*place.shape, *like.opacity.shape[1:])

@@ -33,7 +33,9 @@ class Background(Protocol):
         width: int,
         generator: torch.Generator,
         device: torch.device | str = "cpu",
-    ) -> Float[Tensor, "n 3 height width"]: ...
+    ) -> Float[Tensor, "n 3 height width"]:
+        """Draw ``n`` backgrounds."""
+        ...
 
 
 @validated
@@ -101,7 +103,7 @@ class ProceduralClutter:
             yield from ((12, n, 1, 1), (5, n))
 
     def _wall(self, numbers: Sequence[Tensor], height: int, width: int) -> Tensor:
-        """A random colour with noise of every scale, mostly grey in hue."""
+        """Draw a random colour with noise of every scale, mostly grey in hue."""
         base, tint = 0.2 + 0.6 * numbers[0], 0.25 * (numbers[1] - 0.5)
         images = (base + tint).expand(-1, -1, height, width).clone()
         for octave in range(self.octaves):
@@ -147,8 +149,9 @@ class ProceduralClutter:
 
 @validated
 class PhotoFolder:
-    """Random crops of the photographs under a folder, resized; ``smallest`` is the side of the smallest
-    crop relative to the largest.
+    """Random crops of the photographs under a folder, resized.
+
+    ``smallest`` is the side of the smallest crop relative to the largest.
 
     Raises:
         ValueError: no folder, no photograph in it, or one that is none by its header.

@@ -29,10 +29,11 @@ class Cover:
     opacity: Float[Tensor, "n h w"]
 
     def select(self, index: Tensor | slice) -> Cover:
+        """Return the layer of some of the images."""
         return Cover(self.rgb[index], self.opacity[index])
 
     def over(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """The layer over images, in their type and on their device."""
+        """Lay the layer over images, in their type and on their device."""
         rgb, opacity = self.rgb.to(images), self.opacity.to(images)
         return rgb.movedim(-1, 1) + (1.0 - opacity)[:, None] * images
 
@@ -102,8 +103,9 @@ class Distractors:
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> tuple[Cover, Cover] | None:
-        """What is behind the objects of n images and what is in front of them; None, and no random number is drawn,
-        where there are no distractors.
+        """Draw what is behind the objects of n images and what is in front of them.
+
+        Without distractors both are None, and no random number is drawn.
 
         Raises:
             ValueError: a picture that cannot be read, with its file.
@@ -127,7 +129,7 @@ class Distractors:
         return self.size[0] + (self.size[1] - self.size[0]) * u
 
     def _cutout(self, file: int, side: float) -> Float[np.ndarray, "h w 4"]:
-        """A picture whose longer side has about ``side`` pixels, premultiplied."""
+        """Return a premultiplied picture whose longer side has about ``side`` pixels."""
         picture = self._pictures.get(file)
         if picture is None:
             picture = self._pictures[file] = read_picture(self.files[file]).convert("RGBA")
@@ -147,7 +149,7 @@ class Distractors:
 def _paste(
     layer: Float[np.ndarray, "h w 4"], cutout: Float[np.ndarray, "a b 4"], across: float, down: float
 ) -> None:
-    """A cut-out over a layer, in place, its centre at a fraction of the layer's width and height."""
+    """Paste a cut-out over a layer, in place, its centre at a fraction of the layer's width and height."""
     height, width = layer.shape[:2]
     high, wide = cutout.shape[:2]
     left, top = round(across * width - 0.5 * wide), round(down * height - 0.5 * high)

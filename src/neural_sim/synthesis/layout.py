@@ -34,11 +34,14 @@ class ObjectCount:
 
     @property
     def mean(self) -> float:
+        """Return the mean number of objects in an image."""
         return 0.5 * (self.fewest + self.most)
 
     def draw(self, n: int, generator: torch.Generator, present: bool = False) -> Int[Tensor, "n"]:
-        """Of n images; or, if ``present``, of n images in which one given class is. It is in an image of c objects with
-        a probability in proportion to c, so that such images have c objects in proportion to c.
+        """Draw the numbers of objects of n images; if ``present``, of images that show one given class.
+
+        That class is in an image of c objects with a probability in proportion to c, so that such images have c objects
+        in proportion to c.
         """
         numbers = torch.arange(self.fewest, self.most + 1)
         weights = numbers.double() if present else torch.ones(len(numbers), dtype=torch.float64)
@@ -47,8 +50,10 @@ class ObjectCount:
 
 @dataclass(frozen=True)
 class Layout:
-    """Of n images. ``labels`` are the classes in each, -1 for none; in column 0 the image's own class. ``order`` in
-    [0, 1) says which lies in front among objects at equal distances: the smaller.
+    """The classes of n images, and which object lies in front.
+
+    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. ``order`` in [0, 1) says
+    which lies in front among objects at equal distances: the smaller.
     """
 
     labels: Int[Tensor, "n most"]
@@ -58,6 +63,7 @@ class Layout:
         return len(self.labels)
 
     def select(self, index: Tensor) -> Layout:
+        """Return the layout of some of the images."""
         return Layout(self.labels[index], self.order[index])
 
     def places(self, label: int) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:

@@ -39,7 +39,7 @@ def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
 
 
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
-    """Derivatives of every image's camera-to-world matrix by each of its draw's ``names``.
+    """Differentiate every image's camera-to-world matrix by each of its draw's ``names``.
 
     The matrix takes a pixel's direction into the world. At a camera of focal length m, a longer one narrows that
     direction's x and y as a matrix with shorter axes would, d(x/m)/dm = -(x/m)/m, but for the direction's length, which

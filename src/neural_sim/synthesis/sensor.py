@@ -18,14 +18,17 @@ Deviations = Annotated[tuple[NonNegative, NonNegative], Ascending()]
 
 @dataclass(frozen=True)
 class SensorDraw:
-    """Of n images: ``blur``, the standard deviation of a Gaussian in pixels, and ``grain``, what is added to sRGB
-    values; either is None where there is none.
+    """The sensor's marks on n images.
+
+    ``blur`` is the standard deviation of a Gaussian in pixels, ``grain`` is added to sRGB values; None leaves either
+    out.
     """
 
     blur: Float[Tensor, "n"] | None
     grain: Float[Tensor, "n 3 h w"] | None
 
     def select(self, index: Tensor | slice) -> SensorDraw:
+        """Return the draw of some of the images."""
         return SensorDraw(*(None if part is None else part[index] for part in (self.blur, self.grain)))
 
 
@@ -58,7 +61,7 @@ class Sensor:
 
 
 def seen_by(images: Float[Tensor, "n 3 h w"], sensor: SensorDraw | None) -> Float[Tensor, "n 3 h w"]:
-    """The images blurred, then with noise, in [0, 1]; differentiable in the images where they do not saturate."""
+    """Blur the images, then add noise, in [0, 1]; differentiable in the images where they do not saturate."""
     if sensor is None:
         return images
     if sensor.blur is not None:

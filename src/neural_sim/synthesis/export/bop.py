@@ -35,8 +35,10 @@ LARGEST = 65535
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An object as BOP knows it. ``millimetres`` is the radius of its bounding sphere, ``to_model`` maps the object's
-    normalised frame to its model's, in millimetres; ``mesh`` is in that frame, None where there is none.
+    """An object as BOP knows it.
+
+    ``millimetres`` is the radius of its bounding sphere, ``to_model`` maps the object's normalised frame to its
+    model's, in millimetres; ``mesh`` is in that frame, None where there is none.
     """
 
     name: str
@@ -45,8 +47,9 @@ class Model:
     mesh: trimesh.Trimesh | None = None
 
     def info(self) -> dict[str, float]:
-        """The entry of ``models_info.json``: the bounding box and the largest distance of two points, of the bounding
-        sphere where there is no mesh.
+        """Return the entry of ``models_info.json``: the bounding box and the largest distance of two points.
+
+        Without a mesh they are those of the bounding sphere.
         """
         if self.mesh is None:
             low, size = self.to_model[:3, 3] - self.millimetres, np.full(3, 2.0 * self.millimetres)
@@ -81,7 +84,7 @@ def depth_scale(farthest: float) -> float:
 
 
 def place(number: int, scene_size: int) -> tuple[str, int]:
-    """The scene's folder below the data set's, and the number there, of an image."""
+    """Return the folder of an image's scene below the data set's, and the image's number there."""
     return f"{SPLIT}/{number // scene_size:06d}", number % scene_size
 
 
@@ -131,7 +134,7 @@ def write_bop(
 
 
 def matrix_of(camera: Mapping[str, float]) -> list[float]:
-    """The camera matrix, row by row."""
+    """Return the camera matrix, row by row."""
     return [camera["fx"], 0.0, camera["cx"], 0.0, camera["fy"], camera["cy"], 0.0, 0.0, 1.0]
 
 

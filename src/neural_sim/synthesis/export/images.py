@@ -45,9 +45,11 @@ class DrawnObject:
 
 @dataclass(frozen=True, eq=False)
 class ShownObject:
-    """An object in an image. ``full`` are the pixels of its silhouette within the image, ``visible`` those that no
-    other object hides; ``pixels`` is the number of its silhouette's, with those beyond the image, and ``box`` (x0, y0,
-    x1, y1) is round them, None where there are none. ``labelled``: enough of it is visible for a label.
+    """An object in an image.
+
+    ``full`` are the pixels of its silhouette within the image, ``visible`` those that no other object hides; ``pixels``
+    counts those of its silhouette, also beyond the image, and ``box`` (x0, y0, x1, y1) is round them, None where there
+    are none. ``labelled``: enough of it is visible for a label.
     """
 
     placed: DrawnObject
@@ -60,8 +62,9 @@ class ShownObject:
 
 @dataclass(frozen=True, eq=False)
 class ExportImage:
-    """An image, sRGB in 8 bits, with the depth along the view axis of what is visible (millimetres, 0 where no object
-    is) and its objects, the layout's first one first.
+    """An image, sRGB in 8 bits, with its depth and objects, the layout's first one first.
+
+    The depth is along the view axis, of what is visible, in millimetres, and 0 where no object is.
     """
 
     pixels: UInt8[np.ndarray, "height width 3"]
@@ -90,7 +93,7 @@ class ImageSource:
         return torch.Generator().manual_seed(int.from_bytes(state[:8], "little") >> 1)
 
     def drawn(self, number: int) -> list[DrawnObject]:
-        """The objects of an image, its own first."""
+        """Draw the objects of an image, its own first."""
         generator, scene, camera = self.generator(number, "scene"), self.scene, self.camera
         synthesizer, classes = scene.synthesizer, len(scene.names)
         layout = draw_layout(torch.tensor([number % classes]), classes, synthesizer.count, generator)
@@ -109,7 +112,7 @@ class ImageSource:
 
     @torch.no_grad()
     def image(self, number: int) -> ExportImage:
-        """The image of that number."""
+        """Make the image of that number."""
         height, width, placed = self.camera.height, self.camera.width, self.drawn(number)
         device = self.scene.device
         layers = [self._layer(item) for item in placed]
@@ -183,7 +186,7 @@ class Layer:
     depth: Float[Tensor, "h w"]
 
     def within(self, height: int, width: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """The rectangle's part within an image: its rows and columns in the layer, and in the image."""
+        """Cut the rectangle to an image; return its rows and columns in the layer, and in the image."""
         high, wide = self.opacity.shape
         rows = max(0, self.top), max(0, self.top, min(height, self.top + high))
         columns = max(0, self.left), max(0, self.left, min(width, self.left + wide))
@@ -196,8 +199,10 @@ class Layer:
 
 
 def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], radius: float) -> Box:
-    """(x0, y0, x1, y1), whole pixels round the image of the ball of ``radius`` about the origin, within three image
-    sizes about the image (the canvas on which the BOP toolkit counts pixels beyond the image); empty where it has none.
+    """Return whole pixels (x0, y0, x1, y1) round the image of the ball of ``radius`` about the origin.
+
+    They lie within three image sizes about the image, the canvas on which the BOP toolkit counts pixels beyond the
+    image; they are empty where the ball has no image.
     """
     x, y, z = (camera_to_world[:3, :3].t() @ -camera_to_world[:3, 3]).tolist()
     sides = []

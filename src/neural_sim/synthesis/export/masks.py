@@ -33,7 +33,7 @@ def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
 
 
 def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "corners 2"]]:
-    """The closed outlines of a mask, each by its corners (x, y) along pixel edges, those round most pixels first.
+    """Trace the closed outlines of a mask, each by its corners (x, y) along pixel edges, those round most pixels first.
 
     Outlines of parts go clockwise in the image, those of holes the other way; parts that touch at a corner are two.
     """
@@ -73,8 +73,10 @@ def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "co
 
 
 def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 2"]:
-    """One closed polygon whose inside, by the even-odd rule, is the mask: its outlines, each reached from the first
-    one's first corner and left back to it, so that these ways cancel. Empty for an empty mask.
+    """Join the outlines of a mask to one closed polygon whose inside, by the even-odd rule, is the mask.
+
+    Each outline is reached from the first one's first corner and left back to it, so that these ways cancel. The
+    polygon of an empty mask is empty.
     """
     loops = outlines(mask)
     if not loops:
@@ -86,8 +88,9 @@ def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 
 
 
 def _closes(ways: list[int], before: int) -> bool:
-    """Whether a walk that arrives at its first corner is done though another edge begins there: it would not turn right
-    into it.
+    """Tell whether a walk that arrives at its first corner is done though another edge begins there.
+
+    It is where the walk would not turn right into that edge.
     """
     return (before + 1) % 4 not in ways
 

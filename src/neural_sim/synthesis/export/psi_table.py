@@ -20,11 +20,11 @@ COLUMNS = ("object", "factor", "coordinate", "unit", "spacing", "bin", "low", "h
 def psi_rows(
     distribution: SceneDistribution, psi: Float[Tensor, "objects K"], names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """A row for every bin of every object, counted from 1: to draw, choose a bin of each factor with its weight, then a
-    number between ``low`` and ``high``, uniform, or uniform in its logarithm where ``spacing`` is ``log``.
+    """Tabulate every bin of every object, counted from 1.
 
-    Coordinates that no factor draws are one bin of weight 1. The weights of lights are no probabilities: each image is
-    lit by all anchor lights in these proportions.
+    To draw, choose a bin of each factor with its weight, then a number between ``low`` and ``high``, uniform, or
+    uniform in its logarithm where ``spacing`` is ``log``. Coordinates that no factor draws are one bin of weight 1. The
+    weights of lights are no probabilities: each image is lit by all anchor lights in these proportions.
     """
     rows, p = [], distribution.probabilities(psi.double())
     free = set(distribution.ranges) - {factor.coordinate for factor in distribution.binned}
@@ -66,7 +66,7 @@ def _placed(
 
 
 def psi_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """The table with a header."""
+    """Write the table with a header, as CSV."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)

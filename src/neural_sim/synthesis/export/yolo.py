@@ -19,8 +19,10 @@ SEGMENT = "segment"
 
 
 def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: Sequence[str]) -> None:
-    """``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``; below ``segment`` the same images with the
-    visible masks as polygons. Images without objects have empty files, as YOLO has them.
+    """Write ``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``.
+
+    ``segment`` has the same images with the visible masks as polygons. Images without objects have empty files, as YOLO
+    has them.
     """
     for record in records:
         name = Path(record["file"])
