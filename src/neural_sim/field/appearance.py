@@ -16,6 +16,7 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.extinction import Surface
@@ -61,6 +62,7 @@ class AppearanceField(RadianceField):
         self.register_buffer("mixing", torch.full((anchors, learned), 1.0 / learned))
         self.mixing: Tensor
 
+    @override
     def settings(self) -> dict[str, object]:
         return {
             "features": self.grid.features,
@@ -87,13 +89,14 @@ class AppearanceField(RadianceField):
         return self.mixing @ self.codes
 
     def lit(self, code: Float[Tensor, "code"], rates: Float[Tensor, "q code"] | None = None) -> LitField:
-        """This field under one code, which moves at ``rates`` (None: it does not)."""
+        """Return this field under one code, which moves at ``rates`` (None: it does not)."""
         gain = self.gain(code)
         gain_rates = (
             gain.new_zeros(0, len(gain)) if rates is None else functional.linear(rates, self.code.weight)
         )
         return LitField(self, gain, gain_rates)
 
+    @override
     def with_step(self, multiple: float) -> AppearanceField:
         if multiple == 1.0:
             return self
@@ -103,7 +106,7 @@ class AppearanceField(RadianceField):
         return other
 
     def gain(self, code: Float[Tensor, "*n code"]) -> Float[Tensor, "*n width"]:
-        """What a code multiplies the head's hidden units by."""
+        """Return the factors of the head's hidden units under a code."""
         return 1.0 + self.code(code)
 
     def decode(
@@ -130,15 +133,18 @@ class AppearanceField(RadianceField):
         assert directions is not None
         return torch.cat([raw[..., 1:], directions], -1)
 
+    @override
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         return self.lit(self.anchors.mean(0)).query(positions, directions)
 
+    @override
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         return self.grid.sample(rays, termination)
 
     @property
+    @override
     def reach(self) -> float:
         return self.grid.reach
 
@@ -153,18 +159,23 @@ class LitField(RadianceField):
         self.field, self.gain, self.gain_rates = field, gain, gain_rates
         self.light_rates, self.directed = len(gain_rates), field.directed
 
+    @override
     def settings(self) -> dict[str, object]:
         raise TypeError("LitField: save the appearance field itself")
 
+    @override
     def with_step(self, multiple: float) -> LitField:
         return LitField(self.field.with_step(multiple), self.gain, self.gain_rates)
 
+    @override
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         return self.field.sample(rays, termination)
 
+    @override
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
         return self.field.grid.span(camera, camera_to_world, rows)
 
+    @override
     def trace(
         self,
         rays: Rays,
@@ -177,9 +188,11 @@ class LitField(RadianceField):
         return grid.trace_as(self._decode, self.directed, rays, termination, span, skip_empty, surface)
 
     @property
+    @override
     def reach(self) -> float:
         return self.field.reach
 
+    @override
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.fitting import GridFitting
@@ -64,6 +65,7 @@ class AppearanceFitting(Fitting):
         self._transient: TransientHead | None = None
         self._settled = not (self.grid.refine_steps or self.grid.prune_steps)
 
+    @override
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
         self._view_weights, mixing = self._codes_of(views)
         self.field.reset_codes(mixing, generator)
@@ -88,10 +90,12 @@ class AppearanceFitting(Fitting):
             raise ValueError(f"AppearanceFitting: want {self.anchors} anchors of {len(views)} views")
         return own, own[torch.linspace(0, len(views) - 1, self.anchors).long()]
 
+    @override
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
         (sigma, rgb), samples, _, _, pixels = self._decode_batch()
         return [composite(sigma, rgb, samples)], pixels
 
+    @override
     def loss(self) -> Float[Tensor, ""]:
         static, samples, positions, seen_by, pixels = self._decode_batch()
         if self._transient is None or not self._settled:
@@ -108,11 +112,13 @@ class AppearanceFitting(Fitting):
         static = self.field.decode(self.field.grid.raw(positions, cells), directions, gain)
         return static, samples, positions, seen_by, rays.pixels
 
+    @override
     def advance(self, step: int) -> bool:
         changed = self.grid.advance(step)
         self._settled = self._settled or changed
         return changed
 
+    @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
         field = self.field
         head = [p for part in (field.into, field.code, field.out) for p in part.parameters()]

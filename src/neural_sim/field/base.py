@@ -59,14 +59,14 @@ class RadianceField(nn.Module, ABC):
 
     @abstractmethod
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
-        """The distances at which to ``query`` the field along rays of shape (rays, 3).
+        """Return the distances at which to ``query`` the field along rays of shape (rays, 3).
 
         Deterministic and detached: the same rays always give the same distances. Samples behind a transmittance
         below ``termination`` may be left out; 0 leaves nothing out.
         """
 
     def with_step(self, multiple: float) -> RadianceField:
-        """This field, its tensors shared, sampled at ``multiple`` times its step; itself where it has no step."""
+        """Return this field, tensors shared, sampled at ``multiple`` times its step; itself where it has no step."""
         return self
 
     @torch.no_grad()
@@ -102,4 +102,4 @@ class RadianceField(nn.Module, ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, object]:
-        """The constructor's arguments, for ``field_state``."""
+        """Return the constructor's arguments, for ``field_state``."""

@@ -46,7 +46,7 @@ class Extinction:
         return before, before < self._deepest, alive
 
     def opacity(self) -> Float[Tensor, "rays"]:
-        """What all counted samples together absorb: the sum of their weights."""
+        """Return what all counted samples together absorb: the sum of their weights."""
         return -torch.expm1(-self._depth)
 
 
@@ -68,8 +68,10 @@ class Surface:
         before: Float[Tensor, "k"],
         optical: Float[Tensor, "k"],
     ) -> None:
-        """Look at samples of rays ``ray``: the distances of their middles, the lengths that they stand for, the optical
-        depth before each, and its own.
+        """Look at samples of rays ``ray``.
+
+        They come with the distances of their middles, the lengths that they stand for, the optical depth before each,
+        and its own.
         """
         here = ((before < HALF) & (before + optical >= HALF)).nonzero()[:, 0]
         fraction = (HALF - before.index_select(0, here)) / optical.index_select(0, here)

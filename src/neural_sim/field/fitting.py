@@ -10,6 +10,7 @@ import torch
 from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import COARSEST, Resolution, pixels_across, visual_hull
@@ -64,6 +65,7 @@ class GridFitting(Fitting):
         self.termination = termination
         self._ready: list[tuple[RayPool, PackedSamples, Tensor]] = []
 
+    @override
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
         occupied, origin, cell = visual_hull(views, self.resolution >> len(self.refine_steps))
         occupied, origin = crop(occupied, origin, cell)
@@ -74,12 +76,13 @@ class GridFitting(Fitting):
         self._ready = []
 
     def next_batch(self) -> tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]:
-        """The next rays with their samples and the cells of these."""
+        """Return the next rays with their samples and the cells of these."""
         if not self._ready:
             block = self._blocks.draw(self.batch_rays * BATCHES_PER_BLOCK)
             self._ready = self._batches(block, self.batch_rays)[::-1]
         return self._ready.pop()
 
+    @override
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
         rays, samples, cells = self.next_batch()
         positions, directions = sample_points(rays.rays, samples)
@@ -98,6 +101,7 @@ class GridFitting(Fitting):
             batches.append((block.select(slice(first, last)), part, cells[begin:end]))
         return batches
 
+    @override
     def advance(self, step: int) -> bool:
         refine = step in self.refine_steps
         if not refine and step not in self.prune_steps:
@@ -119,6 +123,7 @@ class GridFitting(Fitting):
                 largest.scatter_reduce_(0, cells.long(), weights, "amax")
         return largest > self.prune_weight
 
+    @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
         groups = [([self.field.table], self.learning_rate)]
         if self.field.head is not None:

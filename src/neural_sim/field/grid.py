@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
+from typing_extensions import override
 
 from neural_sim.field.base import RadianceField
 from neural_sim.field.extinction import Extinction, Surface, sum_rows
@@ -73,12 +74,14 @@ class GridField(RadianceField):
         self.register_load_state_dict_pre_hook(_resize_to_state)
         self.reset(torch.ones(1, 1, 1, dtype=torch.bool), torch.full((3,), -1.0), 2.0)
 
+    @override
     def settings(self) -> dict[str, object]:
         names = ("features", "head_width", "step_cells", "initial_density", "density_gain")
         return {name: getattr(self, name) for name in names}
 
     @property
     def occupancy(self) -> Occupancy:
+        """The occupied cells, and the distances to them."""
         return Occupancy(self.origin, self.edge, self.index, self.distance)
 
     @property
@@ -87,13 +90,14 @@ class GridField(RadianceField):
         return self.step_cells * self.edge
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
-        """Moves and casts like any module; refuses a type that cannot tell two places in a cell apart."""
+        """Move and cast as any module does; refuse a type that cannot tell two places in a cell apart."""
         # Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
             raise ValueError(f"GridField: want float32 or float64, got {wanted}")
         return super()._apply(fn, recurse)
 
+    @override
     def with_step(self, multiple: float) -> GridField:
         if multiple == 1.0:
             return self
@@ -211,12 +215,14 @@ class GridField(RadianceField):
         assert directions is not None
         return sigma, torch.sigmoid(self.head(torch.cat([raw[:, 1:], directions], -1)))
 
+    @override
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
         return self.decode(self.raw(positions), directions)
 
     @torch.no_grad()
+    @override
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
         return self.sample_cells(rays, termination, 0.5)[0]
 
@@ -272,10 +278,12 @@ class GridField(RadianceField):
         march(rays, self.occupancy, self.step, 0.5, visit, span, skip_empty)
         return colour, extinction.opacity()
 
+    @override
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span:
         return screen_span(self.coarse, self.coarse_radius, camera, camera_to_world, rows)
 
     @property
+    @override
     def reach(self) -> float:
         return float(self.coarse.norm(dim=0).amax()) + self.coarse_radius if self.coarse.numel() else 0.0
 

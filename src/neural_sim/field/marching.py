@@ -147,7 +147,7 @@ def _flat(local: Axes, shape: torch.Size) -> Int[Tensor, "*n"]:
 
 
 def lookup(local: Float[Tensor, "*samples 3"], occupancy: Occupancy) -> Int[Tensor, "*samples"]:
-    """Number of the occupied cell at positions in cell units from the grid's origin, or -1."""
+    """Find the occupied cell at positions in cell units from the grid's origin: its number, or -1."""
     shape = occupancy.index.shape
     x, y, z = (axis.contiguous() for axis in local.unbind(-1))
     flat = _flat((x, y, z), shape)

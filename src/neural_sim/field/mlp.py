@@ -9,6 +9,7 @@ import torch
 from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor, nn
+from typing_extensions import override
 
 from neural_sim.cameras import unit_sphere_span
 from neural_sim.field.base import RadianceField
@@ -28,7 +29,7 @@ SKIP_LAYER = 4
 def positional_encoding(
     values: Float[Tensor, "samples 3"], frequencies: int
 ) -> Float[Tensor, "samples encoded"]:
-    """The values and sin, cos of 2^k pi times them for k < ``frequencies`` (NeRF, Eq. 4)."""
+    """Return the values, and sin and cos of 2^k pi times them for k < ``frequencies`` (NeRF, Eq. 4)."""
     scales = torch.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
     angles = (values[:, None, :] * scales[:, None]).flatten(1)
     return torch.cat([values, angles.sin(), angles.cos()], -1)
@@ -49,6 +50,7 @@ class NerfNetwork(nn.Module):
             nn.Linear(width + direction, width // 2), nn.ReLU(), nn.Linear(width // 2, 3)
         )
 
+    @override
     def forward(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
@@ -105,6 +107,7 @@ class MLPField(RadianceField):
         self.fine = NerfNetwork(width, depth, position_frequencies, direction_frequencies)
         _initialise(self, torch.Generator().manual_seed(seed))
 
+    @override
     def settings(self) -> dict[str, object]:
         return dict(self._settings)
 
@@ -117,6 +120,7 @@ class MLPField(RadianceField):
         other.fine_samples = max(2, round(self.fine_samples / multiple))
         return other
 
+    @override
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
@@ -225,10 +229,12 @@ class MLPFitting(Fitting):
         super().__init__(field, batch_rays)
         self.learning_rate = learning_rate
 
+    @override
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
         self._blocks = RayBlocks(build_pool(views, None, generator))
         self._generator = generator
 
+    @override
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
         batch = self._blocks.draw(self.batch_rays)
         coarse = self.field.sample_coarse(batch.rays, self._generator)
@@ -236,8 +242,10 @@ class MLPFitting(Fitting):
         sigma, rgb = self.field.query_coarse(*sample_points(batch.rays, coarse))
         return [composite(sigma, rgb, coarse), render_samples(self.field, batch.rays, fine)], batch.pixels
 
+    @override
     def advance(self, step: int) -> bool:
         return False
 
+    @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
         return [(list(self.field.parameters()), self.learning_rate)]

@@ -30,7 +30,7 @@ class Fitting(ABC):
         """All renderings of the next batch that the loss compares with its pixels, and these (premultiplied RGBA)."""
 
     def loss(self) -> Float[Tensor, ""]:
-        """What the next step descends: the expected error of every rendering of the next batch."""
+        """Return what the next step descends: the expected error of every rendering of the next batch."""
         renderings, pixels = self.render()
         return torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
 
@@ -40,7 +40,7 @@ class Fitting(ABC):
 
     @abstractmethod
     def advance(self, step: int) -> bool:
-        """Called after ``step`` steps; says whether the field's parameters were replaced."""
+        """Act after ``step`` steps; return whether the field's parameters were replaced."""
 
     @abstractmethod
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
@@ -54,7 +54,7 @@ class RayBlocks:
         self._pool, self._next = pool, 0
 
     def draw(self, count: int) -> RayPool:
-        """The next ``count`` rays, or the whole pool if it has fewer."""
+        """Return the next ``count`` rays, or the whole pool if it has fewer."""
         if self._next + count > len(self._pool):
             self._next = 0
         first, self._next = self._next, self._next + count

@@ -32,15 +32,21 @@ class Occupancy:
 
     @property
     def count(self) -> int:
+        """The number of occupied cells."""
         return int(self.index.max()) + 1
 
     @property
     def occupied(self) -> Bool[Tensor, "nx ny nz"]:
+        """True where a cell is occupied."""
         return self.index >= 0
 
 
 def build_occupancy(occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> Occupancy:
-    """Number the occupied cells and measure distances to them. Raises ValueError when no cell is occupied."""
+    """Give numbers to the occupied cells, and measure distances to them.
+
+    Raises:
+        ValueError: no cell is occupied.
+    """
     if not bool(occupied.any()):
         raise ValueError(NOTHING)
     number = occupied.flatten().cumsum(0, dtype=torch.int32).view(occupied.shape) - 1

@@ -30,14 +30,18 @@ class RayPool:
         return self.pixels.shape[0]
 
     def select(self, index: Int[Tensor, "some"] | slice) -> RayPool:
+        """Return some of the rays."""
         rays = Rays(self.rays.origins[index], self.rays.directions[index])
         return RayPool(rays, self.pixels[index], self.phase[index], self.view[index])
 
 
 def build_pool(views: PosedViews, border: int | None, generator: torch.Generator) -> RayPool:
-    """The rays of all pixels within ``border`` pixels of a silhouette (None: all), in random order.
+    """Collect the rays of all pixels within ``border`` pixels of a silhouette (None: all), in random order.
 
-    Consecutive rays of the pool are therefore a random batch. Raises ValueError when every alpha is zero.
+    Consecutive rays of the pool are therefore a random batch.
+
+    Raises:
+        ValueError: every alpha is zero.
     """
     alpha = views.images[..., 3]
     near = (alpha > 0.0).to(alpha.dtype)[:, None]

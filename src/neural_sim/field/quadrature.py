@@ -37,7 +37,7 @@ class PackedSamples:
         return self.ray.shape[0]
 
     def of_rays(self, first: int, last: int, begin: int, end: int) -> PackedSamples:
-        """The samples of rays ``first`` to ``last`` - 1, numbered from 0; they are those from ``begin`` to ``end`` - 1.
+        """Return the samples of rays ``first`` to ``last`` - 1, numbered from 0: those from ``begin`` to ``end`` - 1.
 
         Both are ``starts`` of the rays. They are asked for, because reading them here would make the host wait for
         the device once a batch.
@@ -58,6 +58,7 @@ class Span:
     far: Float[Tensor, "rays"]
 
     def select(self, index: Int[Tensor, "some"]) -> Span:
+        """Return the spans of some rays."""
         return Span(self.near.index_select(0, index), self.far.index_select(0, index))
 
 
@@ -87,8 +88,9 @@ def sum_rays(
 
 
 def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
-    """Running sums over the samples, channel by channel where it is not the CPU that adds: CUDA walks the rows of a
-    matrix one by one, a single row in parallel.
+    """Sum up the samples one after the other, channel by channel where it is not the CPU that adds.
+
+    CUDA walks the rows of a matrix one by one, a single row in parallel.
     """
     if values.device.type == "cpu":
         return values.cumsum(0)
@@ -151,12 +153,12 @@ def composite_with_gradient(
 ) -> tuple[
     Float[Tensor, "rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "q rays 3"]
 ]:
-    """``composite`` as RGBA; its derivatives where all samples of a ray move along x, y or z, and where they move so
-    in proportion to their distances; and the colour's derivatives by the q = n - 3 rates that move colours only.
+    """Composite as ``composite`` does, to RGBA, with derivatives.
 
-    The first three rates are those in space, the others' densities are not looked at. A sample's density adds its
-    own colour, as far as light passes through it, and takes away all behind it: with tau = sigma delta the pixel C
-    changes by T exp(-tau) c - sum_{j behind} w_j c_j.
+    These are by motions of all samples of a ray along x, y or z, by motions in proportion to their distances, and the
+    colour's by the q = n - 3 rates that move colours only. The first three rates are those in space, the others'
+    densities are not looked at. A sample's density adds its own colour, as far as light passes through it, and takes
+    away all behind it: with tau = sigma delta the pixel C changes by T exp(-tau) c - sum_{j behind} w_j c_j.
     """
     depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]

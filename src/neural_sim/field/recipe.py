@@ -10,6 +10,7 @@ from typing import Any, cast
 import lightning
 import torch
 from torch.utils.data import DataLoader
+from typing_extensions import override
 
 from neural_sim.devices import synchronise, trainer_on
 from neural_sim.field.appearance import AppearanceField
@@ -53,7 +54,7 @@ class FieldRecipe:
     def fit(
         self, views: PosedViews, held_out: int, device: torch.device
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
-        """The fitted field, and its scores on the last ``held_out`` views against steps and seconds."""
+        """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds."""
         placed = views.to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)  # layers of a new field draw from the global generator
@@ -147,13 +148,16 @@ class RadianceFieldModule(lightning.LightningModule):
         self._begun = time.perf_counter()
         self._paused = 0.0
 
+    @override
     def setup(self, stage: str) -> None:
         self._begun = time.perf_counter()
         self.fitting.start(self.views, self.generator)
 
     def train_dataloader(self) -> DataLoader[int]:
+        """Count the steps, which need no data."""
         return DataLoader(range(self.steps), batch_size=None)  # pyright: ignore[reportArgumentType]
 
+    @override
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [
             {"params": parameters, "lr": rate, "initial_lr": rate}
@@ -161,6 +165,7 @@ class RadianceFieldModule(lightning.LightningModule):
         ]
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
 
+    @override
     def training_step(self, batch: Any, batch_index: int) -> None:
         optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
         loss = self.fitting.loss()

@@ -30,7 +30,7 @@ LIFT = 0.02
 
 
 def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
-    """The surface where the least alpha over all views is ``LEVEL``, with a colour at each vertex.
+    """Return the surface where the least alpha over all views is ``LEVEL``, with a colour at each vertex.
 
     In the views' frame, without lighting: the colours are those of the views, with the light that was on them.
     ``resolution`` is that of :func:`visual_hull`; the grid of alphas has its cells' centres as points. Cells that a
@@ -61,7 +61,7 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
 
 
 def least_alpha(views: PosedViews, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-    """The least alpha, bilinear, over the views that show each point; 1 where none does."""
+    """Return the least alpha, bilinear, over the views that show each point; 1 where none does."""
     least = torch.ones(len(points), dtype=points.dtype, device=points.device)
     for index in range(len(views)):
         (values, seen) = _sampled(views, index, points)
@@ -70,8 +70,9 @@ def least_alpha(views: PosedViews, points: Float[Tensor, "p 3"]) -> Float[Tensor
 
 
 def vertex_colours(mesh: trimesh.Trimesh, views: PosedViews) -> Float[np.ndarray, "v 3"]:
-    """Mean colour in [0, 1] over the views that see each vertex, weighted towards those that face it; vertices that no
-    view sees have the mean colour of the others.
+    """Return the mean colour in [0, 1] over the views that see each vertex, weighted towards those that face it.
+
+    Vertices that no view sees have the mean colour of the others.
     """
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     points = torch.from_numpy(vertices.copy()).to(views.camera_to_world)

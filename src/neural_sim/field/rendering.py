@@ -86,8 +86,10 @@ def _with_tangents(
 def _by_ray_numbers(
     field: RadianceField, rays: Rays, rates: Rays, samples: PackedSamples
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
-    """As ``_with_tangents``, by the derivatives in space at each sample: their sums along a ray are the pixel's
-    derivatives by the ray's origin, and weighted by distance those by its direction.
+    """Render as ``_with_tangents`` does, by the derivatives in space at each sample.
+
+    Their sums along a ray are the pixel's derivatives by the ray's origin, and weighted by distance those by its
+    direction.
     """
     positions, directions = sample_points(rays, samples)
     unit = torch.eye(3, dtype=positions.dtype, device=positions.device)[:, None].expand(-1, len(samples), -1)

@@ -31,7 +31,7 @@ def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Flo
 
 
 def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
-    """The square error of each ray and channel, of which ``expected_error`` is the mean."""
+    """Return the square error of each ray and channel, of which ``expected_error`` is the mean."""
     colour = rendering[0] - pixels[:, :3]
     opacity = (rendering[1] - pixels[:, 3])[:, None]
     return colour.square() - colour * opacity + opacity.square() / 3.0
@@ -48,15 +48,16 @@ def score_views(
 def where_known(
     rendered: Float[Tensor, "views height width 4"], views: PosedViews
 ) -> Float[Tensor, "views height width 4"]:
-    """Renders without the pixels that these views do not show."""
+    """Return renders without the pixels that these views do not show."""
     return rendered if views.known is None else rendered * views.known[..., None]
 
 
 def compare(
     rendered: Float[Tensor, "views height width 4"], images: Float[Tensor, "views height width 4"]
 ) -> dict[str, float]:
-    """``psnr`` and ``ssim`` of premultiplied renders and views over white, ``psnr_foreground`` over the pixels of alpha
-    above 0.
+    """Score premultiplied renders against views over white.
+
+    The scores are ``psnr``, ``ssim``, and ``psnr_foreground`` where alpha is above 0.
 
     PSNR in dB, mean over views of each view's value; SSIM as torchmetrics' default (Gaussian window, range 1).
     """
@@ -95,6 +96,7 @@ def render_lit(
 
 
 def right_half(images: Float[Tensor, "views height width c"]) -> Float[Tensor, "views height half c"]:
+    """Return the right half of every image."""
     return images[:, :, images.shape[2] // 2 :]
 
 

@@ -32,7 +32,7 @@ class TransientHead(nn.Module):
         self.initial_density = initial_density
 
     def reset(self, generator: torch.Generator) -> None:
-        """New codes. Equal ones would stay equal where views have equal gradients."""
+        """Draw new codes. Equal ones would stay equal where views have equal gradients."""
         drawn = torch.randn(self.codes.shape, generator=generator, device=generator.device)
         with torch.no_grad():
             self.codes.copy_(drawn)
@@ -55,7 +55,7 @@ def composite_both(
     transient: tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"], Float[Tensor, "samples"]],
     samples: PackedSamples,
 ) -> tuple[Rendering, Float[Tensor, "rays"]]:
-    """The image of object and transients together, and each ray's beta, seen through both.
+    """Composite object and transients together; return the image and each ray's beta, seen through both.
 
     Densities add and colours mix by density, which is emission and absorption of two media in one place. (NeRF in
     the Wild adds the alphas of the two, which exceed 1 together where both are opaque.)
@@ -75,8 +75,10 @@ def uncertain_error(
     depths: Float[Tensor, "samples"],
     penalty: float,
 ) -> Float[Tensor, ""]:
-    """|C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, and ``penalty`` times the mean optical depth of the
-    transients' samples (NeRF in the Wild, Sec. 4.2). The square error is expected over backgrounds.
+    """Return |C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, with a penalty of transients.
+
+    ``penalty`` multiplies the mean optical depth of the transients' samples (NeRF in the Wild, Sec. 4.2). The square
+    error is expected over backgrounds.
     """
     errors = expected_errors(rendering, pixels).sum(-1)
     return (0.5 * errors / beta.square() + beta.log()).mean() + penalty * depths.mean()
