@@ -9,6 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.outer.certificate import Certificate, ImplicitQuality, UnrolledQuality
 from neural_sim.outer.steps import Verdict
 
@@ -101,12 +102,13 @@ class LearnedPsi:
 
     ``trajectory`` has the method's psi before the first iteration and after each; a checked step is in it at once, and
     undone an iteration later if it is rejected. ``before`` is the cost before the first iteration: the warm start,
-    whose backbone every loop uses.
+    whose backbone every loop uses, or the estimate of a method that reads psi off the target, which is ``shown``.
     """
 
     trajectory: Float[Tensor, "iterations+1 objects K"]
     records: list[IterationRecord]
     before: Cost = field(default_factory=Cost)
+    shown: tuple[FactorEstimate, ...] = ()
 
     def cost(self, iterations: int) -> Cost:
         """Sum up the cost to the end of a number of iterations; zero for none, whose psi is given."""

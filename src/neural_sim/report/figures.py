@@ -12,6 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.parameter.distributions import merged
@@ -98,6 +99,25 @@ def psi_panel(axes: Any, learned: Learned) -> None:
         bottom += mass
     axes.set_xlim(0, len(p) - 1 + 1.8 * width)
     axes.set_xticks([*ticks, len(p) - 1 + 1.1 * width], [*map(str, ticks), "target"])
+
+
+def shown_panel(axes: Any, one: FactorEstimate) -> None:
+    """Draw what the target shows with its intervals, and where psi stands, by bin; bins that look the same as one."""
+    groups = one.groups
+    start, p, low, high = (
+        merged(torch.tensor(values), groups).numpy() for values in (one.start, one.p, one.low, one.high)
+    )
+    at = np.arange(len(groups))
+    axes.bar(at - 0.2, start, 0.38, color=GRID, label="psi")
+    if one.finding != "too few boxes":
+        errors = np.stack([p - low, high - p]).clip(0.0)
+        strong = 1.0 if one.finding == "moves" else 0.4
+        axes.bar(at + 0.2, p, 0.38, yerr=errors, color=METHOD_COLOURS["learned"], ecolor=INK, capsize=2,
+                 label="target", alpha=strong)  # fmt: skip
+    style(axes)
+    axes.set_xticks(at, ["=".join(map(str, group)) for group in groups], fontsize=7)
+    axes.set(ylim=(min(0.0, float(low.min())), 1))
+    axes.legend(fontsize=7, frameon=False)
 
 
 def _titled(learned: Learned) -> str:
@@ -214,7 +234,7 @@ def write_figures(
     """
     made: dict[str, Figure] = {}
     names = list(results.names)
-    for factor in results.factors if results.records else ():
+    for factor in results.factors if results.moved else ():
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
         made[f"psi_{factor}"] = psi_figure(results.of_factor(factor), title)
     if results.ap:

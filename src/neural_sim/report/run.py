@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.documents import finite, write_json
@@ -67,6 +69,7 @@ class RunResults:
         identity: which runs this one can be compared with, see :func:`identity.identity`.
         real: how photographs trained (``mode``) and how many (``photographs``); empty without.
         score: what detectors are scored by: AP, or accuracy, which ``ap`` then has.
+        shown: what the target's boxes show; empty where nobody read them.
     """
 
     experiment: str
@@ -88,6 +91,12 @@ class RunResults:
     identity: Mapping[str, Any] = field(default_factory=dict)
     real: Mapping[str, Any] = field(default_factory=dict)
     score: Score = "AP"
+    shown: Sequence[FactorEstimate] = ()
+
+    @property
+    def moved(self) -> bool:
+        """Whether the method could move psi."""
+        return bool(self.records) or bool(self.shown)
 
     @property
     def factors(self) -> tuple[str, ...]:
@@ -105,7 +114,7 @@ class RunResults:
                 groups = self.symmetric_bins.get(name, {}).get(factor) or bins
                 listed = {which: values.tolist() for which, values in p.items()}
                 steps = [record["probabilities"][factor][label] for record in self.records]
-                history = [*steps, listed["learned"]]
+                history = [*(steps or [listed["initial"]] * bool(self.shown)), listed["learned"]]
                 found.append(Learned(name, factor, groups, listed, history, _distances(p, groups)))
         return tuple(found)
 
@@ -146,6 +155,7 @@ class RunResults:
                 "validation_ap": self.validation_ap,
                 "real": self.real,
                 "curve": self.curve,
+                "shown": [dataclasses.asdict(one) for one in self.shown],
                 "certificates": untrusted(self.records),
                 "images_without_box": self.images_without_box,
                 "iterations": self.records,
@@ -176,6 +186,7 @@ class RunResults:
             for which in ("initial", "learned"):
                 row = "".join(f"{one.distances[which]:>13.2f}" for one in self.of_factor(factor))
                 lines.append(f"  {which:<22}{row}")
+        lines += [one.sentence for one in self.shown]
         trust = untrusted(self.records)
         if trust["steps"]:
             lines.append(_trust_line(trust))

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Literal
 
 from neural_sim.baseline.base import HypergradientLoop
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.detector.real import Real
 from neural_sim.detector.training import Training
 from neural_sim.outer.records import IterationRecord, LearnedPsi
@@ -17,6 +18,7 @@ from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.images import Images, Psi
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import PictureSubjectStage
+from neural_sim.stages.shown import ShownStage
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,18 @@ class Graph(Images):
         return replace(uniform, scene=self.scene.showing(pictures))
 
     @cached_property
+    def shown(self) -> ShownStage:
+        """What the target's boxes show, read as the method says where it reads them."""
+        x, method = self.experiment, self.experiment.loop.method
+        distribution = x.imaging.distribution
+        angles = [factor.name for factor in distribution.binned if factor.coordinate in ("phi", "rho")]
+        return ShownStage(
+            self.scene, self.targets, tuple(self.symmetry(name, angle) for name in self.names for angle in angles),
+            distribution, method if isinstance(method, LabelShift) else LabelShift(), self.psi("initial"),
+            x.score == "accuracy", x.run.seed,
+        )  # fmt: skip
+
+    @cached_property
     def learned(self) -> PsiStage:
         """The psi that the method learns."""
         x = self.experiment
@@ -119,7 +133,8 @@ class Graph(Images):
         parts = HypergradientParts(x.loop.gradient, x.loop.solver) if follows else None
         return PsiStage(
             self.warm_start, self.targets, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
-            self.psi("initial"), x.run.seed, x.run.progress, self.on_record,
+            self.psi("initial"), x.run.seed, self.shown if isinstance(x.loop.method, LabelShift) else None,
+            x.run.progress, self.on_record,
         )  # fmt: skip
 
     def synthetic(self, psi: Psi, called: str) -> DetectorStage:

@@ -7,11 +7,14 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
+from neural_sim.baseline.label_shift.evidence import estimates_of
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
@@ -23,10 +26,11 @@ from neural_sim.parameter.product import Draws, HardDraws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.shown import ShownStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 
-Method = Fixed | HypergradientLoop | Response | RewardMethod
+Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
 
 
 @dataclass(frozen=True)
@@ -41,8 +45,8 @@ class HypergradientParts:
 class PsiStage(Stage[LearnedPsi]):
     """The psi loop of ``method`` from the warm start's distribution.
 
-    ``parts`` are those of a method that follows the hypergradient, None for others. ``on_record`` is called with every
-    iteration's record as it ends.
+    ``parts`` are those of a method that follows the hypergradient, ``shown`` is what the method reads off the target's
+    boxes; None for others. ``on_record`` is called with every iteration's record as it ends.
 
     Raises:
         ValueError: ``outer.loop_layers`` of a backbone that has no such stages; here, before fields are trained.
@@ -59,6 +63,7 @@ class PsiStage(Stage[LearnedPsi]):
     outer: Outer
     initial: Float[Tensor, "objects K"]
     seed: int
+    shown: ShownStage | None = None
     progress: bool = field(default=False, metadata=UNKEYED)
     on_record: Callable[[IterationRecord], object] | None = field(default=None, metadata=UNKEYED)
 
@@ -74,7 +79,9 @@ class PsiStage(Stage[LearnedPsi]):
     @property
     @override
     def needed(self) -> Iterator[Stage[Any]]:
-        return iter(()) if isinstance(self.method, Fixed) else self.inputs
+        if isinstance(self.method, Fixed):
+            return iter(())
+        return self.inputs if self.shown is None else iter((self.shown,))
 
     @property
     def draws(self) -> Draws:
@@ -88,6 +95,10 @@ class PsiStage(Stage[LearnedPsi]):
         if isinstance(self.method, Fixed):
             psi = self.distribution.psi(self.method.which, list(self.warm_start.scene.names))
             return LearnedPsi(psi[None], [], Cost())
+        if self.shown is not None:
+            found = results(self.shown)
+            spent = Cost(found.images, 0, 0, found.seconds, sum(found.cpu_seconds.values()))
+            return LearnedPsi(torch.stack([self.initial, found.psi]), [], spent, found.factors)
         warm_start = results(self.warm_start)
         learned = learn_psi(self.loop(results), self.progress, self.on_record)
         return replace(learned, before=warm_start.cost)
@@ -109,7 +120,7 @@ class PsiStage(Stage[LearnedPsi]):
             return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver, generator)
         if isinstance(method, Response):
             return ResponseLoop(inner, self.initial, method.part, generator)
-        if isinstance(method, (Fixed, HypergradientLoop)):
+        if isinstance(method, (Fixed, LabelShift, HypergradientLoop)):
             raise ValueError(f"baseline={method.name} has no outer loop")
         return RewardLoop(inner, self.initial, method, generator)
 
@@ -119,9 +130,11 @@ class PsiStage(Stage[LearnedPsi]):
             "trajectory": value.trajectory,
             "records": [dataclasses.asdict(record) for record in value.records],
             "before": dataclasses.asdict(value.before),
+            "shown": [dataclasses.asdict(one) for one in value.shown],
         }
 
     @override
     def unpack(self, stored: Mapping[str, Any]) -> LearnedPsi:
         records = [record_of(record) for record in stored["records"]]
-        return LearnedPsi(stored["trajectory"], records, Cost(**stored["before"]))
+        shown = estimates_of(stored["shown"])
+        return LearnedPsi(stored["trajectory"], records, Cost(**stored["before"]), shown)

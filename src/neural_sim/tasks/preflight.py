@@ -47,7 +47,7 @@ class PreflightTask(Task):
             raise ValueError(
                 f"preflight wants a method that follows the hypergradient, got baseline={method.name}"
             )
-        return [graph.targets, graph.warm_start, graph.of_initial]
+        return [graph.targets, graph.shown, graph.warm_start, graph.of_initial]
 
     @override
     def run(self, context: Context) -> None:
@@ -76,6 +76,7 @@ class PreflightTask(Task):
             distance_factor=distance_factor(differ),
             labelled=tuple(labelled),
             score=x.score,
+            shown=results(graph.shown).factors,
         )
         document = dataclasses.asdict(report) | {"verdict": report.verdict, "worth": report.worth}
         write_json(context.folder / "preflight.json", document)

@@ -137,6 +137,7 @@ def run_results(context: Context, scores: Mapping[str, Scores], symmetric: bool 
         identity=_identity(context),
         real=_real(context),
         score=x.score,
+        shown=learned.shown,
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.outer.inner import pooled
 from neural_sim.parameter.product import HardDraws
 from neural_sim.report.run_tracking import LiveRun
@@ -118,11 +119,12 @@ def omitted(graph: Graph) -> list[Omission]:
     """Return the work that a run leaves out because its scene does not need it; the log says so too."""
     x, draws = graph.experiment, graph.learned.draws
     method, outer, distribution = x.loop.method, x.loop.outer, x.imaging.distribution
-    loops, follows = not isinstance(method, Fixed), isinstance(method, HypergradientLoop)
+    loops, follows = not isinstance(method, (Fixed, LabelShift)), isinstance(method, HypergradientLoop)
     fixed = 0.0 if outer.learned is None else 1.0 - len(outer.learned) / len(graph.names)
     rows = [
         (not distribution.lights, "field", "appearance codes", "no parameter moves the light", None),
-        (not loops, "psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0),
+        (isinstance(method, Fixed), "psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0),
+        (isinstance(method, LabelShift), "psi", "the psi loop", f"baseline={method.name} trains no detector", 1.0),
         (loops and not follows, "psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0),
         (follows and isinstance(draws, HardDraws), "psi", "the renderer's derivative",
          "the estimator scores images and differentiates none", 1.0),

@@ -40,12 +40,14 @@ class Estimate:
         factors: object by object, each factor of psi.
         psi: where it stands now, with what moves moved.
         images: that were rendered or composed.
+        seconds: that it took.
         cpu_seconds: spent, by what: pool, images, network, evidence.
     """
 
     factors: tuple[FactorEstimate, ...]
     psi: Float[Tensor, "objects K"]
     images: int = 0
+    seconds: float = 0.0
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -85,7 +87,7 @@ def estimate(
         groups: bins that look the same; None: every bin looks different.
         whole: read whole images instead of boxes, for ``task=classification``.
     """
-    clock = _Clock()
+    clock, begun = _Clock(), time.perf_counter()
     pool = pool_for(scene, settings.per_bin, generator)
     clock("pool")
     sides = parted(pool, settings.held_out)
@@ -103,4 +105,5 @@ def estimate(
         own, moved[label] = reader.read(label, name, moved[label], (groups or {}).get(name, {}))
         found += own
     clock("evidence")
-    return Estimate(tuple(found), moved, len(training.crops) + len(held.crops), clock.spent)
+    images, seconds = len(training.crops) + len(held.crops), time.perf_counter() - begun
+    return Estimate(tuple(found), moved, images, seconds, clock.spent)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -37,6 +37,7 @@ class FactorEstimate:
         name: the object.
         factor: of psi.
         boxes: that were read.
+        start: probabilities of the bins, or weights of the lights, where psi stands.
         p: probabilities of the bins, or weights of the lights, most probable.
         low: lower ends of their intervals.
         high: upper ends.
@@ -51,6 +52,7 @@ class FactorEstimate:
     name: str
     factor: str
     boxes: int
+    start: tuple[float, ...]
     p: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -92,6 +94,21 @@ class FactorEstimate:
             if total > 0.75:
                 break
         return shown
+
+
+def estimates_of(stored: Iterable[Mapping[str, Any]]) -> tuple[FactorEstimate, ...]:
+    """Invert ``dataclasses.asdict`` for several estimates."""
+    tuples = {
+        "start": tuple,
+        "p": tuple,
+        "low": tuple,
+        "high": tuple,
+        "groups": lambda g: tuple(map(tuple, g)),
+    }
+    return tuple(
+        FactorEstimate(**{key: tuples.get(key, lambda v: v)(value) for key, value in one.items()})
+        for one in stored
+    )
 
 
 def _called(group: Sequence[int]) -> str:

@@ -99,10 +99,12 @@ class _Object:
         if boxes < settings.fewest:
             finding = "too few boxes"
         own = tuple(tuple(group) for group in groups)
+        start = tuple(self.reader.distribution.factor(factor).p_of(self.psi[factor]).tolist())
         return FactorEstimate(
             self.name,
             factor,
             boxes,
+            start,
             span.p,
             span.low,
             span.high,

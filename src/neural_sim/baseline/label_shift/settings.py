@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from annotated_types import Ge, Gt, Lt
 
@@ -29,8 +29,10 @@ class LabelShift:
         interval: probability that an interval covers.
         strange: largest part of an object's boxes that may look like no render; above, its psi does not move.
         fewest: boxes of an object, below which it does not move.
+        name: in reports.
     """
 
+    explores: ClassVar[bool] = False
     per_bin: PositiveInt = 48
     held_out: Annotated[float, Gt(0), Lt(1)] = 0.25
     compositions: Annotated[int, Ge(1)] = 2
@@ -42,3 +44,4 @@ class LabelShift:
     interval: Annotated[float, Gt(0), Lt(1)] = 0.9
     strange: PositiveFraction = 0.5
     fewest: PositiveInt = 8
+    name: str = "label_shift"

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import torch
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.protocol import Score
 from neural_sim.outer.preflight import ExpectedGains, PhotographGain, equivalent
 from neural_sim.report.page import pictures, render
+from neural_sim.report.page.run_page import shown_chart
 from neural_sim.report.page.verdict import listed
 from neural_sim.report.page.weak_bins import BinScore, by_object, weakest
 from neural_sim.target.mismatch import Mismatch
@@ -36,6 +38,7 @@ class Preflight:
         distance_factor: camera distances times this would match the sizes of boxes; None: they agree.
         labelled: what numbers of labelled photographs in training are worth; empty where none are for training.
         score: what detectors are scored by.
+        shown: what the target's boxes show.
     """
 
     experiment: str
@@ -48,6 +51,7 @@ class Preflight:
     distance_factor: float | None
     labelled: tuple[PhotographGain, ...] = ()
     score: Score = "AP"
+    shown: tuple[FactorEstimate, ...] = ()
 
     @property
     def promising(self) -> list[ExpectedGains]:
@@ -104,6 +108,7 @@ class Preflight:
         lines = [
             self.verdict,
             self.worth,
+            *(one.sentence for one in self.shown),
             f"{'object':<14}{'factor':<14}{'p':>9}{'step':>9}{'error':>9}  best bin",
         ]
         for f in self.foreseen:
@@ -154,6 +159,7 @@ def write_preflight_page(
     path = folder / FILE
     text = render.page(
         "preflight.html", title=f"{report.experiment}: preflight", report=report, sides=sides, largest=largest,
+        shown=[(shown_chart(one), one) for one in report.shown],
         bins=by_object(report.bins), weak=weakest(report.bins), promising=report.promising,
     )  # fmt: skip
     path.write_text(text, encoding="utf-8")

@@ -11,6 +11,7 @@ import torch
 from matplotlib.colors import to_hex
 from torch import Tensor
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
 from neural_sim.outer.certificate import untrusted
@@ -98,6 +99,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
         others=gains.get("others"),
         lost=[gain for key, gain in gains.items() if key.startswith("lost:")],
         psi=_psi(results),
+        shown=[(shown_chart(one), one) for one in results.shown],
         rows=_score_rows(results),
         curve=_curve(results, aim),
         aim=listed(aim),
@@ -146,7 +148,7 @@ def score_table(shown: Shown, names: Sequence[str], score: Score) -> ScoreTable:
 def _psi(results: RunResults) -> list[FactorCharts]:
     """Return charts of what was learned, the biased objects' first; none where nothing was."""
     drawn = []
-    for factor in results.factors if results.records else ():
+    for factor in results.factors if results.moved else ():
         learned = sorted(results.of_factor(factor), key=lambda one: one.name not in results.biased)
         panels = [PsiChart(one.name, psi_chart(one), one.distances) for one in learned]
         colours = bin_colours(factor, len(learned[0].p["learned"]))
@@ -179,6 +181,13 @@ def _curve(results: RunResults, aim: Sequence[str]) -> str | None:
 def bin_colours(factor: str, bins: int) -> list[str]:
     """Return the colours of a factor's bins in these charts, for a legend."""
     return [to_hex(colour) for colour in figures.bin_colours(factor, bins)]
+
+
+def shown_chart(one: FactorEstimate) -> str:
+    """Draw what the target shows of one object and factor, with psi's bars next to it."""
+    figure = Figure(figsize=(3.4, 1.9), layout="constrained")
+    figures.shown_panel(figure.add_subplot(), one)
+    return render.data_uri(figure)
 
 
 def psi_chart(learned: Learned) -> str:

@@ -1,0 +1,65 @@
+"""Stage ``shown``: what the target's boxes show, before any detector is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from neural_sim.baseline.label_shift.estimate import Estimate, estimate
+from neural_sim.baseline.label_shift.evidence import estimates_of
+from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.parameter.product import SceneDistribution
+from neural_sim.randomness import stream
+from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.stage import Results, Stage
+from neural_sim.stages.symmetry import SymmetryStage
+from neural_sim.stages.target_sets import TargetSetsStage
+
+
+@dataclass(frozen=True)
+class ShownStage(Stage[Estimate]):
+    """The estimate by label shift, from the target's validation images.
+
+    ``symmetries`` are the bins of every object and angle that look the same; ``psi`` is where it stands; ``whole``:
+    images are read as a whole, since they have no boxes.
+    """
+
+    phase: ClassVar[str] = "psi"
+    kind: ClassVar[str] = "shown"
+
+    scene: SceneStage
+    targets: TargetSetsStage
+    symmetries: tuple[SymmetryStage, ...]
+    distribution: SceneDistribution
+    settings: LabelShift
+    psi: Float[Tensor, "objects K"]
+    whole: bool
+    seed: int
+
+    @property
+    @override
+    def title(self) -> str:
+        return "what the target shows"
+
+    @override
+    def make(self, results: Results) -> Estimate:
+        groups: dict[str, dict[str, list[list[int]]]] = {name: {} for name in self.scene.names}
+        for stage in self.symmetries:
+            groups[stage.object][stage.angle] = results(stage)
+        scene, validation = results(self.scene), results(self.targets).val
+        generator = stream(self.seed, "psi")
+        return estimate(scene, validation, self.psi, self.settings, generator, groups, self.whole)
+
+    @override
+    def pack(self, value: Estimate) -> dict[str, Any]:
+        return {**vars(value), "factors": [dataclasses.asdict(one) for one in value.factors]}
+
+    @override
+    def unpack(self, stored: Mapping[str, Any]) -> Estimate:
+        return Estimate(**{**stored, "factors": estimates_of(stored["factors"])})
