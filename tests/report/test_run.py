@@ -7,6 +7,7 @@ import pytest
 import torch
 from mlflow import MlflowClient
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.report import tracking
 from neural_sim.report.figures import image_grid, psi_figure, write_figures
 from neural_sim.report.run import Learned, RunResults, write_results
@@ -52,6 +53,19 @@ def test_results_are_json_by_the_standard(results, tmp_path):
     assert held["certificates"]["actions"] == {"shrunk": 2} and held["certificates"]["cosines"] == [0.9, 0.9]
     assert held["images_without_box"] == 6
     assert held["psi"]["a"]["pose"]["learned"] == pytest.approx([0.85, 0.05, 0.05, 0.05])
+
+
+def test_what_the_target_shows_is_in_the_results_the_summary_and_the_history(results, tmp_path):
+    one = FactorEstimate(
+        "a", "pose", 40, (0.25,) * 4, (0.85, 0.05, 0.05, 0.05), (0.7, 0.0, 0.0, 0.0), (0.9, 0.1, 0.1, 0.1),
+        ((1,), (2,), (3,), (4,)), 0.005, 0.05, 0.9, "moves",
+    )  # fmt: skip
+    read = dataclasses.replace(results, records=[], shown=(one,))
+    held = json.loads(write_results(read, tmp_path).read_text())
+    assert held["shown"][0]["low"] == [0.7, 0.0, 0.0, 0.0] and held["shown"][0]["finding"] == "moves"
+    assert "your target shows the a from pose bin 1 (0.70 to 0.90)" in read.summary()
+    assert [history[0] for history in read.learned[0].history] == [0.25, 0.85]
+    assert read.moved and not dataclasses.replace(read, shown=()).moved
 
 
 def test_bins_that_look_the_same_are_scored_as_one(results):

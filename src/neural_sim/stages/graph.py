@@ -116,13 +116,14 @@ class Graph(Images):
     @cached_property
     def shown(self) -> ShownStage:
         """What the target's boxes show, read as the method says where it reads them."""
-        x, method = self.experiment, self.experiment.loop.method
+        x, settings = self.experiment, self.experiment.loop.method
+        if not isinstance(settings, LabelShift):
+            settings = LabelShift(per_bin=x.loop.outer.pool_per_bin or LabelShift.per_bin)
         distribution = x.imaging.distribution
         angles = [factor.name for factor in distribution.binned if factor.coordinate in ("phi", "rho")]
         return ShownStage(
             self.scene, self.targets, tuple(self.symmetry(name, angle) for name in self.names for angle in angles),
-            distribution, method if isinstance(method, LabelShift) else LabelShift(), self.psi("initial"),
-            x.score == "accuracy", x.run.seed,
+            distribution, settings, self.psi("initial"), x.score == "accuracy", x.run.seed,
         )  # fmt: skip
 
     @cached_property

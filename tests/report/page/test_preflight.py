@@ -5,6 +5,7 @@ import re
 
 import torch
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.outer.preflight import ExpectedGains, PhotographGain
 from neural_sim.report.page.preflight import Preflight, write_preflight_page
 from neural_sim.report.page.weak_bins import BinScore
@@ -63,3 +64,24 @@ def test_the_page_is_self_contained(tmp_path):
     page = write_preflight_page(preflight(0.001, 0.5), images, images, tmp_path).read_text()
     assert "Worth optimising: object 0" in page and "Box size differs" in page
     assert all(source.startswith("data:image/") for source in re.findall(r'src="([^"]*)"', page))
+
+
+def test_what_the_target_shows_is_said_and_drawn(tmp_path):
+    shown = (
+        FactorEstimate(
+            "object 0", "pose", 30, (0.5, 0.5), (0.9, 0.1), (0.81, 0.02), (0.97, 0.19), ((1,), (2,)), 0.005,
+            0.07, 0.9, "moves",
+        ),
+        FactorEstimate(
+            "object 0", "zoom", 30, (0.5, 0.5), (0.4, 0.6), (0.2, 0.4), (0.6, 0.8), ((1, 2),), 1.0, 0.8, 0.9,
+            "fits no render",
+        ),
+    )  # fmt: skip
+    report = dataclasses.replace(preflight(0.001), shown=shown)
+    said = "your target shows the object 0 from pose bin 1 (0.81 to 0.97)"
+    assert said in report.summary() and "80% of its boxes look like no render" in report.summary()
+    images = LabelledImages(
+        torch.rand(2, 3, 24, 24), torch.zeros(2, 1, 4), torch.full((2, 1), -1), torch.zeros(2).long()
+    )
+    page = write_preflight_page(report, images, images, tmp_path).read_text()
+    assert "What the target shows" in page and page.count('alt="what the target shows') == 2 and said in page
