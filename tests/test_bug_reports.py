@@ -5,17 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 from shared_inputs import laid_out
 
+from neural_sim.cameras import orbit
 from neural_sim.objects.files import MeshFiles
 from neural_sim.objects.folder import MeshFolder
 from neural_sim.objects.photos import Photos
 from neural_sim.pictures import check_headers, read_picture
+from neural_sim.renderer.lighting import Lighting
+from neural_sim.renderer.raycast import RaycastRenderer
 from neural_sim.synthesis.background import PhotoFolder
 from neural_sim.target.coco import CocoTarget
 from neural_sim.target.folders import FolderTarget
 from neural_sim.target.photographs import PhotoFiles
-from neural_sim.types import LabelledImages
+from neural_sim.types import LabelledImages, PinholeCamera
 
 NAMES = ["mug", "can"]
 
@@ -112,6 +117,73 @@ def test_10_leftovers_of_a_mac_are_left_out(tmp_path, caplog):
             meshes: MeshFiles = MeshFolder(out / folder)
             assert meshes.names() == ["box"]
     assert caplog.text.count("leftovers of other programs are left out, such as") == 6
+
+
+def seen_colours(path: Path, name: str) -> list[list[int]]:
+    """What an object of a folder shows of itself where it is plain, by the left edge of each colour."""
+    (item,) = MeshFolder(path, [name]).load()
+    pose = orbit(*(torch.tensor([value], dtype=torch.float64) for value in (0.9, 0.1, 3.0)))
+    renderer = RaycastRenderer(1, Lighting((), ambient=1.0))
+    view = 255.0 * renderer.render(item.mesh, PinholeCamera(48, 48, 0.8), pose)[0]
+    pixels = view[(view[..., 3] > 254.0).nonzero(as_tuple=True)][:, :3].round()
+    colours, counts = pixels.unique(dim=0, return_counts=True)
+    return [colour.int().tolist() for colour, count in zip(colours, counts, strict=True) if count > 30]
+
+
+def test_16_every_primitive_of_a_glb_has_its_own_colour(tmp_path):
+    """By glTF 2.0, in linear space: sRGB of linear 0.02, 0.2, 0.7 is 39, 124, 218."""
+    out = laid_out("16", tmp_path)
+    red, green, blue = [240, 79, 79], [39, 218, 39], [39, 39, 218]
+    wanted = {
+        "colour_no_material": [red], "colour_and_material": [red], "two_factors": [blue, green],
+        "texture_and_factor": [[20, 180, 20], blue], "texture_times_factor": [[250, 87, 87]],
+        "two_unit_factors": [[20, 20, 180], [20, 180, 20]], "two_no_factors": [[20, 20, 180], [20, 180, 20]],
+        "factor_grey": [[124, 124, 124]], "factor_grey_beside_blue": [blue, [124, 124, 124]],
+        "textured_and_vertex": [[20, 180, 20], red],
+    }  # fmt: skip
+    for name, colours in wanted.items():
+        assert np.abs(np.subtract(seen_colours(out, name), colours)).max() <= 1, name
+    with pytest.raises(ValueError, match=r"draco\.glb: .*requires KHR_draco_mesh_compression"):
+        MeshFolder(out, ["draco"]).load()
+
+
+def test_17_materials_of_obj_files_are_found_or_refused_by_name(tmp_path):
+    out = laid_out("17", tmp_path)
+    red, blue = [220, 20, 20], [20, 20, 220]
+    plain = (
+        "sub_folder", "backslash", "windows_path", "spaces", "options", "case", "no_usemtl", "kd_tint", "cmyk",
+        "palette", "tga", "bmp",
+    )  # fmt: skip
+    wanted = {
+        "two": [blue, red], "kd_and_texture": [[26, 26, 230], red], "two_kd": [[26, 26, 230], [230, 26, 26]],
+        "dissolve": [[230, 26, 26]], "grey16": [[78, 78, 78]], **{name: [red] for name in plain},
+    }  # fmt: skip
+    for name, colours in wanted.items():
+        assert np.abs(np.subtract(seen_colours(out, name), colours)).max() <= 1, name
+    assert red in seen_colours(out, "tiled") and blue in seen_colours(out, "tiled")
+    with pytest.raises(ValueError, match=r"missing\.obj: .*missing\.mtl, line 2: the texture 'gone\.png'"):
+        MeshFolder(out, ["missing"]).digests()
+
+
+@pytest.mark.parametrize("number", ["23", "26"])
+def test_23_26_a_changed_texture_changes_the_digest(tmp_path, number):
+    out = laid_out(number, tmp_path)
+    before = MeshFolder(out).digests()
+    for name in before:
+        assert seen_colours(out, name) == [[220, 20, 20]] or name == "jpg"
+        texture = next(
+            path for path in (out / name).rglob("*") if path.suffix in (".png", ".bmp", ".tga", ".jpg")
+        )
+        Image.new("RGB", (8, 8), (20, 220, 20)).save(texture)
+    after = MeshFolder(out).digests()
+    assert all(before[name] != after[name] for name in before)
+
+
+def test_26_a_missing_texture_of_a_ply_is_refused_by_name(tmp_path):
+    out = laid_out("26", tmp_path)
+    (out / "spaces" / "my texture.png").unlink()
+    with pytest.raises(ValueError, match=r"m\.ply: .*'my texture\.png' is neither there"):
+        MeshFolder(out, ["spaces"]).digests()
 
 
 def test_20_a_root_category_is_left_out(tmp_path, caplog):

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -171,11 +172,11 @@ def by(size: tuple[float, ...]) -> str:
 # --- pictures ---
 
 
-def read_picture(path: Path, where: str = "", upright: bool = True) -> Image.Image:
+def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) -> Image.Image:
     """Read a picture in 8 bits: RGBA if its pixels may be transparent, else RGB.
 
     Args:
-        path: the file.
+        path: the file, or its bytes.
         where: what messages begin with; empty: the path.
         upright: whether EXIF turns it; False for pixels as they are stored, which the cameras of captures are of.
 
@@ -191,7 +192,7 @@ def read_picture(path: Path, where: str = "", upright: bool = True) -> Image.Ima
     return image
 
 
-def _loaded(path: Path, where: str) -> tuple[Image.Image, int]:
+def _loaded(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
     with _named(where), Image.open(path) as image:
         orientation = _orientation(image)
         image.load()

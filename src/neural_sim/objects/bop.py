@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import MinLen
 
-from neural_sim.objects.files import MeshFiles, file_digest, folder_of, load_file
+from neural_sim.objects.files import MeshFiles, folder_of, load_file
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.ranges import validated
 
@@ -44,10 +44,6 @@ class BOP(MeshFiles):
         wanted = None if names is None else [str(name) for name in names]
         super().__init__(folder, files, wanted, aliases, "obj_*.ply; want a BOP models folder")
         self._info = folder / "models_info.json"
-
-    def digests(self) -> dict[str, str]:
-        """SHA-256 of the mesh and its texture file by object, without parsing the mesh."""
-        return {name: file_digest(path, path.with_suffix(".png")) for name, path in self._files.items()}
 
     def load(self) -> list[ObjectMesh]:
         """The objects, normalised, in the order of ``names``; transforms lead to metres.

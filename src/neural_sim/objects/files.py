@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -11,16 +12,16 @@ from typing import Annotated, ClassVar
 import numpy as np
 import trimesh
 from annotated_types import MinLen
-from PIL import Image
-from trimesh.visual import TextureVisuals
 
+from neural_sim.objects.gltf import gltf_references, read_gltf
 from neural_sim.objects.mesh import ObjectMesh, normalise
+from neural_sim.objects.paint import join
+from neural_sim.objects.ply import ply_references, read_ply
 from neural_sim.objects.repair import repair
-from neural_sim.pictures import eight_bits
+from neural_sim.objects.wavefront import obj_references, read_obj
 
 Names = Annotated[list[str], MinLen(1)] | None
 """Which objects of a folder, None: all."""
-COMPANIONS = (".mtl", ".png", ".jpg", ".jpeg")
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -42,46 +43,66 @@ def content_digest(files: Mapping[str, Path]) -> str:
 
 
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
-    """Read, repair and normalise a mesh file; several parts in it are joined.
+    """Read, repair and normalise a mesh file; several parts in it are joined, each with its own material.
 
-    glTF files (.glb) have +y up by their standard and are turned to +z up; others are not turned. The object's
-    ``transform`` leads back to the file's frame in metres.
+    glTF files have +y up by their standard and are turned to +z up; others are not turned. The object's ``transform``
+    leads back to the file's frame in metres.
 
     Raises:
         ValueError: a file that cannot be read or has no triangles, with the reason.
     """
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        NotImplementedError,
-        AttributeError,
-    ) as error:  # whatever trimesh's loaders raise on broken or unknown files; NotImplementedError is one of theirs
-        raise ValueError(f"{path}: object {name!r} cannot be read as a mesh: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise ValueError(f"{path}: object {name!r} holds a {type(mesh).__name__}, want a triangle mesh")
-    _read_textures(mesh, f"{path}: texture")
+    with _named(path, f"object {name!r} cannot be read as a mesh"):
+        mesh = _READERS[path.suffix.lower()](path)
     mesh = repair(mesh, name, str(path))
     if metres_per_unit != 1.0:
         mesh.apply_scale(metres_per_unit)
-    if path.suffix.lower() != ".glb":
+    if path.suffix.lower() not in GLTF:
         return normalise(mesh, name, str(path), digest)
     mesh.apply_transform(Y_UP_TO_Z_UP)
     item = normalise(mesh, name, str(path), digest)
     return replace(item, transform=np.linalg.inv(Y_UP_TO_Z_UP) @ item.transform)
 
 
-def _read_textures(mesh: trimesh.Trimesh, where: str) -> None:
-    """Decode a mesh's textures to 8 bits, which trimesh does not. Raises ``ValueError`` for damaged ones."""
-    material = mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None
-    for key in ("image", "baseColorTexture"):
-        image = getattr(material, key, None)
-        if isinstance(image, Image.Image):
-            setattr(material, key, eight_bits(image, where))
+def references(path: Path) -> list[Path]:
+    """Return the files that a mesh file names and that its reader reads: materials, textures, buffers.
+
+    Raises:
+        ValueError: a file that is not there, with the names of both.
+    """
+    with _named(path, "cannot be read as a mesh"):
+        return _REFERENCES.get(path.suffix.lower(), lambda _: [])(path)
+
+
+@contextmanager
+def _named(path: Path, what: str) -> Iterator[None]:
+    """Turn all that a reader raises on a damaged or unknown file into one line with its name."""
+    try:
+        yield
+    except Exception as error:  # of damaged files, whose numbers and names lead anywhere
+        reason = " ".join(str(error).split()) or "its content is damaged"
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise ValueError(f"{path}: {what}: {kind}{reason}") from error
+
+
+def _stl(path: Path) -> trimesh.Trimesh:
+    mesh = trimesh.load(path, force="mesh", process=False)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise ValueError(f"holds a {type(mesh).__name__}, want a triangle mesh")
+    return mesh
+
+
+GLTF = (".glb", ".gltf")
+_READERS: dict[str, Callable[[Path], trimesh.Trimesh]] = {
+    **dict.fromkeys(GLTF, lambda path: join(read_gltf(path))),
+    ".obj": lambda path: join(read_obj(path)),
+    ".ply": lambda path: join(read_ply(path)),
+    ".stl": _stl,
+}
+_REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
+    **dict.fromkeys(GLTF, gltf_references),
+    ".obj": obj_references,
+    ".ply": ply_references,
+}
 
 
 def choose(
@@ -140,8 +161,12 @@ class MeshFiles:
         return list(self._files)
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each mesh and the material and image files beside it, without parsing them."""
-        return {name: file_digest(path, *_companions(path)) for name, path in self._files.items()}
+        """Return the SHA-256 of each mesh and of all files that it names, without parsing the mesh.
+
+        Raises:
+            ValueError: a mesh that names a file which is not there.
+        """
+        return {name: file_digest(path, *references(path)) for name, path in self._files.items()}
 
     def load(self) -> list[ObjectMesh]:
         """The objects, normalised, in the order of ``names``. Source units are taken to be metres."""
@@ -155,10 +180,3 @@ def folder_of(root: str | Path) -> Path:
     if not path.is_dir():
         raise ValueError(f"objects.root: {path} is not a folder")
     return path
-
-
-def _companions(path: Path) -> list[Path]:
-    """Files a mesh may refer to: all materials and images beside it, some of which may be other meshes'."""
-    if path.suffix.lower() in (".glb", ".stl"):
-        return []
-    return sorted(other for other in path.parent.iterdir() if other.suffix.lower() in COMPANIONS)

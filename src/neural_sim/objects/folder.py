@@ -12,12 +12,12 @@ from neural_sim.ranges import validated
 log = logging.getLogger(__name__)
 
 # In order of preference, for a sub-folder with one object in several formats.
-FORMATS = (".glb", ".obj", ".ply", ".stl")
+FORMATS = (".glb", ".obj", ".ply", ".stl", ".gltf")
 
 
 @validated
 class MeshFolder(MeshFiles):
-    """Meshes of a folder (.glb, .obj, .ply, .stl), +z up, in metres (rendering does not depend on the unit).
+    """Meshes of a folder (.glb, .obj, .ply, .stl, .gltf), +z up, in metres (rendering does not depend on the unit).
 
     A file's object has the name of its stem. A sub-folder is one object of that name: its only mesh, or the first by
     ``FORMATS``; nested folders are searched.

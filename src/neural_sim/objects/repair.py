@@ -7,12 +7,14 @@ import logging
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from neural_sim.objects.paint import GREY, Paint
+
 log = logging.getLogger(__name__)
 
-GREY = (160, 160, 160, 255)
 HUGE_FACES = 500_000
 
 
@@ -80,6 +82,9 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
 
 def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     visual, paint = mesh.visual, GREY
+    if isinstance(visual, Paint):
+        visual.uv = _finite_uv(visual.uv, name, source)
+        return mesh
     if isinstance(visual, TextureVisuals):
         material = visual.material
         image = (
@@ -88,7 +93,8 @@ def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trime
             else getattr(material, "image", None)
         )
         if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
-            return _with_finite_uv(mesh, visual, name, source)
+            visual.uv = _finite_uv(np.asarray(visual.uv), name, source)
+            return mesh
         if np.asarray(material.main_color)[:3].any():  # files without any colour come out black
             paint = tuple(int(value) for value in np.asarray(material.main_color)[:4])
         log.warning("%s: object %r: no texture to draw (missing?), painted plain %s", source, name, paint[:3])
@@ -101,9 +107,11 @@ def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trime
     return mesh
 
 
-def _with_finite_uv(mesh: trimesh.Trimesh, visual: TextureVisuals, name: str, source: str) -> trimesh.Trimesh:
-    uv = np.asarray(visual.uv)
-    if not np.isfinite(uv).all():
-        log.warning("%s: object %r: texture coordinates that are not finite set to 0", source, name)
-        visual.uv = np.nan_to_num(uv, nan=0.0, posinf=0.0, neginf=0.0)
-    return mesh
+def _finite_uv(uv: Float[np.ndarray, "v 2"], name: str, source: str) -> Float[np.ndarray, "v 2"]:
+    finite = np.all(np.isfinite(uv), axis=1)
+    if not finite.all():
+        log.warning(
+            "%s: object %r: %d of %d texture coordinates are not finite, set to 0",
+            source, name, int((~finite).sum()), len(uv),
+        )  # fmt: skip
+    return np.where(finite[:, None], uv, 0.0)

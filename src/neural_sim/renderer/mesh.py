@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 from pyrender.constants import GLTF
 
 from neural_sim.cameras import focal_lengths, principal_point
+from neural_sim.objects.paint import Texture
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
@@ -23,6 +24,7 @@ with contextlib.suppress(ImportError):
 
 # Closer than this to the camera nothing is drawn; objects have radius 1 and cameras keep outside of them.
 NEAR, FAR = 0.01, 100.0
+WRAPS = {"repeat": GLTF.REPEAT, "mirror": GLTF.MIRRORED_REPEAT, "clamp": GLTF.CLAMP_TO_EDGE}
 
 
 class PyrenderRenderer(MeshRenderer):
@@ -54,32 +56,40 @@ class PyrenderRenderer(MeshRenderer):
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
-    """Front faces, and the same faces turned round with the light of their inner side.
+    """Front faces of each texture, and the same faces turned round with the light of their inner side.
 
     Each is culled where it faces away, so exactly one of the two is seen and they never fight for depth.
     """
-    texture = None
-    if surface.texture is not None:
-        texture = pyrender.Texture(source=surface.texture, source_channels="RGB")
-    material = pyrender.MetallicRoughnessMaterial(
-        baseColorFactor=(1.0, 1.0, 1.0, 1.0), baseColorTexture=texture, alphaMode="OPAQUE", doubleSided=False
-    )
     sides = []
-    for shade, faces in ((surface.front, surface.faces), (surface.back, surface.faces[:, ::-1])):
-        colour = np.ones((len(shade), 4), dtype=np.float32)
-        colour[:, :3] = surface.albedo * shade
-        uv = None if surface.uv is None else surface.uv.astype(np.float32)
-        sides.append(
-            pyrender.Primitive(
-                positions=surface.vertices.astype(np.float32),
-                texcoord_0=uv,
-                color_0=colour,
-                indices=np.ascontiguousarray(faces, dtype=np.uint32),
-                material=material,
-                mode=GLTF.TRIANGLES,
+    for page in np.unique(surface.page).tolist():
+        faces = surface.faces[surface.page == page]
+        material = _material(None if page < 0 else surface.textures[page])
+        for shade, seen in ((surface.front, faces), (surface.back, faces[:, ::-1])):
+            colour = np.ones((len(shade), 4), dtype=np.float32)
+            colour[:, :3] = surface.albedo * shade
+            sides.append(
+                pyrender.Primitive(
+                    positions=surface.vertices.astype(np.float32),
+                    texcoord_0=None if page < 0 else surface.uv.astype(np.float32),
+                    color_0=colour,
+                    indices=np.ascontiguousarray(seen, dtype=np.uint32),
+                    material=material,
+                    mode=GLTF.TRIANGLES,
+                )
             )
-        )
     return pyrender.Mesh(primitives=sides)
+
+
+def _material(texture: Texture | None) -> pyrender.MetallicRoughnessMaterial:
+    image = None
+    if texture is not None:
+        u, v = (WRAPS[wrap] for wrap in texture.wrap)
+        image = pyrender.Texture(
+            source=texture.pixels, source_channels="RGB", sampler=pyrender.Sampler(wrapS=u, wrapT=v)
+        )
+    return pyrender.MetallicRoughnessMaterial(
+        baseColorFactor=(1.0, 1.0, 1.0, 1.0), baseColorTexture=image, alphaMode="OPAQUE", doubleSided=False
+    )
 
 
 # One context a process: freeing one of two EGL contexts ends the display they share, and with it the other.

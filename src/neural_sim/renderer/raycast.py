@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 from PIL import Image
 from torch import Tensor
 
 from neural_sim.cameras import focal_lengths, rays
+from neural_sim.objects.paint import Wrap
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
@@ -30,31 +31,31 @@ class RaycastRenderer(MeshRenderer):
         self, surface: Surface, camera: PinholeCamera, poses: Float64[np.ndarray, "n 4 4"]
     ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
         bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-        pyramid = None if surface.texture is None else Pyramid(surface.texture)
+        pyramids = [Pyramid(texture.pixels, texture.wrap) for texture in surface.textures]
         for pose in torch.from_numpy(poses):
-            yield _cast(bare, surface, pyramid, camera, pose)
+            yield _cast(bare, surface, pyramids, camera, pose)
 
 
 def _cast(
-    mesh: trimesh.Trimesh, surface: Surface, pyramid: Pyramid | None, camera: PinholeCamera, pose: Tensor
+    mesh: trimesh.Trimesh, surface: Surface, pyramids: Sequence[Pyramid], camera: PinholeCamera, pose: Tensor
 ) -> Float[np.ndarray, "h w 4"]:
     """Premultiplied RGBA: a ray through each pixel's centre, and four more where the silhouette runs."""
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
-    image = _trace(mesh, surface, pyramid, camera, origins, directions)
+    image = _trace(mesh, surface, pyramids, camera, origins, directions)
     edge = _silhouette(image[:, 3].reshape(camera.height, camera.width) > 0.0).reshape(-1)
     image[edge] = 0.0
     fx, fy = focal_lengths(camera)
     for x, y in EDGE_SAMPLES:
         shifted = _shifted(directions[edge], pose.numpy(), x / fx, y / fy)
-        image[edge] += _trace(mesh, surface, pyramid, camera, origins[edge], shifted) / len(EDGE_SAMPLES)
+        image[edge] += _trace(mesh, surface, pyramids, camera, origins[edge], shifted) / len(EDGE_SAMPLES)
     return image.reshape(camera.height, camera.width, 4)
 
 
 def _trace(
     mesh: trimesh.Trimesh,
     surface: Surface,
-    pyramid: Pyramid | None,
+    pyramids: Sequence[Pyramid],
     camera: PinholeCamera,
     origins: np.ndarray,
     directions: np.ndarray,
@@ -65,7 +66,7 @@ def _trace(
     face = mesh.ray.intersects_first(origins, directions)
     hit = np.flatnonzero(face >= 0)
     if len(hit):
-        image[hit, :3] = _colours(surface, pyramid, face[hit], origins[hit], directions[hit], camera)
+        image[hit, :3] = _colours(surface, pyramids, face[hit], origins[hit], directions[hit], camera)
         image[hit, 3] = 1.0
     return image
 
@@ -87,7 +88,7 @@ def _shifted(directions: np.ndarray, pose: np.ndarray, x: float, y: float) -> Fl
 
 def _colours(
     surface: Surface,
-    pyramid: Pyramid | None,
+    pyramids: Sequence[Pyramid],
     face: np.ndarray,
     origins: np.ndarray,
     directions: np.ndarray,
@@ -99,15 +100,18 @@ def _colours(
     # As in OpenGL, the product of albedo and shade is interpolated, not its factors.
     vertex_colour = surface.albedo[corners] * sides
     colour = np.einsum("nk,nkc->nc", weights, vertex_colour)
-    if pyramid is not None and surface.uv is not None:
-        uv = surface.uv[corners]
-        first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-        uv_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-        texels = uv_area * pyramid.texels / np.maximum(area, 1e-12)
-        sample = distance / min(focal_lengths(camera))
+    uv = surface.uv[corners]
+    first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    uv_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    sample = distance / min(focal_lengths(camera))
+    place = np.einsum("nk,nkc->nc", weights, uv)
+    page = surface.page[face]
+    for number, pyramid in enumerate(pyramids):
+        of = page == number
+        texels = uv_area[of] * pyramid.texels / np.maximum(area[of], 1e-12)
         # OpenGL's isotropic filter takes the longer side of the footprint, which a slanted face stretches.
-        texels_a_side = np.sqrt(texels) * sample / np.maximum(np.abs(cosine), 0.05)
-        colour = colour * pyramid.sample(np.einsum("nk,nkc->nc", weights, uv), np.log2(texels_a_side + 1e-12))
+        texels_a_side = np.sqrt(texels) * sample[of] / np.maximum(np.abs(cosine[of]), 0.05)
+        colour[of] = colour[of] * pyramid.sample(place[of], np.log2(texels_a_side + 1e-12))
     return np.clip(colour, 0.0, 1.0)
 
 
@@ -133,7 +137,10 @@ def _barycentric(
 class Pyramid:
     """A texture and its halvings; ``sample`` blends the two levels next to the wanted footprint."""
 
-    def __init__(self, texture: UInt8[np.ndarray, "h w 3"]) -> None:
+    def __init__(
+        self, texture: UInt8[np.ndarray, "h w 3"], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    ) -> None:
+        self._wrap = wrap
         height, width = texture.shape[:2]
         self.texels = height * width
         self._levels = [np.asarray(texture, dtype=np.uint8)]
@@ -144,7 +151,7 @@ class Pyramid:
             self._levels.append(np.asarray(image))
 
     def sample(self, uv: Float[np.ndarray, "n 2"], level: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """Colours in [0, 1]; ``uv`` wraps, v upwards; ``level`` is log2 of texels a sample, 0 or less: full size."""
+        """Colours in [0, 1]; ``uv`` has v upwards; ``level`` is log2 of texels a sample, 0 or less: full size."""
         level = np.clip(level, 0.0, len(self._levels) - 1.0)
         low = np.floor(level).astype(np.int64)
         part = (level - low)[:, None]
@@ -155,17 +162,27 @@ class Pyramid:
             )
             rows = np.flatnonzero(weight[:, 0] > 0.0)
             if len(rows):
-                colour[rows] += weight[rows] * _bilinear(self._levels[number], uv[rows])
+                colour[rows] += weight[rows] * _bilinear(self._levels[number], uv[rows], self._wrap)
         return colour / 255.0
 
 
-def _bilinear(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def _bilinear(texture: np.ndarray, uv: np.ndarray, wrap: tuple[Wrap, Wrap]) -> np.ndarray:
     height, width = texture.shape[:2]
     x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
     x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    left, right = x0 % width, (x0 + 1) % width
-    top, bottom = y0 % height, (y0 + 1) % height
+    left, right = _wrapped(x0, width, wrap[0]), _wrapped(x0 + 1, width, wrap[0])
+    top, bottom = _wrapped(y0, height, wrap[1]), _wrapped(y0 + 1, height, wrap[1])
     upper = texture[top, left] * (1.0 - fx) + texture[top, right] * fx
     lower = texture[bottom, left] * (1.0 - fx) + texture[bottom, right] * fx
     return upper * (1.0 - fy) + lower * fy
+
+
+def _wrapped(index: Int[np.ndarray, "n"], size: int, wrap: Wrap) -> Int[np.ndarray, "n"]:
+    """Return the texels that stand for indices beyond the edges."""
+    if wrap == "clamp":
+        return np.clip(index, 0, size - 1)
+    if wrap == "mirror":
+        turned = index % (2 * size)
+        return np.minimum(turned, 2 * size - 1 - turned)
+    return index % size

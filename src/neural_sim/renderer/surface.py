@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from neural_sim.objects.paint import Paint, Texture
 from neural_sim.renderer.lighting import Lighting, lambert
 
 
@@ -20,7 +21,8 @@ class Surface:
 
     The light and the object share one frame, so the shade belongs to the vertex and no renderer has to agree with
     another about lights or materials. ``front`` holds where a face is seen from outside, ``back`` from inside (open
-    and badly wound meshes). ``albedo`` per vertex in [0, 1] is white where a ``texture`` carries the colour.
+    and badly wound meshes). ``albedo`` per vertex in [0, 1] is white where a texture carries the colour. ``page`` is
+    each face's texture, -1: none.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -28,8 +30,9 @@ class Surface:
     albedo: Float[np.ndarray, "v 3"]
     front: Float[np.ndarray, "v 3"]
     back: Float[np.ndarray, "v 3"]
-    uv: Float[np.ndarray, "v 2"] | None
-    texture: UInt8[np.ndarray, "h w 3"] | None
+    uv: Float[np.ndarray, "v 2"]
+    page: Int[np.ndarray, "f"]
+    textures: tuple[Texture, ...]
 
 
 def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
@@ -46,23 +49,28 @@ def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
         raise ValueError("renderer: the mesh has vertices or normals that are not finite; repair it first")
     faces = np.asarray(mesh.faces, dtype=np.int64)
     visual = mesh.visual
-    uv = texture = None
+    uv, page, textures = np.zeros((len(vertices), 2)), np.full(len(faces), -1), ()
     if isinstance(visual, ColorVisuals) and visual.kind == "face":  # corners can no longer be shared
         albedo = np.repeat(np.asarray(visual.face_colors)[:, :3] / 255.0, 3, axis=0)
         vertices, normals = vertices[faces].reshape(-1, 3), normals[faces].reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
+        uv = np.zeros((len(vertices), 2))
+    elif isinstance(visual, Paint):
+        albedo, uv, page, textures = visual.albedo, visual.uv, visual.page[faces[:, 0]], visual.textures
     elif isinstance(visual, TextureVisuals):
-        albedo, uv, texture = _textured(visual, len(vertices))
+        albedo, texture = _textured(visual, len(vertices))
+        if texture is not None:
+            uv, page, textures = np.asarray(visual.uv, dtype=np.float64), np.zeros_like(page), (texture,)
     elif isinstance(visual, ColorVisuals):
         albedo = np.asarray(visual.vertex_colors)[:, :3] / 255.0
     else:
         raise ValueError(f"renderer: want a mesh with colours or a texture, got {type(visual).__name__}")
     front, back = lambert(normals, lighting), lambert(-normals, lighting)
-    return Surface(vertices, faces, albedo, front, back, uv, texture)
+    return Surface(vertices, faces, albedo, front, back, uv, page, textures)
 
 
-def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Albedo, uv and texture; a material without an image has only its one colour."""
+def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, Texture | None]:
+    """Albedo and texture; a material without an image has only its one colour."""
     material = visual.material
     image, factor = getattr(material, "image", None), np.ones(3)
     if isinstance(material, PBRMaterial):
@@ -70,7 +78,6 @@ def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, np.ndarra
         if material.baseColorFactor is not None:
             factor = np.asarray(material.baseColorFactor)[:3] / 255.0
     if isinstance(image, Image.Image) and visual.uv is not None and len(visual.uv) == count:
-        albedo = np.broadcast_to(factor, (count, 3))
-        return albedo, np.asarray(visual.uv, dtype=np.float64), np.asarray(image.convert("RGB"))
+        return np.broadcast_to(factor, (count, 3)), Texture(np.asarray(image.convert("RGB")))
     colour = np.asarray(material.main_color)[:3] / 255.0
-    return np.broadcast_to(colour, (count, 3)), None, None
+    return np.broadcast_to(colour, (count, 3)), None

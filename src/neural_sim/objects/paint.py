@@ -1,0 +1,259 @@
+"""What meshes are painted with: colours of vertices, and as many textures as a file's materials have."""
+
+from __future__ import annotations
+
+import logging
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int, Shaped, UInt8
+from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.base import Visuals
+from trimesh.visual.material import SimpleMaterial
+from typing_extensions import override
+
+from neural_sim.pictures import read_picture
+
+_log = logging.getLogger(__name__)
+
+GREY = (160, 160, 160, 255)
+"""What is painted where a file says no colour."""
+LARGEST_SIDE = 8192
+"""Sides of textures in pixels that every OpenGL takes; larger ones are halved."""
+Wrap = Literal["repeat", "mirror", "clamp"]
+"""What a texture shows beyond its edges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture in sRGB and what it shows beyond its edges, along u and v."""
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+
+
+class Paint(Visuals):
+    """Colours of vertices times textures, for meshes of several materials.
+
+    Args:
+        albedo: of each vertex, sRGB in [0, 1]; what a texture is multiplied by.
+        uv: of each vertex; v points up in the picture.
+        page: the texture of each vertex, -1: none. The vertices of a face agree.
+        textures: the textures.
+    """
+
+    def __init__(
+        self,
+        albedo: Float[np.ndarray, "v 3"],
+        uv: Float[np.ndarray, "v 2"],
+        page: Int[np.ndarray, "v"],
+        textures: Sequence[Texture],
+    ) -> None:
+        self.albedo, self.uv, self.page, self.textures = albedo, uv, page, tuple(textures)
+
+    @property
+    @override
+    def kind(self) -> str:
+        return "paint"
+
+    @property
+    def defined(self) -> bool:
+        """Whether there are colours, as trimesh asks."""
+        return True
+
+    @override
+    def update_vertices(self, mask: Shaped[np.ndarray, "kept"]) -> None:
+        self.albedo, self.uv, self.page = self.albedo[mask], self.uv[mask], self.page[mask]
+
+    @override
+    def update_faces(self, mask: Shaped[np.ndarray, "kept"]) -> None:
+        """Faces have no colours of their own."""
+
+    @override
+    def concatenate(self, other: Visuals) -> Visuals:
+        raise NotImplementedError("meshes are joined by neural_sim.objects.paint.join")
+
+    @override
+    def __hash__(self) -> int:
+        return hash((self.albedo.tobytes(), self.uv.tobytes(), self.page.tobytes()))
+
+    @override
+    def copy(self) -> Paint:
+        return Paint(self.albedo.copy(), self.uv.copy(), self.page.copy(), self.textures)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The triangles of one material.
+
+    Args:
+        vertices: their corners.
+        faces: three indices each.
+        colours: sRGB in [0, 1] of the vertices, or of the faces; they multiply the texture.
+        normals: of the vertices, None: those of the faces round them.
+        uv: texture coordinates of the vertices; v points up in the picture.
+        texture: None: the colours alone.
+        by_face: whether colours are of the faces.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    colours: Float[np.ndarray, "c 3"]
+    normals: Float[np.ndarray, "v 3"] | None = None
+    uv: Float[np.ndarray, "v 2"] | None = None
+    texture: Texture | None = None
+    by_face: bool = False
+
+
+def join(parts: Sequence[Part]) -> trimesh.Trimesh:
+    """Join parts into one mesh, painted with trimesh's own kinds of colours where these can say it.
+
+    Raises:
+        ValueError: no parts.
+    """
+    if not parts:
+        raise ValueError("holds no triangles")
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    normals = None
+    if any(part.normals is not None for part in parts):
+        normals = np.concatenate([_normals_of(part) for part in parts])
+    joined = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    if len(parts) == 1 and parts[0].by_face:
+        joined.visual = ColorVisuals(joined, face_colors=_bytes(parts[0].colours))
+    else:
+        joined.visual = _paint_of(parts)  # pyright: ignore[reportAttributeAccessIssue]  # trimesh takes any Visuals
+    return joined
+
+
+def _normals_of(part: Part) -> Float[np.ndarray, "v 3"]:
+    if part.normals is not None:
+        return part.normals
+    return np.array(trimesh.Trimesh(part.vertices, part.faces, process=False).vertex_normals)
+
+
+def _paint_of(parts: Sequence[Part]) -> Visuals:
+    colours = np.clip(np.concatenate([part.colours for part in parts]), 0.0, 1.0)
+    if all(part.texture is None for part in parts):
+        return ColorVisuals(vertex_colors=_bytes(colours))
+    textures: list[Texture] = []
+    pages, uv = [], []
+    for part in parts:
+        if part.texture is not None and part.texture not in textures:
+            textures.append(part.texture)
+        page = -1 if part.texture is None else textures.index(part.texture)
+        pages.append(np.full(len(part.vertices), page, dtype=np.int64))
+        uv.append(np.zeros((len(part.vertices), 2)) if part.uv is None else part.uv)
+    where, coordinates = np.concatenate(pages), np.concatenate(uv)
+    only = textures[0]
+    if (where == 0).all() and (colours == 1.0).all() and only.wrap == ("repeat", "repeat"):
+        return TextureVisuals(coordinates, SimpleMaterial(image=Image.fromarray(only.pixels)))
+    return Paint(colours, coordinates, where, textures)
+
+
+def _bytes(colours: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 4"]:
+    rgba = np.full((len(colours), 4), 255, dtype=np.uint8)
+    rgba[:, :3] = np.rint(255.0 * colours)
+    return rgba
+
+
+# --- colours ---
+
+
+def encoded(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the sRGB values of linear ones (IEC 61966-2-1)."""
+    low = np.clip(linear, 0.0, 1.0)
+    return np.where(low <= 0.0031308, 12.92 * low, 1.055 * low ** (1.0 / 2.4) - 0.055)
+
+
+def decoded(srgb: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the linear values of sRGB ones."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def tinted(texture: Texture, factor: Float[np.ndarray, "3"]) -> Texture:
+    """Multiply a texture by a linear colour, in linear space."""
+    if (factor == 1.0).all():
+        return texture
+    values = decoded(np.arange(256) / 255.0)
+    tables = np.rint(255.0 * encoded(values[:, None] * factor)).astype(np.uint8)
+    pixels = np.stack([tables[:, channel][texture.pixels[..., channel]] for channel in range(3)], -1)
+    return Texture(pixels, texture.wrap)
+
+
+# --- files that meshes name ---
+
+
+def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> Texture:
+    """Read a picture as a texture, as it is stored: texture coordinates know nothing of EXIF, opacity is left out.
+
+    Raises:
+        ValueError: no picture that can be read, with ``where``.
+    """
+    image = read_picture(BytesIO(source) if isinstance(source, bytes) else source, where, upright=False)
+    image = image.convert("RGB")
+    if max(image.size) > LARGEST_SIDE:
+        factor = -(-max(image.size) // LARGEST_SIDE)
+        _log.info("%s: %d x %d pixels, drawn at 1/%d of that size", where, *image.size, factor)
+        image = image.reduce(factor)
+    return Texture(np.asarray(image), wrap)
+
+
+def find_named(written: str, folder: Path) -> Path | None:
+    """Find a file that a mesh in ``folder`` names, as its writer's machine may have spelt it.
+
+    Separators of Windows count as separators, case does not count where no file has the very name, and where the named
+    folder is not there, the last name is looked for in the folder itself, in those in it, and in a folder ``textures``
+    beside it.
+    """
+    parts = [part for part in written.strip().strip('"').replace("\\", "/").split("/") if part != "."]
+    if not parts or not parts[-1]:
+        return None
+    exact = folder / "/".join(parts)
+    if exact.is_file():
+        return exact
+    if (followed := _followed(parts, folder)) is not None:
+        return followed
+    last = parts[-1]
+    inner = sorted(path for path in folder.iterdir() if path.is_dir())
+    beside = [path for path in (folder.parent / "textures", folder.parent / "Textures") if path.is_dir()]
+    for places in ([folder], inner, beside[:1]):
+        found = [path for place in places if (path := _followed([last], place)) is not None]
+        if len(found) > 1:
+            names = ", ".join(str(path) for path in found)
+            raise ValueError(f"{last!r} may be any of {names}; write its folder where it is named")
+        if found:
+            _log.info("%s: %r is taken to be %s", folder, written, found[0])
+            return found[0]
+    return None
+
+
+def _followed(parts: Sequence[str], folder: Path) -> Path | None:
+    """Follow names from a folder whatever their case; None where they lead to no file, or to several."""
+    here = folder
+    for part in parts:
+        if part == "..":
+            here = here.parent
+            continue
+        if not here.is_dir():
+            return None
+        if not (here / part).exists():
+            alike = [path for path in here.iterdir() if _plain(path.name) == _plain(part)]
+            if len(alike) != 1:
+                return None
+            here = alike[0]
+        else:
+            here = here / part
+    return here if here.is_file() else None
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
