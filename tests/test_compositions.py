@@ -99,7 +99,7 @@ PAIRS = [
     ("neural_sim", "neural_sim_pathwise"),
     ("neural_sim", "neural_sim_reinforce"),
     ("neural_sim_pathwise", "neural_sim_reinforce"),
-    ("neural_sim_paper", "neural_sim_paper_reinforce"),
+    ("neural_sim_paper", "auto_sim_paper"),
 ]
 
 
@@ -112,8 +112,11 @@ def test_estimators_are_compared_in_one_loop(pair, scale):
     assert all(key == "baseline.name" or key.startswith("gradient.") for key in differ)
     assert type(one.loop.gradient) is not type(other.loop.gradient)
     for made, name in ((one, pair[0]), (other, pair[1])):
-        wanted = {"paper": PathwiseEstimator, "pathwise": PathwiseEstimator, "reinforce": ReinforceEstimator}
-        assert isinstance(made.loop.gradient, wanted.get(name.rsplit("_", 1)[1], StratifiedEstimator))
+        wanted = {
+            "neural_sim": StratifiedEstimator, "neural_sim_paper": PathwiseEstimator,
+            "neural_sim_pathwise": PathwiseEstimator,
+        }  # fmt: skip
+        assert isinstance(made.loop.gradient, wanted.get(name, ReinforceEstimator))
 
 
 @pytest.mark.parametrize("scale", ["smoke", "quick", "paper"])
@@ -148,8 +151,8 @@ def test_a_bad_step_is_refused_with_its_place(key):
 
 def test_lights_are_explored_where_a_method_scores_its_draws_alone():
     lights = ["parameter=[pose,illumination]", "renderer=nerf_w"]
-    explores = {"lts", "auto_sim", "neural_sim_reinforce", "neural_sim_paper_reinforce"}
-    hard = {*explores, "neural_sim", "ns", "oracle"}
+    explores = {"auto_sim", "neural_sim_reinforce", "auto_sim_paper"}
+    hard = {*explores, "neural_sim", "lts", "ns", "oracle"}
     for name in hard:
         made = experiment(f"baseline={name}", *lights)
         assert Graph(made).learned.draws == HardDraws(explore=name in explores)
@@ -168,6 +171,14 @@ def test_lights_want_a_renderer_that_knows_them():
 def test_what_is_fixed_says_which_distribution():
     kinds = {name: experiment(f"baseline={name}").loop.method for name in ("ns", "oracle")}
     assert kinds == {"ns": Fixed("ns", "initial"), "oracle": Fixed("oracle", "target")}
+
+
+@pytest.mark.parametrize("baseline", ["lts", "lts_by_object", "response"])
+def test_what_compares_trainings_refuses_one_detector_that_goes_on(baseline):
+    with pytest.raises(ValueError, match=f"baseline={baseline} compares trainings.*add outer.start=warm"):
+        experiment(f"baseline={baseline}", "+variant=paper")
+    made = experiment(f"baseline={baseline}", "+variant=paper", "outer.start=warm")
+    assert made.loop.outer.start == "warm" and made.loop.method.name == baseline
 
 
 @pytest.mark.parametrize(

@@ -63,11 +63,13 @@ GONE: dict[str, str] = {
     "gradient.theta_mode=reverse": "it gained nothing; want forward or central_difference, with gradient=stratified",
     "outer.certify": "the reference is the response of training; outer.certify_every alone asks for it",
     "outer.certify_per_bin": "it belonged to outer.certify=retrained, which is a reference of the tests now",
+    "baseline.max_step": "baseline=lts draws settings of psi now; want baseline.deviation or baseline.learning_rate",
     "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/numerics.md); boxes are fixed labels",
 }
 """The message for each key or choice (``key=value``) that no longer exists. A key stands for all keys below it, too."""
 
 MOVED: dict[str, str] = {
+    "baseline=neural_sim_paper_reinforce": "baseline=auto_sim_paper",
     "outer.steps=checked": "outer/steps=trust_region",
     "outer.steps=free": "outer/steps=free",
     "outer.checks": "outer.steps",
@@ -130,9 +132,10 @@ def updated(
 
 def _renamed(key: str, value: str, moved: Mapping[str, str]) -> tuple[str, str] | None:
     """Today's key and value, of a sweep value by value; None for what has not moved."""
-    choices = [moved.get(f"{key}={one}", "").partition("=") for one in value.split(",")]
+    words = [f"{key}={one}" for one in value.split(",")]
+    choices = [moved.get(word, word).partition("=") for word in words]
     names = {name for name, _, _ in choices}
-    if len(names) == 1 and "" not in names:
+    if len(names) == 1 and any(word in moved for word in words):
         return names.pop(), ",".join(one for _, _, one in choices)
     for parent in _with_parents(key):
         if parent in moved and (parent == key or "/" not in moved[parent]):

@@ -1,5 +1,6 @@
 """The loop of reward methods: rounds, what is counted, and that psi is the method's."""
 
+import itertools
 from types import SimpleNamespace
 
 import pytest
@@ -33,7 +34,7 @@ def reward_loop(scene):
 
 
 def test_rounds_are_counted_and_the_trajectory_is_the_methods(reward_loop):
-    method = LearningToSimulate(rounds=3)
+    method = LearningToSimulate(rounds=3, samples=2)
     loop = reward_loop(method)
     learned = learn_psi(loop, progress=False)
     assert len(learned.records) == 2 * method.rounds and len(learned.trajectory) == len(learned.records) + 1
@@ -41,6 +42,8 @@ def test_rounds_are_counted_and_the_trajectory_is_the_methods(reward_loop):
         assert (record.images, record.detector_steps, record.products) == (12, 3, 0)
         assert record.certificate is None and record.seconds["train"] > 0.0
     assert torch.equal(learned.last, loop.search.psi)
+    moved = [not torch.equal(*pair) for pair in itertools.pairwise(learned.trajectory)]
+    assert moved == [False, True] * 3  # after every second setting
     assert any(record.probabilities != learned.records[0].probabilities for record in learned.records)
 
 

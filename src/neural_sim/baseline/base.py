@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Literal, Protocol
 
 import torch
 from jaxtyping import Float
@@ -12,10 +11,6 @@ from torch import Tensor
 
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import PositiveFraction, validated
-from neural_sim.types import SceneDraw
-
-Draws = Sequence[SceneDraw]
-"""The scenes drawn from an asked psi, object by object."""
 
 
 class Search(Protocol):
@@ -30,18 +25,17 @@ class Search(Protocol):
         """Ask for the psi whose images come next."""
         ...
 
-    def tell(self, reward: float, draws: Draws) -> None:
-        """Tell the reward of a detector trained on images of the psi last asked for; larger is better."""
+    def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
+        """Tell the reward of a detector trained on images of the psi last asked for; larger is better.
+
+        ``by_object`` is what it scored on each object's class, 0 of classes that validation images do not show.
+        """
         ...
 
 
 class RewardMethod(Protocol):
-    """A configured method. Each outer iteration of the budget has ``rounds`` of drawing, training and reward.
+    """A configured method. Each outer iteration of the budget has ``rounds`` of drawing, training and reward."""
 
-    ``explores``: the method needs a density of its draws, so that lights are drawn around psi's.
-    """
-
-    explores: ClassVar[bool]
     name: str
     rounds: int
 
@@ -57,7 +51,6 @@ class RewardMethod(Protocol):
 class Fixed:
     """No optimisation: images from the initial distribution (``ns``, the paper's NS) or the target's (``oracle``)."""
 
-    explores: ClassVar[bool] = False
     name: str
     which: Literal["initial", "target"]
 
@@ -67,7 +60,6 @@ class Fixed:
 class HypergradientLoop:
     """Steps of psi by the hypergradient with the configured estimator: Neural-Sim, or Auto-Sim with ``reinforce``."""
 
-    explores: ClassVar[bool] = False
     name: str
 
 
@@ -79,6 +71,5 @@ class Response:
     It takes a training for each bin, in which ``part`` of every object's images moves to it.
     """
 
-    explores: ClassVar[bool] = False
     name: str
     part: PositiveFraction = 0.15

@@ -1,13 +1,14 @@
-"""Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the validation reward.
+"""Learning to Simulate (Ruiz, Schulter and Chandraker 2019): REINFORCE on the rewards of simulator settings.
 
-The policy is p_psi, an action is a whole training set, its reward what a detector trained on it scores on the target
-set. One number is the reward of all objects and bins, so that thousands of rounds replace one hypergradient.
+The policy is a Gaussian over psi with a learned mean omega and fixed deviations. A setting drawn from it makes one data
+set, on which one detector is trained; what that scores on the target set is the setting's reward. After every
+``samples`` of them omega steps along ``mean_k (R_k - b) d log pi(psi_k) / d omega`` (their Algorithm 1).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Ge, Lt
@@ -15,99 +16,116 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.baseline.base import Draws, Search
+from neural_sim.baseline.base import Search
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.parameter.update import bound
 from neural_sim.ranges import Positive, PositiveInt, validated
-from neural_sim.types import SceneDraw
 
 
 @validated
 @dataclass(frozen=True)
 class LearningToSimulate:
-    """Ascent along ``(R - b) d log p(training set) / d psi`` with a moving average b of past rewards.
+    """A Gaussian policy over psi, whose mean steps along the policy gradient times the policy's variance.
 
-    The first reward has no baseline. psi stays until the second round; then each of the two rewards is the other's
-    baseline (leave one out, unbiased), and psi steps along both.
+    Rewards count in their own running standard deviations, so that steps depend neither on their unit nor on an offset.
 
     Args:
         name: in reports.
-        learning_rate: logits a step at an advantage of one standard deviation of past rewards.
-        decay: of the moving averages of the reward and of its square.
-        max_step: largest change of a logit a step.
-        rounds: training sets for each outer iteration of the budget; two take about as long as one hypergradient.
+        learning_rate: deviations that omega moves at a mean advantage of one.
+        deviation: the policy's, in logits of bins.
+        light_deviation: the policy's, in weights of lights.
+        samples: K, settings between two steps.
+        rewarded: what an object's part of psi is rewarded by: the ``whole`` data set's score, or by ``object`` that of
+            its own class.
+        baseline: b: a ``moving_average`` of earlier rewards (the first settings, which have none, take their own mean),
+            or the mean of the step's other settings (``leave_one_out``).
+        decay: of the moving averages of rewards and of squared advantages.
+        rounds: settings for each outer iteration of the budget; two take about as long as one hypergradient.
+
+    Raises:
+        ValueError: ``leave_one_out`` of a single setting.
     """
 
-    explores: ClassVar[bool] = True
     name: str = "lts"
-    learning_rate: Positive = 0.5
+    learning_rate: Positive = 1.0
+    deviation: Positive = 1.0
+    light_deviation: Positive = 0.3
+    samples: PositiveInt = 4
+    rewarded: Literal["whole", "object"] = "whole"
+    baseline: Literal["moving_average", "leave_one_out"] = "moving_average"
     decay: Annotated[float, Ge(0), Lt(1)] = 0.8
-    max_step: Positive = 1.0
     rounds: PositiveInt = 2
+
+    def __post_init__(self) -> None:
+        if self.baseline == "leave_one_out" and self.samples < 2:
+            raise ValueError(f"baseline.samples: leave_one_out wants at least 2, got {self.samples}")
 
     def begin(
         self, distribution: SceneDistribution, psi: Float[Tensor, "objects K"], generator: torch.Generator
     ) -> Policy:
-        """Make a policy that starts at ``psi``."""
-        return Policy(self, distribution, psi.detach().clone())
+        """Make a policy whose mean is ``psi``."""
+        return Policy(self, distribution, psi.detach().clone(), generator)
 
 
 class Policy(Search):
     """See :class:`LearningToSimulate`."""
 
     def __init__(
-        self, settings: LearningToSimulate, distribution: SceneDistribution, psi: Float[Tensor, "objects K"]
+        self,
+        settings: LearningToSimulate,
+        distribution: SceneDistribution,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
     ) -> None:
-        self._settings, self._distribution, self._psi = settings, distribution, psi
-        self._mean, self._variance, self._told = 0.0, 0.0, 0
-        self._first = torch.zeros_like(psi)  # the first round's score
+        self._settings, self._distribution, self._omega = settings, distribution, psi
+        self._generator = generator
+        own = {True: settings.light_deviation, False: settings.deviation}
+        self._deviation = torch.cat(
+            [psi.new_full((f.size,), own[f.lights > 0]) for f in distribution.factors]
+        )
+        self._noise: list[Float[Tensor, "objects K"]] = []
+        self._rewards: list[Float[Tensor, "objects"]] = []
+        self._mean: Float[Tensor, "objects"] | None = None
+        self._variance: Float[Tensor, "objects"] | None = None
 
     @property
     @override
     def psi(self) -> Float[Tensor, "objects K"]:
-        return self._psi
+        return self._omega
 
     @override
     def ask(self) -> Float[Tensor, "objects K"]:
-        return self._psi
+        noise = torch.randn(self._omega.shape, generator=self._generator, dtype=torch.float64).to(self._omega)
+        self._noise.append(noise)
+        # The density is that of the draw before its projection: the projected one has none.
+        return self._distribution.constrained(self._omega + self._deviation * noise)
 
     @override
-    def tell(self, reward: float, draws: Draws) -> None:
-        advantage = self._advantage(reward)
-        slope = torch.stack(
-            [score(self._distribution, psi, drawn) for psi, drawn in zip(self._psi, draws, strict=True)]
-        )
-        if self._told == 1:
-            self._first = slope
+    def tell(self, reward: float, by_object: Float[Tensor, "objects"]) -> None:
+        whole = self._settings.rewarded == "whole"
+        own = torch.full_like(self._omega[:, 0], reward) if whole else by_object.to(self._omega)
+        self._rewards.append(own)
+        if len(self._rewards) < self._settings.samples:
             return
-        if advantage == 0.0:
-            return
-        if self._told == 2:  # R_1 - R_2 is the first round's advantage, R_2 - R_1 the second's
-            slope = slope - self._first
-        # A sum of n scores has a standard deviation of order sqrt(n): divided out, so that the rate is in logits.
-        size = max(len(draws[0]), 1) ** 0.5
-        step = self._distribution.split(self._settings.learning_rate * advantage * slope / size)
-        moved = {
-            f.name: bound(*f.reach(step[f.name], self._settings.max_step)) for f in self._distribution.factors
-        }
-        self._psi = self._distribution.constrained(self._psi + self._distribution.join(moved))
+        advantages, noise = self._advantages(torch.stack(self._rewards)), torch.stack(self._noise)
+        self._noise, self._rewards = [], []
+        # d log pi / d omega is noise / deviation; times the variance, so that a step is in deviations.
+        score = (advantages[..., None] * noise).mean(0)
+        step = self._settings.learning_rate * self._deviation * score
+        self._omega = self._distribution.constrained(self._omega + self._centred(step))
 
-    def _advantage(self, reward: float) -> float:
-        """Compute ``R - b`` over the running standard deviation of rewards, then update b."""
-        above, rest = reward - self._mean, 1.0 - self._settings.decay
-        self._told += 1
-        if self._told == 1:
-            self._mean = reward
-            return 0.0
-        # The first difference is the only measure of spread so far.
-        self._variance = above**2 if self._told == 2 else (1.0 - rest) * (self._variance + rest * above**2)
-        self._mean += rest * above
-        return above / self._variance**0.5 if self._variance > 0.0 else 0.0
+    def _advantages(self, rewards: Float[Tensor, "samples objects"]) -> Float[Tensor, "samples objects"]:
+        """Compute ``R - b`` over the root of its moving mean square, then update b."""
+        mean, decay = rewards.mean(0), self._settings.decay
+        before = mean if self._mean is None else self._mean
+        above = rewards - before
+        if self._settings.baseline == "leave_one_out":
+            above = (rewards - mean) * len(rewards) / (len(rewards) - 1)
+        square = above.square().mean(0)
+        self._mean = decay * before + (1.0 - decay) * mean
+        self._variance = square if self._variance is None else decay * self._variance + (1.0 - decay) * square
+        return torch.where(self._variance > 0.0, above / self._variance.sqrt(), 0.0)
 
-
-def score(distribution: SceneDistribution, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "K"]:
-    """Compute ``d log p(draws) / d psi`` of independent draws together."""
-    leaf = psi.detach().requires_grad_()
-    with torch.enable_grad():
-        total = distribution.log_prob(leaf, draw).sum()
-    return torch.autograd.grad(total, leaf)[0]
+    def _centred(self, step: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
+        """Take each factor's mean off: p does not depend on it, and weights add up to 1."""
+        parts = self._distribution.split(step)
+        return self._distribution.join({n: part - part.mean(-1, keepdim=True) for n, part in parts.items()})

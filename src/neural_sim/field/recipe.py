@@ -51,6 +51,12 @@ class FieldRecipe:
     score_every: NonNegativeInt = 0
     seed: NonNegativeInt = 0
 
+    @property
+    def kind(self) -> type[RadianceField] | None:
+        """The class of the fields; None where another callable makes them."""
+        made = getattr(self.field, "func", self.field)
+        return made if isinstance(made, type) and issubclass(made, RadianceField) else None
+
     def fit(
         self, views: PosedViews, held_out: int, device: torch.device
     ) -> tuple[RadianceField, list[dict[str, Any]]]:

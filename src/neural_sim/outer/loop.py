@@ -160,9 +160,9 @@ class RewardLoop(OuterLoop):
     def training_step(self, batch: int, batch_idx: int) -> None:
         trained = self.train_on(self.search.ask())
         with self.timed("reward"):
-            reward = -trained.validation_loss
+            reward, by_object = -trained.validation_loss, trained.scores.sum(1)[: len(self.psi)]
         self.record(trained)
-        self.search.tell(reward, [part.draw for part in trained.rendered.objects])
+        self.search.tell(reward, by_object)
         self.psi.data = self.search.psi.clone()
         self.trajectory.append(self.psi.detach().clone())
 

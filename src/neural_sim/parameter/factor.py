@@ -124,10 +124,6 @@ class Factor(Protocol):
         """Find the stratum of each draw."""
         ...
 
-    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """Convert a score to the units of psi, with the largest step, where steps are at most ``step`` logits."""
-        ...
-
 
 @validated
 @dataclass(frozen=True)
@@ -233,10 +229,6 @@ class BinnedFactor:
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """Find the bin of each draw's coordinate: for a relaxed draw not always the bin that was drawn."""
         return self.bin_of(getattr(draw, self.coordinate))
-
-    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """Return the score itself, and ``step``."""
-        return score, step
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
         """Draw bins exactly by the Gumbel-max trick, balanced where the noise has an offset, without a derivative."""

@@ -147,10 +147,6 @@ class Illumination:
             raise ValueError("parameter.illumination: want draws under weighed lights, got the fixed one")
         return draw.weights.argmax(-1)
 
-    def reach(self, score: Float[Tensor, "*n k"], step: float) -> tuple[Float[Tensor, "*n k"], float]:
-        """Multiply the score by the variance, to units of psi; the largest step is one standard deviation."""
-        return self.deviation**2 * score, self.deviation
-
     def draw(self, psi: Float[Tensor, "k"], count: int) -> Float[Tensor, "n k"]:
         """Repeat psi for every image, differentiably."""
         return psi.expand(count, -1)

@@ -71,6 +71,10 @@ class NerfRenderer:
         self.rays_per_chunk = rays_per_chunk
         self.cull, self.skip_empty = cull, skip_empty
 
+    @staticmethod
+    def check(kind: type[RadianceField]) -> None:
+        """Raise ``ValueError`` for a kind of field that this renderer cannot draw."""
+
     def at(self, quality: Quality) -> Self:
         """Return this renderer at another quality.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
@@ -21,6 +22,14 @@ class NerfWRenderer(NerfRenderer):
     A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views of equal weights are rendered as one batch
     under one code. Opacity depends on no weight. Without weights the anchors count equally.
     """
+
+    @override
+    @staticmethod
+    def check(kind: type[RadianceField]) -> None:
+        if not issubclass(kind, AppearanceField):
+            raise ValueError(
+                f"renderer=nerf_w wants fields with appearance codes: want field=grid_w, got {kind.__name__}"
+            )
 
     @torch.no_grad()
     def render(
@@ -122,10 +131,8 @@ def _checked(
 
     The weights stay on their own device: draws are on the CPU.
     """
-    if not isinstance(field, AppearanceField):
-        raise ValueError(
-            f"renderer=nerf_w wants fields with appearance codes (field=grid_w), got {type(field).__name__}"
-        )
+    NerfWRenderer.check(type(field))
+    assert isinstance(field, AppearanceField)
     anchors = len(field.mixing)
     if weights is None:
         return field, torch.full((count, anchors), 1.0 / anchors, dtype=field.codes.dtype)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.detector.protocol import Detector, Score, score_of
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
@@ -54,6 +55,9 @@ class Imaging:
     """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target.
 
     ``camera`` is that of synthesised and of rendered target images.
+
+    Raises:
+        ValueError: fields that the renderer cannot draw.
     """
 
     objects: ObjectSource | Photos
@@ -64,6 +68,11 @@ class Imaging:
     target: Target
     camera: PinholeCamera
     distribution: SceneDistribution
+
+    def __post_init__(self) -> None:
+        kind = self.field.kind
+        if kind is not None:
+            self.renderer.check(kind)
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,8 @@ class Experiment:
 
     Raises:
         ValueError: a detector, an objective or images that are not of the task; a first hypergradient at a warm start
-            of another distribution than psi's.
+            of another distribution than psi's; a method that compares trainings of which each goes on from the one
+            before.
     """
 
     run: Run
@@ -103,6 +113,12 @@ class Experiment:
             raise ValueError(
                 f"task={task} and a detector that is scored by {score} do not belong together: want {choices}, and "
                 "detector=classifier for accuracy"
+            )
+        method = self.loop.method
+        if self.loop.outer.start == "previous" and not isinstance(method, (Fixed, HypergradientLoop)):
+            raise ValueError(
+                f"baseline={method.name} compares trainings, and under outer.start=previous (of +variant=paper) later "
+                "ones score more whatever psi is: add outer.start=warm"
             )
         name, wanted = _OBJECTIVES[score]
         if not isinstance(objective, (wanted, Loss)):

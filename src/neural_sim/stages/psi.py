@@ -22,7 +22,7 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, record_of
 from neural_sim.outer.response import ResponseLoop
 from neural_sim.outer.settings import Outer
-from neural_sim.parameter.product import Draws, HardDraws, SceneDistribution
+from neural_sim.parameter.product import HARD, Draws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
@@ -85,10 +85,8 @@ class PsiStage(Stage[LearnedPsi]):
 
     @property
     def draws(self) -> Draws:
-        """How the method wants its images drawn: as its estimator does, or as a method that sees rewards says."""
-        if self.parts is not None:
-            return self.parts.estimator.draws
-        return HardDraws(explore=self.method.explores)
+        """How the method wants its images drawn: as its estimator does, exactly where it has none."""
+        return HARD if self.parts is None else self.parts.estimator.draws
 
     @override
     def make(self, results: Results) -> LearnedPsi:
