@@ -19,6 +19,15 @@ def shared_data() -> Path:
     return root
 
 
+@pytest.fixture(scope="session")
+def paper_source() -> list[str]:
+    """Lines of paper.tex, which lies beside the data."""
+    root = Path(os.environ.get("NEURAL_SIM_DATA", Path(__file__).parents[2] / "shared"))
+    if not (root / "paper.tex").is_file():
+        pytest.skip(f"no source of the paper: {root / 'paper.tex'} does not exist (set NEURAL_SIM_DATA)")
+    return (root / "paper.tex").read_text(encoding="utf-8").split("\n")
+
+
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)

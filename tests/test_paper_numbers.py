@@ -1,8 +1,5 @@
 """The paper's numbers in conf/paper beside the lines of its LaTeX source that they are from."""
 
-import os
-from pathlib import Path
-
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -12,33 +9,24 @@ from neural_sim.configuration import conf_directory
 NUMBERS = OmegaConf.to_container(OmegaConf.load(conf_directory() / "paper" / "numbers.yaml"))
 
 
-@pytest.fixture(scope="module")
-def source():
-    """Lines of paper.tex, which lies beside the data."""
-    root = Path(os.environ.get("NEURAL_SIM_DATA", Path(__file__).parents[2] / "shared"))
-    if not (root / "paper.tex").is_file():
-        pytest.skip(f"no source of the paper: {root / 'paper.tex'} does not exist (set NEURAL_SIM_DATA)")
-    return (root / "paper.tex").read_text(encoding="utf-8").split("\n")
-
-
 CLAIMS = [(name, claim) for name, claims in NUMBERS["claims"].items() for claim in claims]
 
 
 @pytest.mark.parametrize(("name", "claim"), CLAIMS, ids=[f"{name}-{claim['line']}" for name, claim in CLAIMS])
-def test_a_claim_is_what_its_line_says(name, claim, source):
+def test_a_claim_is_what_its_line_says(name, claim, paper_source):
     words = {"10 minutes": "ten minutes", "20 to 60": r"$20\%$ to $60\%$", "20 hours": "$20$ hours"}
-    assert claim["quote"] in source[claim["line"] - 1]
+    assert claim["quote"] in paper_source[claim["line"] - 1]
     assert words.get(claim["value"], str(claim["value"])) in claim["quote"]
 
 
 @pytest.mark.parametrize("name", NUMBERS["tables"])
-def test_a_table_has_the_numbers_of_its_lines(name, source):
+def test_a_table_has_the_numbers_of_its_lines(name, paper_source):
     """Each row's numbers stand in one line in their order; Table 1 is printed with methods as rows."""
     table = NUMBERS["tables"][name]
     first, last = table["lines"]
     lines = [
         line.replace("\\textbf{", "").replace("\\bf{", "").replace("}", "")
-        for line in source[first - 1 : last]
+        for line in paper_source[first - 1 : last]
     ]
     rows = [[value for value in row if value is not None] for row in table["rows"].values()]
     if name == "table_1":

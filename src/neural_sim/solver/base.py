@@ -107,6 +107,11 @@ class System:
 class LinearSolver(abc.ABC):
     """Solves ``A x = b`` for symmetric A given by its products. Subclasses hold typed hyper-parameters."""
 
+    @property
+    def largest(self) -> int | None:
+        """The most unknowns that it takes; None: any number."""
+        return None
+
     @abc.abstractmethod
     def iterate(self, system: System) -> Iterate:
         """Iterate until the residual's norm is at most the system's tolerance or its steps are spent."""

@@ -27,6 +27,11 @@ class Exact(LinearSolver):
 
     max_size: PositiveInt = 5000
 
+    @property
+    @override
+    def largest(self) -> int:
+        return self.max_size
+
     @override
     def iterate(self, system: System) -> Iterate:
         operator, rhs, size = system.operator, system.rhs, system.rhs.numel()

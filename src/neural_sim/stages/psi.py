@@ -16,6 +16,7 @@ from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardM
 from neural_sim.baseline.label_shift.evidence import estimates_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import Estimator
+from neural_sim.gradient.implicit import Implicit
 from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
@@ -49,7 +50,8 @@ class PsiStage(Stage[LearnedPsi]):
     boxes; None for others. ``on_record`` is called with every iteration's record as it ends.
 
     Raises:
-        ValueError: ``outer.loop_layers`` of a backbone that has no such stages; here, before fields are trained.
+        ValueError: ``outer.loop_layers`` of a backbone that has no such stages, or a solver that does not take the
+            detector's parameters; here, before fields are trained.
     """
 
     phase: ClassVar[str] = "psi"
@@ -70,6 +72,16 @@ class PsiStage(Stage[LearnedPsi]):
     def __post_init__(self) -> None:
         if self.outer.loop_layers:
             self.warm_start.build().in_loop(self.outer.loop_layers)
+        largest = None if self.parts is None else self.parts.solver.linear.largest
+        if largest is not None and isinstance(self.outer.adjoint, Implicit):
+            detector = self.warm_start.build().in_loop(self.outer.loop_layers)
+            trained = detector.split(detector.init(stream(self.seed, "size")))[1]
+            size = sum(value.numel() for value in trained.values())
+            if size > largest:
+                raise ValueError(
+                    f"solver=exact takes {largest} unknowns (solver.linear.max_size), and the detector has {size}: want "
+                    "solver=cg or detector=micro"
+                )
 
     @property
     @override
