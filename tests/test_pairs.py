@@ -1,10 +1,16 @@
 """Choices of any two groups: refused when the experiment is built, in one line, or run through."""
 
 import itertools
+import re
 
 import numpy as np
+import pytest
+from documented_data import backgrounds, captures, labels
+from hydra import compose, initialize_config_dir
 
 from neural_sim.configuration import conf_directory
+from neural_sim.main import context_of
+from neural_sim.tasks.walk import walk
 
 CONF = conf_directory()
 
@@ -42,7 +48,7 @@ GROUPS = {
 }
 """By group its choices, with what a choice needs; an empty one is the method's own."""
 SMALL = [
-    "scale=smoke", "progress=false", "objects.names=[can,mug]", "views.count=8", "views.held_out=2",
+    "scale=smoke", "progress=false", "objects.names=[can,mug]", "views.count=16", "views.held_out=2",
     "views.image_size=24", "views.supersample=1", "views.backend=raycast", "budget.grid.steps=8",
     "budget.grid.resolution=32", "budget.grid.refine_steps=[2]", "budget.grid.prune_steps=[4]",
     "budget.mlp.steps=4", "budget.mlp.width=8", "budget.mlp.coarse_samples=4", "budget.mlp.fine_samples=4",
@@ -50,39 +56,6 @@ SMALL = [
     "training.batch_size=8", "outer.iterations=2", "outer.images_per_object=4", "outer.epochs=1",
     "outer.least_steps=0", "outer.pool_per_bin=1", "stages=[psi,evaluate]",
 ]  # fmt: skip
-
-
-def covering(groups, refused):
-    """Rows, a choice of every group each, that have every pair of choices at least once but those ``refused``.
-
-    Greedy: a row begins with a pair that no row has yet, and takes, group by group, what adds most new pairs.
-    """
-    names, random = list(groups), np.random.default_rng(0)
-    cells = [(name, choice) for name in names for choice in groups[name]]
-    missing = {
-        frozenset(pair)
-        for pair in itertools.combinations(cells, 2)
-        if pair[0][0] != pair[1][0] and not refused(*(choice for _, choice in pair))
-    }
-    rows = []
-    while missing:
-        best, gained = None, 0
-        for seed in random.permutation(sorted(tuple(sorted(pair)) for pair in missing))[:12]:
-            row = {str(name): str(choice) for name, choice in seed}
-            for name in random.permutation([name for name in names if name not in row]):
-                fits = [c for c in groups[name] if not any(refused(c, other) for other in row.values())]
-                if not fits:
-                    break
-                news = [sum(frozenset([(name, c), cell]) in missing for cell in row.items()) for c in fits]
-                row[str(name)] = fits[int(np.argmax(news))]
-            new = sum(frozenset(pair) in missing for pair in itertools.combinations(row.items(), 2))
-            if len(row) == len(names) and new > gained:
-                best, gained = row, new
-        if best is None:
-            raise AssertionError(f"no row has any of {[sorted(pair) for pair in missing]}")
-        missing -= {frozenset(pair) for pair in itertools.combinations(best.items(), 2)}
-        rows.append(best)
-    return rows
 
 
 LIT = ("field=grid_w", "field=paper_nerf_w")
@@ -124,3 +97,99 @@ REFUSED = {
 
 def refused(a, b):
     return any(rule(*pair) for rule, _ in REFUSED.values() for pair in ((a, b), (b, a)))
+
+
+def covering(groups, refused):
+    """Rows, a choice of every group each, that have every pair of choices at least once but those ``refused``.
+
+    Greedy: a row begins with a pair that no row has yet, and takes, group by group, what adds most new pairs.
+    """
+    names, random = list(groups), np.random.default_rng(0)
+    cells = [(name, choice) for name in names for choice in groups[name]]
+    missing = {
+        frozenset(pair)
+        for pair in itertools.combinations(cells, 2)
+        if pair[0][0] != pair[1][0] and not refused(*(choice for _, choice in pair))
+    }
+    rows = []
+    while missing:
+        best, gained = None, 0
+        for seed in random.permutation(sorted(tuple(sorted(pair)) for pair in missing))[:12]:
+            row = {str(name): str(choice) for name, choice in seed}
+            for name in random.permutation([name for name in names if name not in row]):
+                fits = [c for c in groups[name] if not any(refused(c, other) for other in row.values())]
+                if not fits:
+                    break
+                news = [sum(frozenset([(name, c), cell]) in missing for cell in row.items()) for c in fits]
+                row[str(name)] = fits[int(np.argmax(news))]
+            new = sum(frozenset(pair) in missing for pair in itertools.combinations(row.items(), 2))
+            if len(row) == len(names) and new > gained:
+                best, gained = row, new
+        if best is None:
+            raise AssertionError(f"no row has any of {[sorted(pair) for pair in missing]}")
+        missing -= {frozenset(pair) for pair in itertools.combinations(best.items(), 2)}
+        rows.append(best)
+    return rows
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Where rows run, on one store, and the data that they name."""
+    root = tmp_path_factory.mktemp("pairs")
+    made = {
+        "captures": captures(root / "captures"), "labels": labels(root / "labels" / "labels.json"),
+        "backgrounds": backgrounds(root / "backgrounds"),
+    }  # fmt: skip
+    return root, made
+
+
+def composed(room, row, *more):
+    root, made = room
+    words = [word.format(**made) for choice in row for word in choice.split()]
+    paths = [f"paths.store={root / 'store'}", f"paths.mlflow={root / 'mlflow.db'}"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", [*words, *SMALL, *paths, *more])
+
+
+EXAMPLES = [
+    ("lights", ["parameter=[illumination]", "renderer=nerf"]),
+    ("codes", ["renderer=nerf_w", "field=mlp"]),
+    ("going on", ["baseline=lts_by_object", "outer.start=previous"]),
+    ("going on", ["outer/steps=trust_region", "outer.start=previous"]),
+    ("untrained", ["outer/adjoint=unrolled", "outer.train_first=false", "outer/steps=free"]),
+    ("dense", ["baseline=auto_sim", "solver=exact", "detector=tiny"]),
+    ("no camera", ["camera=from_target", "target=rendered"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("rule", "words"), EXAMPLES, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_what_does_not_go_together_is_refused_at_the_start_in_one_line(room, rule, words):
+    with pytest.raises(ValueError, match=re.escape(REFUSED[rule][1])) as caught:
+        _ = context_of(composed(room, words), room[0] / "unused")[0].graph.learned
+    assert "\n" not in str(caught.value)
+
+
+def test_every_rule_of_what_is_refused_has_an_example():
+    assert {rule for rule, _ in EXAMPLES} == set(REFUSED) - {"uniform start"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(8))
+def test_all_other_pairs_run_through(room, part):
+    """Two iterations of the loop and three scored detectors for each row of the covering array."""
+    rows = covering(GROUPS, refused)
+    assert len(rows) < 130
+    failed = []
+    for number, row in list(enumerate(rows))[part::8]:
+        folder = room[0] / f"row_{number}"
+        folder.mkdir()
+        try:
+            context, tasks = context_of(composed(room, row.values()), folder)
+            walk(context, tasks)
+            results = context.results(context.graph.learned)
+            assert bool(results.last.isfinite().all())
+        except Exception as error:  # all of them are wanted at once: a part takes minutes
+            failed.append(f"{' '.join(row.values())}: {type(error).__name__}: {error}")
+    assert not failed, "\n".join(failed)

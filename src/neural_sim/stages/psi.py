@@ -79,8 +79,8 @@ class PsiStage(Stage[LearnedPsi]):
             size = sum(value.numel() for value in trained.values())
             if size > largest:
                 raise ValueError(
-                    f"solver=exact takes {largest} unknowns (solver.linear.max_size), and the detector has {size}: want "
-                    "solver=cg or detector=micro"
+                    f"solver=exact takes {largest} unknowns (solver.linear.max_size), and the detector has {size}: "
+                    "want solver=cg or detector=micro"
                 )
 
     @property
