@@ -132,23 +132,32 @@ def covering(groups, refused):
     return rows
 
 
+class Data(dict):
+    """Paths that choices name, made when one does."""
+
+    def __init__(self, root):
+        super().__init__()
+        self.root = root
+
+    def __missing__(self, name):
+        make = {"captures": captures, "labels": labels, "backgrounds": backgrounds}[name]
+        self[name] = make(self.root / name / "labels.json" if name == "labels" else self.root / name)
+        return self[name]
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     """Where rows run, on one store, and the data that they name."""
     root = tmp_path_factory.mktemp("pairs")
-    made = {
-        "captures": captures(root / "captures"), "labels": labels(root / "labels" / "labels.json"),
-        "backgrounds": backgrounds(root / "backgrounds"),
-    }  # fmt: skip
-    return root, made
+    return root, Data(root)
 
 
-def composed(room, row, *more):
-    root, made = room
-    words = [word.format(**made) for choice in row for word in choice.split()]
+def composed(room, row):
+    root, data = room
+    words = [word.format_map(data) for choice in row for word in choice.split()]
     paths = [f"paths.store={root / 'store'}", f"paths.mlflow={root / 'mlflow.db'}"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", [*words, *SMALL, *paths, *more])
+        return compose("config", [*words, *SMALL, *paths])
 
 
 EXAMPLES = [

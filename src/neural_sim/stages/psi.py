@@ -75,7 +75,7 @@ class PsiStage(Stage[LearnedPsi]):
         largest = None if self.parts is None else self.parts.solver.linear.largest
         if largest is not None and isinstance(self.outer.adjoint, Implicit):
             detector = self.warm_start.build().in_loop(self.outer.loop_layers)
-            trained = detector.split(detector.init(stream(self.seed, "size")))[1]
+            trained = detector.split(detector.init(torch.Generator()))[1]
             size = sum(value.numel() for value in trained.values())
             if size > largest:
                 raise ValueError(
