@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.detector.protocol import Detector, Score, score_of
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
@@ -115,7 +116,9 @@ class Experiment:
                 "detector=classifier for accuracy"
             )
         method = self.loop.method
-        if self.loop.outer.start == "previous" and not isinstance(method, (Fixed, HypergradientLoop)):
+        if self.loop.outer.start == "previous" and not isinstance(
+            method, (Fixed, LabelShift, HypergradientLoop)
+        ):
             raise ValueError(
                 f"baseline={method.name} compares trainings, and under outer.start=previous (of +variant=paper) later "
                 "ones score more whatever psi is: add outer.start=warm"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from annotated_types import Ge, Gt, Lt
 
@@ -32,7 +32,6 @@ class LabelShift:
         name: in reports.
     """
 
-    explores: ClassVar[bool] = False
     per_bin: PositiveInt = 48
     held_out: Annotated[float, Gt(0), Lt(1)] = 0.25
     compositions: Annotated[int, Ge(1)] = 2
