@@ -16,9 +16,12 @@ from neural_sim.objects.photos import Photos
 from neural_sim.pictures import check_headers, read_picture
 from neural_sim.renderer.lighting import Lighting
 from neural_sim.renderer.raycast import RaycastRenderer
+from neural_sim.report.tracking import opened, tracking_uri
 from neural_sim.synthesis.background import PhotoFolder
+from neural_sim.target.bop import BopScenes
 from neural_sim.target.coco import CocoTarget
 from neural_sim.target.folders import FolderTarget
+from neural_sim.target.frames import FrameName
 from neural_sim.target.photographs import PhotoFiles
 from neural_sim.types import LabelledImages, PinholeCamera
 
@@ -163,6 +166,58 @@ def test_17_materials_of_obj_files_are_found_or_refused_by_name(tmp_path):
     assert red in seen_colours(out, "tiled") and blue in seen_colours(out, "tiled")
     with pytest.raises(ValueError, match=r"missing\.obj: .*missing\.mtl, line 2: the texture 'gone\.png'"):
         MeshFolder(out, ["missing"]).digests()
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        (1, "1"),
+        (20240501, "2024_05_01"),
+        ("on", "on"),
+        (None, "null"),
+        (1000.0, "1e3"),
+        (True, "true"),
+        (7, "007"),
+    ],
+)
+def test_18_names_that_the_command_line_takes_for_numbers_are_names(tmp_path, given, name):
+    root = laid_out("18", tmp_path) / "meshes"
+    assert MeshFolder(root, [given]).names() == [name]
+    with pytest.raises(ValueError, match=r"3 is not in .*; quote it: \"objects\.names=\['3'\]\""):
+        MeshFolder(root, [3])
+
+
+def test_18_folders_and_categories_of_digits_are_classes(tmp_path):
+    out = laid_out("18", tmp_path)
+    target = FolderTarget(out / "by_class", classes={0: "mug", 1: "can"})
+    assert len(target.photographs(NAMES)) == 12
+    assert len(CocoTarget(out / "labels.json", categories={0: "mug", 1: "can"}).load(NAMES, 60, 80)) == 8
+
+
+def test_19_what_is_no_database_is_refused_at_once_with_its_key(tmp_path):
+    out = laid_out("19", tmp_path)
+    reasons = {
+        "garbage": "is no SQLite database",
+        "folder": "is a folder, want a file",
+        "newer": "a newer MLflow",
+    }
+    for name, reason in reasons.items():
+        with (
+            pytest.raises(ValueError, match=rf"paths\.mlflow: .*{name}\.db.*{reason}.*set paths\.mlflow"),
+            opened(tracking_uri(str(out / f"{name}.db")), "gap", "run", {}, {}),
+        ):
+            raise AssertionError(f"{name} was opened")
+
+
+def test_21_bop_sets_of_other_writers_are_read_or_refused_by_file(tmp_path):
+    out = laid_out("21", tmp_path)
+    itodd = BopScenes(out / "itodd")
+    depth = itodd.frame(FrameName("val/000000", 1), depth=True).depth
+    assert depth is not None and np.allclose(depth, 0.3)  # 3000 of 0.1 mm
+    with pytest.raises(ValueError, match=r"scene_gt_info\.json: 0\[0\]: visib_fract: want .*got 1\.0002"):
+        BopScenes(out / "above_one").frame(FrameName("train_pbr/000000", 0))
+    with pytest.raises(ValueError, match=r"blenderproc/train_pbr/000000/scene_gt_info\.json: not readable"):
+        BopScenes(out / "blenderproc").frame(FrameName("train_pbr/000000", 0))
 
 
 @pytest.mark.parametrize("number", ["23", "26"])

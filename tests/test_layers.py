@@ -47,7 +47,7 @@ def test_heavy_libraries_stay_in_their_rooms():
         "onnxruntime": {"detector/onnx_export.py"},
         "safetensors": {"detector/saved.py"},
         "jinja2": {"report/page/render.py"},
-        "filelock": {"report/tracking.py", "stages/store.py"},
+        "filelock": {"report/database.py", "stages/store.py"},
         "h5py": {"target/ycb_video.py"},
         "skimage": {"field/reconstruction.py"},
         "hydra": {"main.py"},

@@ -112,6 +112,15 @@ def test_a_user_error_is_one_line_and_exit_status_two(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+def test_a_run_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "run").write_text("a file")
+    done = _run(tmp_path, "scale=smoke")
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr == (
+        f"neural-sim: hydra.run.dir: {tmp_path}/run cannot be made (File exists); name another folder\n"
+    )
+
+
 def test_a_sweeps_folders_have_names_that_file_systems_take(tmp_path):
     """Whatever is overridden: values with slashes, and more of them than a name has room for."""
     one, two = (

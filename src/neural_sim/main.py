@@ -230,7 +230,7 @@ def _task(config: DictConfig) -> float | None:
         from neural_sim.tasks.walk import walk
 
         return walk(context, tasks)
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise
         _refuse(error)
@@ -269,6 +269,13 @@ class OwnFolder(Callback):
     @override
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         self._take(config, "run")
+        folder = Path(config.hydra.run.dir)
+        try:  # as Hydra would, with two screens of its own calls where that fails
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            _refuse(
+                UserError(f"hydra.run.dir: {folder} cannot be made ({error.strerror}); name another folder")
+            )
 
     @override
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -288,7 +295,10 @@ class OwnFolder(Callback):
 def _refuse(error: Exception) -> NoReturn:
     """One line, and exit status 2."""
     _log.debug("details", exc_info=True)
-    print(f"neural-sim: {first_line(error)}", file=sys.stderr)
+    line = first_line(error)
+    if isinstance(error, OSError) and error.filename is not None:
+        line = f"{error.filename}: {error.strerror}; nothing that was finished before is lost"
+    print(f"neural-sim: {line}", file=sys.stderr)
     sys.exit(2)
 
 

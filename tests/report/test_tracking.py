@@ -89,9 +89,10 @@ def test_what_the_store_refuses_for_now_is_written_later(uri, caplog):
         assert caplog.text.count("metrics wait for the next writing (the store is away)") == 2
         run.log({"psi/loss": 2.0}, 2)
         assert len(reader.get_metric_history(run.run_id, "psi/loss")) == 3
-    with pytest.raises(MlflowException), opened(uri) as run:
+    with opened(uri) as run:  # what never gets through costs the numbers there, not the results and the exit
         run._client = Away(run._client, times=9)
         run.log({"psi/loss": 0.0})
+    assert "the last metrics are lost (the store is away)" in caplog.text
     with pytest.raises(KeyError), opened(uri) as run:  # the cause is told, not that it could not be written
         run._client = Away(run._client, times=9)
         run.log({"psi/loss": 0.0})

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import trimesh
@@ -20,8 +20,8 @@ from neural_sim.objects.ply import ply_references, read_ply
 from neural_sim.objects.repair import repair
 from neural_sim.objects.wavefront import obj_references, read_obj
 
-Names = Annotated[list[str], MinLen(1)] | None
-"""Which objects of a folder, None: all."""
+Names = Annotated[list[str | int | float | bool | None], MinLen(1)] | None
+"""Which objects of a folder, None: all. Numbers are names that the command line took for some."""
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -106,9 +106,12 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 
 
 def choose(
-    available: dict[str, Path], names: list[str] | None, aliases: dict[str, str], where: str
+    available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
     """The available names of ``names``, which may be aliases, in their order; for None all of them, sorted.
+
+    What the command line took for a number or a word of YAML (1, 1e3, 2024_05_01, true, null) is the one name that is
+    written so.
 
     Raises:
         ValueError: an unknown name, or one object twice.
@@ -117,15 +120,34 @@ def choose(
         return sorted(available)
     chosen = []
     for name in names:
-        key = name if name in available else aliases.get(name)
+        text = name if isinstance(name, str) else _written(name, [*available, *aliases])
+        key = text if text in available else aliases.get(text)
         if key is None:
+            hint = "" if isinstance(name, str) else f"; quote it: \"objects.names=['{name}']\""
             raise ValueError(
-                f"objects.names: {name!r} is not in {where}; there are {', '.join(sorted(available))}"
+                f"objects.names: {name!r} is not in {where}; there are {', '.join(sorted(available))}{hint}"
             )
         if key in chosen:
             raise ValueError(f"objects.names: {name!r} names the object {key!r} twice")
         chosen.append(key)
     return chosen
+
+
+def _written(value: Any, names: Sequence[str]) -> str:
+    """Return the only one of ``names`` that the command line takes for a value, else the value as text."""
+    words = {None: ("null",), True: ("true",), False: ("false",)}
+    if value is None or isinstance(value, bool):
+        alike = [name for name in names if name.lower() in words[value]]
+    else:
+        alike = [name for name in names if _is_number(name, value)]
+    return alike[0] if len(set(alike)) == 1 else str(value)
+
+
+def _is_number(name: str, value: float) -> bool:
+    try:
+        return float(name) == value
+    except ValueError:
+        return False
 
 
 class MeshFiles:

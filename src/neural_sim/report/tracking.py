@@ -9,12 +9,14 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neural_sim.configuration import first_line
 from neural_sim.interruption import Interrupted, has_ended, last_act, this_process
+from neural_sim.report.database import check_database, database_of, guard
 from neural_sim.report.provenance import commit
 
 _log = logging.getLogger(__name__)
@@ -91,7 +93,10 @@ class Run:
 
     def log_files(self, folder: Path) -> None:
         """Copy a folder to the run's artifacts."""
-        self._client.log_artifacts(self.run_id, str(folder))
+        self._try(
+            f"not all of {folder} is among its artifacts",
+            lambda: self._client.log_artifacts(self.run_id, str(folder)),
+        )
 
     @contextmanager
     def fluent(self) -> Iterator[Any]:
@@ -99,7 +104,7 @@ class Run:
 
         The experiment stays set afterwards; nothing else here reads it.
         """
-        with quiet(), _guard(self.uri):
+        with quiet(), guard(self.uri):
             import mlflow
 
             before = mlflow.get_tracking_uri()
@@ -111,19 +116,16 @@ class Run:
                 mlflow.set_tracking_uri(before)
 
     def close(self, status: str, error: BaseException | None = None) -> None:
-        """Send what waits and end the run.
+        """Send what waits and end the run; what the store refuses is a warning: the results are in the run's folder.
 
         Args:
             status: FINISHED, FAILED or KILLED.
-            error: the cause, which becomes a tag; then what the store refuses is a warning.
+            error: the cause, which becomes a tag.
         """
-        if error is None:
-            self._send()
-            self._end(status)
-            return
-        text = f"{type(error).__name__}: {error}".splitlines()[0][:500]
         self._try("the last metrics are lost", self._send)
-        self._try("its cause is not noted", lambda: self._client.set_tag(self.run_id, "error", text))
+        if error is not None:
+            text = f"{type(error).__name__}: {error}".splitlines()[0][:500]
+            self._try("its cause is not noted", lambda: self._client.set_tag(self.run_id, "error", text))
         self._try(f"the run stays open, want {status}", lambda: self._end(status))
 
     def parameters(self, parameters: Mapping[str, Any]) -> None:
@@ -132,26 +134,27 @@ class Run:
 
         pairs = [Param(_allowed(key), str(value)[:6000]) for key, value in parameters.items()]
         for start in range(0, len(pairs), BATCH):
-            with _guard(self.uri):
+            with guard(self.uri):
                 self._client.log_batch(self.run_id, params=pairs[start : start + BATCH])
 
     def _send(self) -> None:
         while self._waiting:
-            with _guard(self.uri):
+            with guard(self.uri):
                 self._client.log_batch(self.run_id, metrics=self._waiting[:BATCH])
             del self._waiting[:BATCH]
 
     def _end(self, status: str) -> None:
-        with _guard(self.uri):
+        with guard(self.uri):
             self._client.set_terminated(self.run_id, status, int(1000 * self._clock()))
 
     def _try(self, otherwise: str, act: Callable[[], object]) -> None:
         from mlflow.exceptions import MlflowException
+        from sqlalchemy.exc import SQLAlchemyError
 
         try:
             act()
-        except MlflowException as error:
-            _log.warning("mlflow: run %s: %s (%s)", self.run_id, otherwise, str(error).splitlines()[0])
+        except (MlflowException, SQLAlchemyError, OSError) as error:
+            _log.warning("mlflow: run %s: %s (%s)", self.run_id, otherwise, first_line(error))
 
 
 @contextmanager
@@ -183,17 +186,18 @@ def opened(
     """
     with quiet():
         from mlflow.exceptions import MlflowException
+        from sqlalchemy.exc import SQLAlchemyError
 
         start = int(1000 * (clock() if begun is None else begun))
         try:
             client = connect(uri)
-            with _guard(uri):
+            with guard(uri):
                 close_abandoned(client)
                 experiment_id = _experiment_id(client, uri, experiment)
                 tags = {**tags, **SOURCE, PROCESS: this_process(), COMMIT: commit() or UNKNOWN}
                 created = client.create_run(experiment_id, start_time=start, run_name=name, tags=tags)
-        except MlflowException as error:
-            raise ValueError(f"paths.mlflow: {uri} cannot be written to ({error})") from error
+        except (MlflowException, SQLAlchemyError) as error:
+            raise ValueError(f"paths.mlflow: {uri} cannot be written to ({first_line(error)})") from error
     run = Run(client, uri, created.info, clock)
     try:
         with last_act(lambda error: run.close("KILLED", error)):
@@ -260,27 +264,30 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def _database(uri: str) -> Path | None:
-    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
-
-
-def _guard(uri: str) -> AbstractContextManager[Any]:
-    """One writer at a time for a SQLite file, among this program's processes."""
-    from filelock import FileLock
-
-    database = _database(uri)
-    return nullcontext() if database is None else FileLock(f"{database}.lock")
-
-
 def connect(uri: str) -> Any:
-    """Return a client of a store, which is created if it is a SQLite file that does not exist yet."""
-    from mlflow import MlflowClient
+    """Return a client of a store, which is created if it is a SQLite file that does not exist yet.
 
-    if (database := _database(uri)) is not None:
-        database.parent.mkdir(parents=True, exist_ok=True)
-    with _guard(uri):
-        client = MlflowClient(tracking_uri=uri)
-        client.search_experiments(max_results=1)  # creates the tables of a new database
+    Raises:
+        ValueError: a file that is no database of MLflow's, or one of a version that this one does not know.
+    """
+    from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+
+    if (database := database_of(uri)) is not None:
+        check_database(database)
+    try:
+        with guard(uri):
+            client = MlflowClient(tracking_uri=uri)
+            client.search_experiments(max_results=1)  # creates the tables of a new database
+    except MlflowException:
+        raise
+    except (
+        Exception
+    ) as error:  # of SQLAlchemy and Alembic, on databases that are not what MLflow's version made
+        raise ValueError(
+            f"paths.mlflow: {uri} cannot be used ({first_line(error)}); a newer MLflow may have written it: move it "
+            "away, or set paths.mlflow"
+        ) from error
     return client
 
 
@@ -290,7 +297,7 @@ def _experiment_id(client: Any, uri: str, name: str) -> str:
 
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
-        database = _database(uri)
+        database = database_of(uri)
         location = None if database is None else (database.parent / "mlartifacts" / name).as_uri()
         try:
             return client.create_experiment(name, artifact_location=location, tags=dict([KIND]))

@@ -35,7 +35,10 @@ from neural_sim.types import PinholeCamera
 
 MILLIMETRE = 1e-3
 TARGETS = "test_targets_bop19.json"
-IMAGES = ("rgb/*.png", "rgb/*.jpg", "gray/*.png", "gray/*.tif")
+IMAGES = tuple(
+    f"{kind}/*.{form}" for kind in ("rgb", "gray", "grey") for form in ("png", "jpg", "tif", "tiff", "jpeg")
+)
+DEPTHS = ("depth/*.png", "depth/*.tif", "depth/*.tiff")
 
 
 @validated
@@ -103,7 +106,7 @@ class BopScenes(FrameReader):
     @override
     def class_names(self, scenes: Collection[str]) -> list[str]:
         if self._info:
-            return sorted(map(_class_name, self._info))
+            return sorted(_class_name(number, str(self._info_file)) for number in self._info)
         shown = (
             item
             for scene in scenes
@@ -111,7 +114,11 @@ class BopScenes(FrameReader):
             for item in items
         )
         return sorted(
-            {_class_name(item["obj_id"]) for item in shown if isinstance(item, dict) and "obj_id" in item}
+            {
+                _class_name(item["obj_id"], f"{self.root}: obj_id")
+                for item in shown
+                if isinstance(item, dict) and "obj_id" in item
+            }
         )
 
     def numbers(self, scene: str) -> list[int]:
@@ -154,9 +161,11 @@ class BopScenes(FrameReader):
             # The toolkit's width and height are differences of first and last pixels.
             x, y, width, height = numbers(info["bbox_visib"], 4, f"{where}: bbox_visib").tolist()
             box = (x, y, x + width + 1, y + height + 1) if width >= 0 and height >= 0 else None
-        return PosedObject(
-            _class_name(pose["obj_id"]), moved, box, float(numbers(info["visib_fract"], 1, where)[0]), mask
-        )
+        said = where.replace("scene_gt.json", "scene_gt_info.json")
+        visible = float(numbers(info["visib_fract"], 1, f"{said}: visib_fract")[0])
+        if not 0.0 <= visible <= 1.0:
+            raise ValueError(f"{said}: visib_fract: want a fraction from 0 to 1, got {visible:g}")
+        return PosedObject(_class_name(pose["obj_id"], f"{where}: obj_id"), moved, box, visible, mask)
 
     @override
     def camera(self, name: FrameName) -> PinholeCamera:
@@ -172,7 +181,7 @@ class BopScenes(FrameReader):
         return camera_of_matrix(entry["cam_K"], *size, f"{where}: cam_K")
 
     def _depth(self, name: FrameName, size: tuple[int, int]) -> np.ndarray | None:
-        file = self._folder(name) / "depth" / f"{name.number:06d}.png"
+        file = self._file(name, DEPTHS)
         if not file.is_file():
             return None
         entry = self._entry(name, "scene_camera.json")
@@ -220,7 +229,11 @@ class BopScenes(FrameReader):
         return self.root / name.scene
 
     def _image(self, name: FrameName) -> Path:
-        files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in IMAGES]
+        return self._file(name, IMAGES)
+
+    def _file(self, name: FrameName, forms: Sequence[str]) -> Path:
+        """Return the first of a photograph's possible files that is there, else the first."""
+        files = [self._folder(name) / form.replace("*", f"{name.number:06d}") for form in forms]
         return next((file for file in files if file.is_file()), files[0])
 
     @override
@@ -231,8 +244,11 @@ class BopScenes(FrameReader):
         return [*labels, self._image(name), *masks, *([self._info_file] if self._info else [])]
 
 
-def _class_name(number: int | str) -> str:
-    return f"obj_{int(number):06d}"
+def _class_name(number: int | str, where: str) -> str:
+    try:
+        return f"obj_{int(number):06d}"
+    except (TypeError, ValueError):
+        raise ValueError(f"{where}: want an object's number, got {number!r}") from None
 
 
 def _want(entry: Any, keys: Sequence[str], where: str) -> None:

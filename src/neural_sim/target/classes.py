@@ -33,7 +33,7 @@ class ClassMap:
 
     def check_listed(self, names: Collection[str]) -> None:
         """Raise ``ValueError`` for a class of the mapping that is none of ``names``."""
-        strange = sorted(set(self.mapping or {}) - set(names))
+        strange = sorted(set(self._named) - set(names))
         if strange:
             raise ValueError(
                 f"{self.key}: {strange} are no {self.kind[1]} of {self.source}, which has {list(names)}"
@@ -41,7 +41,12 @@ class ClassMap:
 
     def object_of(self, name: str) -> str | None:
         """Return the name of the object that a class is, None for a class that is left out."""
-        return (self.mapping or {}).get(name, name)
+        return self._named.get(name, name)
+
+    @property
+    def _named(self) -> dict[str, str | None]:
+        """The mapping as text: what the command line took for numbers (``{0: mug}``) are names, too."""
+        return {str(key): None if name is None else str(name) for key, name in (self.mapping or {}).items()}
 
     def labels(self, names: Collection[str], objects: Sequence[str]) -> dict[str, int | None]:
         """Return the labels of classes, positions in ``objects``, None for those that the mapping leaves out.

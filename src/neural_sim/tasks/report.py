@@ -46,17 +46,17 @@ class ReportTask(Task):
             results(stage)
         scores = {called: results(stage) for called, stage in graph.compared(learned).items()}
         report = run_results(context, scores)
+        write_results(report, folder)  # first of all: whatever fails then, the numbers are there
         rendered = graph.synthetic(learned.last, "learned").images(results)
         drawn = dataclasses.replace(rendered, images=rendered.images.to("cpu"))
         write_figures(report, drawn.images, test, scores["learned"].detections, folder / "figures")
         write_training_set(drawn, list(graph.names), folder / "training_set")
         write_detections(test, {called: part.detections for called, part in scores.items()}, folder)
         _write_model(context, test)
-        write_results(report, folder)
         commands = _commands(context)
         page = write_run_page(report, _shown(context, learned.last, test, scores), commands, folder)
-        context.live.finish(report, folder)
         print(report.summary())
+        context.live.finish(report, folder)
         print(f"results: {folder}\n{context.live.where}")
         for what, command in commands.items():
             print(f"{what.lower()}: {command}")

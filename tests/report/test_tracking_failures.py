@@ -1,0 +1,65 @@
+"""A tracking store that fails costs neither the results nor the exit, and says so in one line with its key."""
+
+import logging
+import sqlite3
+
+import pytest
+
+from neural_sim.report import tracking
+
+
+@pytest.fixture
+def uri(tmp_path) -> str:
+    return tracking.tracking_uri(str(tmp_path / "mlflow.db"))
+
+
+def opened(uri: str):
+    return tracking.opened(uri, "gap", "run", {}, {})
+
+
+def test_a_full_disk_at_the_end_is_a_warning(uri, tmp_path, monkeypatch, caplog):
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device", "artifact")
+
+    with caplog.at_level(logging.WARNING), opened(uri) as run:
+        monkeypatch.setattr(run._client, "log_artifacts", full)
+        monkeypatch.setattr(run._client, "set_terminated", full)
+        run.log_files(tmp_path)
+    assert "not all of" in caplog.text and "No space left on device" in caplog.text
+    assert "stays open, want FINISHED" in caplog.text
+
+
+def test_a_database_that_is_damaged_while_a_run_is_open_is_a_warning(uri, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING), opened(uri) as run:
+        (tmp_path / "mlflow.db").write_bytes(b"SQLite format 3\0" + bytes(8192))
+        run.log({"a": 1.0})
+    assert "metrics wait" in caplog.text and "stays open, want FINISHED" in caplog.text
+
+
+@pytest.mark.parametrize("keep", [17, 5000])
+def test_a_database_that_is_cut_off_is_refused_at_once(uri, tmp_path, keep):
+    with opened(uri):
+        pass
+    file = tmp_path / "mlflow.db"
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(ValueError, match=r"paths\.mlflow: .*mlflow\.db.*(damaged|cannot be)"), opened(uri):
+        raise AssertionError("was opened")
+
+
+def test_a_place_where_no_file_can_be_is_refused_at_once(tmp_path):
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(
+            ValueError, match=r"paths\.mlflow: .*file/mlflow\.db cannot be used .*set paths\.mlflow"
+        ),
+        opened(tracking.tracking_uri(str(tmp_path / "file" / "mlflow.db"))),
+    ):
+        raise AssertionError("was opened")
+
+
+def test_a_database_of_other_tables_is_refused(uri, tmp_path):
+    with sqlite3.connect(tmp_path / "mlflow.db") as connection:
+        connection.execute("create table alembic_version (version_num varchar(32))")
+        connection.execute("insert into alembic_version values ('ffffffffffff')")
+    with pytest.raises(ValueError, match=r"paths\.mlflow: .*a newer MLflow may have written it"), opened(uri):
+        raise AssertionError("was opened")
