@@ -1,5 +1,7 @@
 """The whole estimate on painted objects, whose bins show as the place of a bright patch."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,6 +9,7 @@ from neural_sim.baseline.label_shift.crops import Augmentation
 from neural_sim.baseline.label_shift.estimate import LabelShift, estimate
 from neural_sim.baseline.label_shift.network import Fitting
 from neural_sim.parameter.distributions import total_variation
+from neural_sim.parameter.illumination import Illumination
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.parameter.zoom import Zoom
@@ -150,3 +153,40 @@ def test_augmented_crops_keep_their_shape_and_differ(posed):
     still, own = plain(crops)
     assert seen.shape == still.shape and boxes.shape == own.shape
     assert bool(seen.isfinite().all()) and float((seen - still).abs().mean()) > 0.02
+
+
+HUES = torch.tensor([[250.0, 60, 60], [60, 250, 60], [60, 60, 250]])
+
+
+def lit(name, distribution, weights):
+    """A pool of squares whose colour is a mixture of three lights', with ``weights``."""
+    noise = distribution.draw_noise(len(weights), torch.Generator().manual_seed(3))
+    draw = replace(distribution.at_bins({}, noise), weights=weights)
+    maps = torch.zeros(len(weights), SIDE, SIDE, 4, dtype=torch.uint8)
+    maps[:, 12:36, 12:36, :3] = (weights @ HUES).round().to(torch.uint8)[:, None, None]
+    maps[:, 12:36, 12:36, 3] = 255
+    return PooledSubject(name, maps, draw, len(weights))
+
+
+def test_weights_of_lights_are_read_in_the_same_interface():
+    distribution, generator = (
+        SceneDistribution.of([Illumination(anchors=3)]),
+        torch.Generator().manual_seed(0),
+    )
+    squares = torch.randn(96, 3, generator=generator).square()
+    mixed = squares / squares.sum(-1, keepdim=True)
+    truth = torch.tensor([0.7, 0.1, 0.2])
+    even = torch.full((3,), 1 / 3)
+    synthesizer = Synthesizer(ProceduralClutter())
+
+    def scene(lamp, cup):
+        subjects = tuple(lit(*each) for each in (("lamp", distribution, lamp), ("cup", distribution, cup)))
+        return Scene(subjects, PinholeCamera(SIDE, SIDE, 0.7), synthesizer, distribution)
+
+    psi = distribution.uniform.expand(2, -1)
+    seen = scene(truth.expand(40, 3), even.expand(40, 3)).training_set(psi, 40, generator).images
+    result = read(scene(mixed, mixed), seen, psi)
+    lamp, cup = result.factors
+    assert lamp.finding == "moves" and torch.tensor(lamp.p) == pytest.approx(truth.tolist(), abs=0.12)
+    assert cup.finding == "stays"
+    torch.testing.assert_close(result.psi[0], torch.tensor(lamp.p, dtype=torch.float64))

@@ -86,7 +86,8 @@ class Augmentation:
 
     Args:
         roll_deg: largest turn in the image plane either way, in degrees; 180 for cameras held at any roll.
-        exposure: largest change of brightness either way, in stops; contrast and colour change with it.
+        exposure: largest change of brightness either way, in stops; contrast and colour change with it. Not where psi
+            weighs lights.
         blur: largest part of a crop's detail that is lost.
         noise: largest standard deviation of pixel noise.
         occlusion: part of the crops of which a rectangle is hidden.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -96,7 +96,10 @@ def estimate(
     distribution = scene.distribution
     cells = Cells(tuple(f.bins for f in distribution.binned))
     network = BinNetwork.drawn(len(scene.names), cells.count, distribution.lights, generator)
-    settings.fitting(training, network, settings.augmentation, generator)
+    augmentation = settings.augmentation
+    if distribution.lights:  # they are what differs, and no change of exposure may hide it
+        augmentation = replace(augmentation, exposure=0.0)
+    settings.fitting(training, network, augmentation, generator)
     clock("network")
     target = crops_of(validation.to("cpu"), whole)
     reader = Reader(settings, distribution, network, training, held, target, generator)

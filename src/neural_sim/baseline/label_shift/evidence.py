@@ -73,7 +73,7 @@ class FactorEstimate:
                 f"{self.factor} is not read off them"
             )
         shown = ", ".join(
-            f"{_called(group)} ({self.low[group[0] - 1]:.2f} to {self.high[group[0] - 1]:.2f})"
+            f"{_called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
             for group in self._largest
         )
         ending = (
@@ -86,11 +86,11 @@ class FactorEstimate:
     @property
     def _largest(self) -> list[tuple[int, ...]]:
         """The groups that make up most, at most three."""
-        ordered = sorted(self.groups, key=lambda group: -sum(self.p[b - 1] for b in group))
+        ordered = sorted(self.groups, key=lambda group: -_sum(self.p, group))
         shown, total = [], 0.0
         for group in ordered[:3]:
             shown.append(group)
-            total += sum(self.p[b - 1] for b in group)
+            total += _sum(self.p, group)
             if total > 0.75:
                 break
         return shown
@@ -109,6 +109,10 @@ def estimates_of(stored: Iterable[Mapping[str, Any]]) -> tuple[FactorEstimate, .
         FactorEstimate(**{key: tuples.get(key, lambda v: v)(value) for key, value in one.items()})
         for one in stored
     )
+
+
+def _sum(values: Sequence[float], group: Sequence[int]) -> float:
+    return sum(values[b - 1] for b in group)
 
 
 def _called(group: Sequence[int]) -> str:

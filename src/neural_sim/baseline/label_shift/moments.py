@@ -26,12 +26,14 @@ class Response:
     Attributes:
         slope: B.
         scatter: covariance of a guess about B w.
-        precision: inverse of the sum of w w^T over the renders that B is from.
+        precision: inverse of the sum of w w^T over the different renders that B is from.
+        misfit: covariance of what products of two weights explain of the rest: no number of boxes averages it out.
     """
 
     slope: Float[Tensor, "k k"]
     scatter: Float[Tensor, "k k"]
     precision: Float[Tensor, "k k"]
+    misfit: Float[Tensor, "k k"]
 
     @staticmethod
     def of(guesses: Float[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Response:
@@ -41,11 +43,17 @@ class Response:
         slope = (precision @ weights.T @ guesses).T
         left = guesses - weights @ slope.T
         scatter = left.T @ left / max(len(left) - weights.shape[1], 1)
-        return Response(slope, scatter + 1e-9 * scatter.diagonal().mean().clamp_min(1e-12) * eye, precision)
+        first, second = torch.triu_indices(weights.shape[1], weights.shape[1], 1)
+        bent = weights[:, first] * weights[:, second]
+        explained = bent @ torch.linalg.lstsq(bent, left).solution
+        misfit = explained.T @ explained / max(len(left), 1)
+        least = 1e-9 * scatter.diagonal().mean().clamp_min(1e-12) * eye
+        several = len(weights) / len(weights.unique(dim=0))  # images of one render: they err alike
+        return Response(slope, scatter + least, several * precision, misfit)
 
     def covariance(self, boxes: int, weights: Float[Tensor, "k"]) -> Float[Tensor, "k k"]:
         """Compute the covariance of the mean of ``boxes`` guesses less B w, which has errors of its own."""
-        return self.scatter * (1.0 / boxes + weights @ self.precision @ weights)
+        return self.scatter * (1.0 / boxes + weights @ self.precision @ weights) + self.misfit
 
 
 def matched(
