@@ -32,7 +32,7 @@ class Crops:
     """Square crops about boxes.
 
     Attributes:
-        pixels: in [0, 1], ``MARGIN`` sides of the box across; what lies outside of the image is grey.
+        pixels: in [0, 1], ``MARGIN`` sides of the box across; what lies outside of the image is its mean colour.
         boxes: logarithms of width and height as fractions of the image's, the centre from -1 to 1, and whether the box
             touches the border.
         labels: class of each.
@@ -69,9 +69,12 @@ def crops_of(images: LabelledImages, whole: bool) -> Crops:
     centre = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     half = 0.5 * MARGIN * size.amax(1, keepdim=True)
     regions = torch.cat([rows[:, None].to(boxes), centre - half, centre + half], 1)
-    # Around the image lies grey: a crop is of what is there minus grey, plus grey.
+    # Around the image lies its mean colour: a crop is of what is there minus that, plus that.
+    mean = images.images.mean((2, 3), keepdim=True)
     ratio = max(1, round(float(2.0 * half.median()) / _STORED)) if len(rows) else 1
-    pixels = roi_align(images.images - 0.5, regions, _STORED, sampling_ratio=ratio, aligned=True) + 0.5
+    pixels = (
+        roi_align(images.images - mean, regions, _STORED, sampling_ratio=ratio, aligned=True) + mean[rows]
+    )
     touches = ((boxes < 1.0) | (boxes > edges - 1.0))[:, :2].any(1) | (boxes[:, 2:] > edges[2:] - 1.0).any(1)
     numbers = torch.cat(
         [(size / edges[2:]).log(), 2.0 * centre / edges[2:] - 1.0, touches[:, None].to(boxes)], 1
@@ -95,7 +98,7 @@ class Augmentation:
     """
 
     roll_deg: Annotated[float, Ge(0), Le(180)] = 10.0
-    exposure: NonNegative = 0.5
+    exposure: NonNegative = 1.0
     blur: Fraction = 0.8
     noise: Fraction = 0.04
     occlusion: Fraction = 0.3

@@ -66,7 +66,7 @@ class BinNetwork(nn.Module):
 
     def __init__(self, objects: int, cells: int, lights: int) -> None:
         super().__init__()
-        self.cells = cells
+        self.cells, self.lights = cells, lights
         layers: list[nn.Module] = []
         for i, (inputs, outputs) in enumerate(zip((3, *_WIDTHS), _WIDTHS, strict=False)):
             size = 5 if i == 0 else 3
@@ -90,6 +90,9 @@ class BinNetwork(nn.Module):
         labels: Int[Tensor, "n"],
     ) -> tuple[Float[Tensor, "n cells"], Float[Tensor, "n lights"], Float[Tensor, "n features"]]:
         """Return logits of the cells, weights of the lights, and the features that they are read from."""
+        if not self.lights:  # a target of another exposure than the renders shows the same bins
+            apart = seen - seen.mean((1, 2, 3), keepdim=True)
+            seen = apart / (apart.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.01)
         image = self.joined(self.convolutions(seen).flatten(1))
         scale, shift = self.style(labels).chunk(2, -1)
         features = torch.cat([image * (1.0 + scale) + shift, self.box(boxes, labels)], -1).relu()

@@ -41,6 +41,6 @@ class LabelShift:
     level: PositiveFraction = 0.05
     draws: Annotated[int, Ge(19)] = 199
     interval: Annotated[float, Gt(0), Lt(1)] = 0.9
-    strange: PositiveFraction = 0.5
+    strange: PositiveFraction = 0.3
     fewest: PositiveInt = 8
     name: str = "label_shift"
