@@ -108,7 +108,7 @@ def shown_panel(axes: Any, one: FactorEstimate) -> None:
         merged(torch.tensor(values), groups).numpy() for values in (one.start, one.p, one.low, one.high)
     )
     at = np.arange(len(groups))
-    axes.bar(at - 0.2, start, 0.38, color=GRID, label="psi")
+    axes.bar(at - 0.2, start, 0.38, color=MUTED, alpha=0.6, label="psi")
     if one.finding != "too few boxes":
         errors = np.stack([p - low, high - p]).clip(0.0)
         strong = 1.0 if one.finding == "moves" else 0.4
