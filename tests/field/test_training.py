@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neural_sim import cameras
-from neural_sim.field.fitting import GridFitting
+from neural_sim.field.fitting import GridFitting, _large_parts
 from neural_sim.field.grid import GridField
 from neural_sim.field.hull import visual_hull
 from neural_sim.field.mlp import MLPField, MLPFitting, inverse_cumulative
@@ -118,3 +118,19 @@ def test_bad_budgets_are_refused() -> None:
         fit_field(ball_views(3), fitting(), generator, steps=1, held_out=3)
     with pytest.raises(ValueError, match="steps"):
         fit_field(ball_views(3), fitting(), generator, steps=0)
+
+
+def test_small_parts_in_the_air_are_left_out():
+    """Of three blocks of cells the one with a fiftieth of the largest one's goes, and cells that nothing shows."""
+    occupied = torch.zeros(12, 12, 12, dtype=torch.bool)
+    occupied[:5, :5, :4] = True  # 100 cells
+    occupied[8:10, 8:10, 8:10] = True  # 8
+    occupied[11, 0, :2] = True  # 2
+    seen = torch.ones(110, dtype=torch.bool)
+    seen[0] = False
+    kept = torch.zeros_like(occupied)
+    kept[occupied] = _large_parts(occupied, seen)
+    expected = occupied.clone()
+    expected[11, 0, :2] = False
+    expected[0, 0, 0] = False
+    assert torch.equal(kept, expected)

@@ -6,6 +6,8 @@ import math
 from itertools import pairwise
 from typing import Annotated
 
+import numpy as np
+import scipy.ndimage
 import torch
 from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Int
@@ -23,6 +25,9 @@ from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import PosedViews
 
 BelowOne = Annotated[float, Ge(0), Lt(1)]
+LARGE = 0.05
+"""Smallest connected part of a field of photographs that is kept, relative to the largest: their poses are not exact,
+and where few look a field has pictures of its own in the air."""
 BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 
@@ -64,6 +69,7 @@ class GridFitting(Fitting):
         self.learning_rate, self.head_learning_rate = learning_rate, head_learning_rate
         self.termination = termination
         self._ready: list[tuple[RayPool, PackedSamples, Tensor]] = []
+        self._photographs = False
 
     @override
     def start(self, views: PosedViews, generator: torch.Generator) -> None:
@@ -74,6 +80,7 @@ class GridFitting(Fitting):
         border = pixels_across(views, math.sqrt(3.0) * cell)
         self._blocks = RayBlocks(build_pool(views, border, generator))
         self._ready = []
+        self._photographs = views.known is not None
 
     def next_batch(self) -> tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]:
         """Return the next rays with their samples and the cells of these."""
@@ -106,7 +113,10 @@ class GridFitting(Fitting):
         refine = step in self.refine_steps
         if not refine and step not in self.prune_steps:
             return False
-        self.field.keep(self._seen_cells(), refine)
+        seen = self._seen_cells()
+        if self._photographs:
+            seen = seen & _large_parts(self.field.occupied, seen)
+        self.field.keep(seen, refine)
         self._ready = []
         return True
 
@@ -129,3 +139,15 @@ class GridFitting(Fitting):
         if self.field.head is not None:
             groups.append((list(self.field.head.parameters()), self.head_learning_rate))
         return groups
+
+
+def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]) -> Bool[Tensor, "cells"]:
+    """Find the cells in connected parts that are not small beside the largest; others are errors in the air."""
+    grid = torch.zeros_like(occupied)
+    grid[occupied] = seen
+    parts = np.zeros(tuple(grid.shape), dtype=np.int64)
+    scipy.ndimage.label(grid.cpu().numpy(), np.ones((3, 3, 3)), output=parts)
+    label = torch.from_numpy(parts).to(occupied.device)[occupied]
+    sizes = torch.bincount(label)
+    sizes[0] = 0
+    return (sizes >= LARGE * float(sizes.max()))[label] & seen

@@ -31,9 +31,10 @@ def visual_hull(
     """Cells of the unit sphere that the object may occupy; the cube [-1, 1]^3 has ``resolution`` along each edge.
 
     A cell goes when some view that sees its centre has no pixel above
-    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small; of photographs
-    (``views.known``), more than ``DISSENT`` of those that see it. Returns cells, origin and edge length in object
-    radii.
+    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small. Of photographs
+    (``views.known``) it takes more than ``DISSENT`` of those that show it. Returns cells, origin and edge length in
+    object radii.
+
     Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
     """
     check(resolution, Resolution, "visual_hull.resolution")
@@ -80,7 +81,7 @@ def _inside_all(
     remaining = torch.arange(len(centres), device=centres.device)
     allowed = 0.0 if views.known is None else DISSENT
     seen_by, missed_by = torch.zeros(2, len(centres), device=centres.device)
-    for pose, silhouette in zip(views.camera_to_world, mask, strict=True):
+    for number, (pose, silhouette) in enumerate(zip(views.camera_to_world, mask, strict=True)):
         local = (centres[remaining] - pose[:3, 3]) @ pose[:3, :3]
         depth = (-local[:, 2]).clamp_min(1e-6)
         column = (fx * local[:, 0] / depth + cx).floor().long()
@@ -88,8 +89,10 @@ def _inside_all(
         seen = (
             (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] < 0)
         )
-        hit = silhouette[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-        if allowed:
+        row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+        hit = silhouette[row, column]
+        if views.known is not None:
+            seen &= views.known[number][row, column]
             seen_by += seen
             missed_by += seen & ~hit
             continue

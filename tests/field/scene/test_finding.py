@@ -8,9 +8,13 @@ import torch
 from painted_scenes import RESOLUTION, WHOLE, box_of, cameras, painted, pixels_of, silhouette
 
 from neural_sim.field.scene.finding import find
+from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.photographs import photo_rays
 from neural_sim.field.scene.plane import supporting_plane
+from neural_sim.field.scene.region import SHOWS, cell_centres
 from neural_sim.field.scene.rendering import object_mask
+from neural_sim.field.scene.space import expand
+from neural_sim.field.scene.surface import seen_surface
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 CELL = 4.0 / RESOLUTION
@@ -152,3 +156,39 @@ def test_a_plane_among_points_with_outliers(generator):
     assert -0.01 < got.offset + 0.3 < 0.0
     below = torch.tensor([[0.0, 0.0, -2.0], [0.5, 0.0, -2.0]], dtype=torch.float64)
     assert supporting_plane(torch.cat([plane, standing]), UP, below, 0.03, generator) is None
+
+
+def test_a_blurred_surface_is_found(capture):
+    """A field of few steps: no cell of the box contributes ``SHOWS``, and rays end in it all the same."""
+
+    def blurred(points):
+        return box_of(points, LOW, HIGH)
+
+    grid = painted(lambda points: scene(points) & ~blurred(points))
+    axis = torch.linspace(-2.0, 2.0, RESOLUTION + 1)
+    points = expand(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3))
+    grid.table[blurred(points), 0] = -0.7  # softplus(-1.4) = 0.22 an edge: half of the light in three cells
+    grid.mark()
+    object_ = found(grid, capture)
+    surface = seen_surface(grid, pixels_of(capture), torch.arange(0, 38400, 7), WHOLE)
+    off_the_table = (*LOW[:2], LOW[2] + 3.0 * CELL)
+    inner = box_of(expand(cell_centres(RESOLUTION)), off_the_table, HIGH)
+    assert float(surface.largest[inner].max()) < SHOWS
+    for ours, theirs in zip(object_.box, (LOW, HIGH), strict=True):
+        assert np.abs(ours - np.array(theirs)).max() < 4.0 * CELL
+
+
+def test_fog_before_an_object_does_not_hide_it(standing, capture):
+    """A slab in the air that takes two thirds of the light is no part of the scene; the masks are as without it."""
+    object_ = found(standing, capture)
+    axis = torch.linspace(-2.0, 2.0, RESOLUTION + 1)
+    points = expand(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3))
+    foggy = SceneGrid(RESOLUTION, standing.table.clone())
+    foggy.table[box_of(points, (-1.0, -1.0, 0.6), (1.0, 1.0, 0.9)), 0] = -0.5
+    foggy.mark()
+    clear, fogged = (
+        torch.stack([object_mask(grid, object_.region, photo_rays(p, 80), WHOLE) for p in capture.frames])
+        for grid in (standing, foggy)
+    )
+    assert float((clear - fogged).abs().mean()) < 0.01
+    assert overlap(foggy, capture, object_.region).min() > EDGE

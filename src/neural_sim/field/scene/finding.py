@@ -12,13 +12,13 @@ from torch import Tensor
 from neural_sim.field.scene.fitting import ScenePixels
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.plane import Plane, refitted, supporting_plane
-from neural_sim.field.scene.region import GROUND, Region, cell_centres, connected_region
+from neural_sim.field.scene.region import GROUND, Region, cell_centres, connected_region, without_fog
 from neural_sim.field.scene.space import Frame, expand
 from neural_sim.field.scene.surface import seen_surface
 from neural_sim.objects.capture import Capture
 from neural_sim.objects.pictures import Corners
 
-RAYS = 49_152
+RAYS = 98_304
 """Pixels whose rays find the scene's surface."""
 DETAILED = 3
 """One in so many of them, those with most detail, give the points among which the plane is looked for."""
@@ -30,13 +30,16 @@ THICK = 0.75
 
 @dataclass(frozen=True)
 class Found:
-    """The object's region in the normalised frame; its centre, radius and box in the capture's."""
+    """The object's region in the normalised frame; its centre, radius and box in the capture's. ``occupied`` are the
+    cells of the field without fog.
+    """
 
     frame: Frame
     region: Region
     centre: Float[np.ndarray, "3"]
     radius: float
     box: tuple[np.ndarray, np.ndarray]
+    occupied: Bool[Tensor, "cells"]
 
 
 def find(
@@ -57,7 +60,8 @@ def find(
     """
     index = torch.randperm(len(pixels), generator=generator)[:RAYS]
     index = index[pixels.detail[index].argsort(descending=True, stable=True)]
-    points, largest = seen_surface(grid, pixels, index, frame)
+    surface = seen_surface(grid, pixels, index, frame)
+    points = surface.points
     poses = np.stack([photo.camera_to_world for photo in capture.frames])
     cameras = frame.into(torch.from_numpy(poses[:, :3, 3]))
     if before is None:
@@ -69,7 +73,7 @@ def find(
         )
     middle = ", ".join(f"{x:.4g}" for x in frame.centre)
     if box is not None:
-        region = _boxed(grid, largest, plane, frame, box)
+        region = _boxed(grid, surface.largest, plane, frame, box)
         if region is None:
             raise ValueError(
                 f"objects.box: nothing of {capture.name} is in {[list(corner) for corner in box]}; want two corners "
@@ -79,7 +83,7 @@ def find(
         within = None
         if before is not None:
             within = before.region.cells_in(before.frame, frame, grid.resolution)
-        region = connected_region(grid, largest, plane, within)
+        region = connected_region(grid, surface, plane, within)
         if region is None:
             raise ValueError(
                 f"{capture.source}: objects.masks=scene finds no object of {capture.name} near ({middle}), where the "
@@ -89,9 +93,8 @@ def find(
     centre = 0.5 * (low + high)
     cells = frame.out(expand(cell_centres(grid.resolution)[region.cells]).double().numpy())
     radius = float(np.linalg.norm(cells - centre, axis=1).max())
-    return Found(
-        frame, region, centre, radius, (low, high) if box is None else (np.array(box[0]), np.array(box[1]))
-    )
+    corners = (low, high) if box is None else (np.array(box[0]), np.array(box[1]))
+    return Found(frame, region, centre, radius, corners, without_fog(grid, surface, region))
 
 
 def _boxed(

@@ -82,6 +82,7 @@ class SceneMasks:
         finer = Frame(_three(first.centre), ROOM * first.radius)
         pixels, grid = self._fit(capture, finer, 1.0, generator, grid.moved(frame, finer))
         found = find(grid, pixels, finer, capture, upward, box, generator, first)
+        grid.occupied &= found.occupied
         masks = tuple(
             object_mask(grid, found.region, photo_rays(photo, self.image_size), finer)
             for photo in capture.frames

@@ -11,12 +11,16 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from neural_sim.field.occupancy import dilate
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.plane import Plane
 from neural_sim.field.scene.space import Frame, cells_of, contract, expand
+from neural_sim.field.scene.surface import SeenSurface
 
 SHOWS = 0.4
 """Smallest contribution of a cell to some pixel with which it counts as solid."""
+HITS = 2
+"""Rays that end in a cell from which on it counts as solid: a blurred surface contributes less, cell by cell."""
 REACH = 1.5
 """The object lies inside the ball of this radius in the normalised frame."""
 LARGE = 0.1
@@ -27,6 +31,8 @@ LEAST = 8
 """Solid cells of an object, at least."""
 EMPTIER = 0.5
 """Largest density of solid cells about an object, relative to its own."""
+SPECK = 64
+"""Cells of a connected part of the scene's surface, at least: a smaller one in the air is an error of the field."""
 APART = 1.0
 """Height in cells above the plane from which on cells connect: below it the plane's own roughness does."""
 GROUND = 1.0
@@ -69,14 +75,14 @@ def cell_centres(resolution: int) -> Float[Tensor, "cells 3"]:
 
 def connected_region(
     grid: SceneGrid,
-    largest: Float[Tensor, "cells"],
+    surface: SeenSurface,
     plane: Plane | None,
     within: Bool[Tensor, "cells"] | None = None,
 ) -> Region | None:
-    """What is connected and nearest to the origin, None where nothing is. ``largest`` is the cells' contribution;
-    ``within``, where it is given, holds the object and little else: all that is solid there is taken.
+    """What is connected and nearest to the origin, None where nothing is. ``within``, where it is given, holds the
+    object and little else: all that is solid there is taken.
     """
-    solid = (largest > SHOWS) & _allowed(grid, plane, APART)
+    solid = ((surface.largest > SHOWS) | (surface.hits >= HITS)) & _allowed(grid, plane, APART)
     if within is not None:
         solid &= within
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
@@ -130,6 +136,20 @@ def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells
     sizes = torch.bincount(label, minlength=count + 1)
     sizes[0] = 0
     return (sizes >= LARGE * float(sizes.max()))[label] & solid
+
+
+def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[Tensor, "cells"]:
+    """The cells in which light ends, with their neighbours and the region's own; all others hold fog.
+
+    Before few cameras, and where they see little, a field explains their photographs by something thin in the air. No
+    ray ends in it, or few do in a place of its own; in a mask it would hide the object.
+    """
+    side = grid.resolution
+    label, count = _labelled(surface.hits >= HITS, side)
+    sizes = torch.bincount(label, minlength=count + 1)
+    sizes[0] = 0
+    solid = (sizes >= SPECK)[label].view(side, side, side).float()
+    return (dilate(solid).flatten() > 0) | region.cells
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:

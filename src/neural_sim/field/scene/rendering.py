@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neural_sim.field.quadrature import render_weights, sum_rays
+from neural_sim.field.quadrature import render_weights, sum_rays, transmittance
 from neural_sim.field.scene.fitting import visible
 from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.photographs import PhotoRays
@@ -18,19 +18,43 @@ from neural_sim.types import Rays
 PHASES = (0.25, 0.75)
 """Shifts of the samples' lattice that a pixel averages: with one alone a surface shows the lattice's steps."""
 
+FOG = 4.0
+"""What lets one part in so many of the light pass hides nothing; what is solid lets less pass than a hundredth."""
+
 
 @torch.no_grad()
 def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) -> Float[Tensor, "h w"]:
-    """Opacity in [0, 1] of the object at each pixel: the weights of the ray's samples in the region, summed."""
+    """Opacity in [0, 1] of the object at each pixel, behind what is solid before it.
+
+    Fog is not: a field of few photographs from some side explains what it cannot by something thin in the air, and
+    would hide the object behind it.
+    """
     height, width = rays.seen.shape
     directions = rays.directions.reshape(-1, 3).float()
     origin = frame.into(rays.origin).float()
     mask = torch.zeros(height * width)
-    for part in rays.seen.flatten().nonzero()[:, 0].split(AT_ONCE):
+    low, high = (torch.from_numpy(corner).float() for corner in region.corners())
+    near = _meets(origin, directions, low, high) & rays.seen.flatten()
+    for part in near.nonzero()[:, 0].split(AT_ONCE):
         bundle = Rays(origin.expand(len(part), 3), directions[part])
         for phase in PHASES:
             seen = visible(grid, bundle, torch.full((len(part),), phase), grid.samples)
-            weights = render_weights(grid.density(grid.raw(seen.corners, seen.weights)[:, 0]), seen.samples)
-            weights = weights * region.holds(seen.positions)
+            sigma = grid.density(grid.raw(seen.corners, seen.weights)[:, 0])
+            inside = region.holds(seen.positions)
+            before = transmittance(sigma.masked_fill(inside, 0.0), seen.samples)
+            weights = render_weights(sigma.masked_fill(~inside, 0.0), seen.samples)
+            weights = weights * (FOG * before).clamp_max(1.0)
             mask[part] += sum_rays(weights[:, None], seen.samples)[:, 0] / len(PHASES)
     return mask.view(height, width).clamp(0.0, 1.0)
+
+
+def _meets(
+    origin: Float[Tensor, "3"],
+    directions: Float[Tensor, "n 3"],
+    low: Float[Tensor, "3"],
+    high: Float[Tensor, "3"],
+) -> Bool[Tensor, "n"]:
+    """Whether rays pass through a box, by its slabs."""
+    slope = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
+    one, other = (low - origin) / slope, (high - origin) / slope
+    return torch.minimum(one, other).amax(1).clamp_min(0.0) <= torch.maximum(one, other).amin(1)

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neural_sim.objects.placing import nearest_to_axes
+
 NEAR = 0.4
 """Where rays begin, in distances of their camera from the origin: nearer, a field has room for a picture of its own
 before each camera, and photographs of an object show nothing."""
@@ -87,8 +89,7 @@ def looked_at(camera_to_world: Float[np.ndarray, "n 4 4"], name: str) -> tuple[n
     """
     axes, centres = -camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    point = np.linalg.lstsq(normal, (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+    normal, point = across.sum(0), nearest_to_axes(camera_to_world)
     ahead = ((point - centres) * axes).sum(1) > 0.0
     if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(axes) or ahead.mean() < 0.5:
         raise ValueError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -9,19 +11,31 @@ from torch import Tensor
 from neural_sim.field.quadrature import alpha_from_sigma, transmittance
 from neural_sim.field.scene.fitting import ScenePixels, visible
 from neural_sim.field.scene.grid import SceneGrid
-from neural_sim.field.scene.space import Frame, cells_of, expand
+from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 
 AT_ONCE = 4096
 """Rays whose samples are in memory together."""
 
 
+@dataclass(frozen=True)
+class SeenSurface:
+    """What rays meet: ``points`` in the normalised frame at which half of a ray's light has ended, their number in each
+    of the grid's cells, and the ``largest`` contribution of each cell to any pixel.
+
+    A field of few steps spreads a surface over several cells, none of which contributes much; where half of the light
+    has ended it has a place all the same.
+    """
+
+    points: Float[Tensor, "hits 3"]
+    hits: Float[Tensor, "cells"]
+    largest: Float[Tensor, "cells"]
+
+
 @torch.no_grad()
 def seen_surface(
     grid: SceneGrid, pixels: ScenePixels, index: Int[Tensor, "some"], frame: Frame
-) -> tuple[Float[Tensor, "hits 3"], Float[Tensor, "cells"]]:
-    """Points in the normalised frame at which half of a ray's light has ended, and the largest contribution of each of
-    the grid's cells to any of these pixels.
-    """
+) -> SeenSurface:
+    """What the rays of these pixels meet."""
     points, largest = [], torch.zeros(grid.resolution**3)
     for part in index.split(AT_ONCE):
         seen = visible(grid, pixels.rays(part, frame), torch.full((len(part),), 0.5), grid.samples)
@@ -35,4 +49,6 @@ def seen_surface(
         last = starts[:-1] + lit[starts[1:]] - lit[starts[:-1]] - 1
         ended = torch.zeros(len(part)).index_add_(0, seen.samples.ray, weights) >= 0.5
         points.append(expand(seen.positions[last[ended]]))
-    return torch.cat(points), largest
+    met = torch.cat(points)
+    hits = torch.bincount(cells_of(contract(met), grid.resolution), minlength=grid.resolution**3)
+    return SeenSurface(met, hits.float(), largest)
