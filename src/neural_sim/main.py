@@ -94,7 +94,8 @@ def _build(plain: dict[str, Any]) -> Experiment:
         task=plain["task"],
     )
     images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
-    imaging = Imaging(**images, camera=_camera(parts), distribution=_product(parameters, parts))
+    distribution, covered = _covered(_product(parameters, parts), parameters, parts["objects"])
+    imaging = Imaging(**images, camera=_camera(parts), distribution=distribution, coverage=covered)
     loop = Loop(parts["baseline"], parts["outer"], parts["gradient"], parts["solver"])
     return Experiment(run, imaging, parts["detector"], parts["training"], loop, plain, parts["model"])
 
@@ -149,6 +150,25 @@ def _camera(parts: Mapping[str, Any]) -> Any:
     views = parts["views"]
     try:
         return parts["camera"].camera(parts["training"].image_size, views.field_of_view_deg, parts["target"])
+    except ValueError as error:
+        raise UserError(first_line(error)) from error
+
+
+def _covered(distribution: Any, parameters: Mapping[str, Any], objects: Any) -> tuple[Any, Any]:
+    """p_psi without the bins that no photograph shows, unless these are wanted; and what photographs show."""
+    from neural_sim.objects.photos import Photos
+    from neural_sim.parameter.coverage import coverages
+    from neural_sim.parameter.pose import Pose
+
+    pose = next((own for own in parameters.values() if isinstance(own, Pose)), None)
+    if pose is None or not isinstance(objects, Photos):
+        return distribution, {}
+    seen = {name: objects.directions(name) for name in objects.names()}
+    found = coverages(distribution, seen, pose.covered_within_deg)
+    if pose.uncovered == "render":
+        return distribution, found
+    try:
+        return distribution.leaving_out(found), found
     except ValueError as error:
         raise UserError(first_line(error)) from error
 

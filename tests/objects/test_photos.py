@@ -11,7 +11,7 @@ from captures import DISTORTION, capture, distorted
 
 from neural_sim.objects.capture import Lens
 from neural_sim.objects.photos import Photos
-from neural_sim.objects.placing import upright
+from neural_sim.objects.placing import place, upright
 from neural_sim.objects.resampling import turned_to_origin
 from neural_sim.objects.ycb import YCB
 from neural_sim.renderer.raycast import RaycastRenderer
@@ -220,3 +220,31 @@ def test_frames_are_split_and_blenders_files_say_which_score(tmp_path, made):
     assert blender.captures["can"].up == (0.0, 0.0, 1.0)
     assert blender.captures["can"].frames[0].lens.fx == pytest.approx(source["fl_x"], rel=1e-12)
     assert [len(part) for part in blender.split("can", 100, 4)] == [10, 4]
+
+
+def test_a_box_bounds_centre_and_radius(tmp_path):
+    """The upper half of a can by a box about it: the hull's cells end at the box, by a cell of its grid at most."""
+    truth = capture(tmp_path, count=12)
+    low, high = (np.array(corner) for corner in truth.mesh.bounds)
+    middle = 0.5 * (low[1] + high[1])
+    box = (tuple(low - 0.1), (high[0] + 0.1, middle, high[2] + 0.1))
+    pictures = Photos(tmp_path, up="-y").pictures("can")
+    whole, half = place(pictures, (0.0, -1.0, 0.0)), place(pictures, (0.0, -1.0, 0.0), box)
+    cell = 2.0 * 1.1 * whole.radius / 48
+    assert half.radius < whole.radius - cell
+    bottom = np.linalg.inv(half.to_object) @ [0.0, 0.0, 0.0, 1.0]
+    expected = 0.5 * (low[1] + middle)
+    assert abs(bottom[1] - expected) < 2.0 * cell
+
+
+def test_directions_are_those_of_the_views(tmp_path):
+    """Without a mask, from where the cameras look: within a few degrees of the cameras of the placed views."""
+    capture(tmp_path, count=12)
+    photos = Photos(tmp_path, up="-y")
+    train, test = photos.split("can", 12, 1)
+    placed = np.stack([photos.placement("can").pose(f.camera_to_world)[:3, 3] for f in (*train, *test)])
+    order = [photos.captures["can"].frames.index(f) for f in (*train, *test)]
+    cosines = (placed / np.linalg.norm(placed, axis=1, keepdims=True) * photos.directions("can")[order]).sum(
+        1
+    )
+    assert np.degrees(np.arccos(cosines.min())) < 6.0

@@ -138,3 +138,41 @@ def test_circular_mean_derivative_against_central_differences(generator):
 def test_one_bin_always_wins(generator):
     y = binned.gumbel_softmax(torch.zeros(1), binned.gumbel((5, 1), generator, torch.float32), 0.1)
     assert (y == 1).all()
+
+
+def closed_psi():
+    psi = torch.tensor([[0.3, -0.2, 1.0, 0.5], [0.0, 2.0, -1.0, 0.1]], dtype=torch.float64)
+    closed = torch.tensor([[False, True, False, True], [False, False, False, False]])
+    return binned.closing(psi, closed), psi, closed
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.02])
+def test_closed_bins_have_no_probability_and_the_others_are_those_without_them(floor):
+    """A row with closed bins against the same logits without these; one without any is untouched."""
+    psi, before, _ = closed_psi()
+    p = binned.log_probabilities(psi, floor).exp()
+    assert p[0, [1, 3]].tolist() == [0.0, 0.0]
+    torch.testing.assert_close(p[0, [0, 2]], binned.log_probabilities(before[0, [0, 2]], floor).exp())
+    torch.testing.assert_close(p[1], binned.log_probabilities(before[1], floor).exp())
+    back = binned.logits(p, floor, binned.is_closed(psi))
+    torch.testing.assert_close(binned.log_probabilities(back, floor).exp(), p)
+    slopes = torch.autograd.functional.jacobian(lambda x: binned.log_probabilities(x, floor).exp(), psi[0])
+    assert bool(slopes.isfinite().all()) and not slopes[[1, 3]].any() and not slopes[:, [1, 3]].any()
+
+
+def test_no_step_opens_a_closed_bin(generator):
+    psi, _, closed = closed_psi()
+    assert torch.equal(binned.is_closed(binned.bounded(psi + 3.0, 0.01)), closed)
+    p = binned.log_probabilities(psi, 0.01).exp()
+    moved = binned.nearest(p + torch.tensor([-0.3, 0.5, 0.1, 0.2]), 0.01, 0.1 * p, closed)
+    torch.testing.assert_close(moved.sum(-1), torch.ones(2, dtype=torch.float64))
+    assert moved[0, [1, 3]].tolist() == [0.0, 0.0] and float(moved.min()) >= 0.0
+    alone = binned.nearest((p[0] + torch.tensor([-0.3, 0.5, 0.1, 0.2]))[[0, 2]], 0.01, 0.1 * p[0, [0, 2]])
+    torch.testing.assert_close(
+        moved[0, [0, 2]], alone, atol=2e-3, rtol=0.0
+    )  # the least p is of four bins, not two
+    log_p = binned.log_probabilities(psi[0], 0.01)
+    gumbel = binned.gumbel((400, 4), generator, torch.float64)
+    assert not set(binned.balanced(log_p, gumbel, 0.3).tolist()) & {1, 3}
+    assert not set((log_p + gumbel).argmax(-1).tolist()) & {1, 3}
+    assert float(binned.gumbel_softmax(log_p, gumbel, 0.1)[:, [1, 3]].max()) == 0.0

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class Co3d(Photos):
         names: categories; null: all.
         sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
             the highest ``viewpoint_quality_score``, of those without one the longest.
-        masks, up, size, box, scene, poses: see :class:`Photos`.
+        masks, up, size, box, scene, poses, poor: see :class:`Photos`.
 
     Raises:
         ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
@@ -56,9 +56,10 @@ class Co3d(Photos):
         box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
         poses: PoseCorrector | None = None,
+        poor: Literal["refuse", "use"] = "refuse",
     ) -> None:
         self.sequences = dict(sequences or {})
-        super().__init__(root, names, masks, up, size, box, scene, poses)
+        super().__init__(root, names, masks, up, size, box, scene, poses, poor)
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
             raise ValueError(f"objects.sequences: {strange} are no objects, these are {self.names()}")

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from neural_sim.objects.pictures import (
     check_masks,
     mask_of,
 )
-from neural_sim.objects.placing import AXES, Placement, place
+from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
 from neural_sim.objects.resampling import pixels_per_pixel, resample
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
 from neural_sim.ranges import Matching, Positive, validated
@@ -62,6 +63,7 @@ class Photos:
             its unit, or a mapping by object's name; null: the object is looked for where the cameras look.
         scene: what computes masks where ``masks="scene"``.
         poses: what corrects the cameras' poses; null: they stay as they are given.
+        poor: what happens where a field does not show its object: nothing trains on it (``refuse``), or ``use``.
 
     Raises:
         ValueError: a missing folder, one without captures, an unknown name, ``masks="scene"`` without ``scene``,
@@ -78,12 +80,13 @@ class Photos:
         box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
         poses: PoseCorrector | None = None,
+        poor: Literal["refuse", "use"] = "refuse",
     ) -> None:
         self.root = folder_of(root)
         captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
-        self.up, self.size, self.box, self.scene, self.poses = up, size, box, scene, poses
+        self.up, self.size, self.box, self.scene, self.poses, self.poor = up, size, box, scene, poses, poor
         if masks == "scene" and scene is None:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
@@ -156,7 +159,7 @@ class Photos:
 
     def placement(self, name: str, pictures: Pictures | None = None) -> Placement:
         """An object's pose and radius in its capture's frame."""
-        return place(pictures or self.pictures(name), self._up(name))
+        return place(pictures or self.pictures(name), self._up(name), box_of(self.box, name))
 
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
@@ -171,6 +174,22 @@ class Photos:
             name, len(train), len(test), image_size, finest,
         )  # fmt: skip
         return views if self.poses is None else self.poses.refine(views, len(test))
+
+    def up_of(self, name: str) -> tuple[float, float, float]:
+        """The up direction in an object's capture's frame: as set, else its file's, else the mean of the cameras'."""
+        capture = self.captures[name]
+        return self._up(name) or capture.up or mean_up(capture)
+
+    def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
+        """Unit vectors from where an object's cameras look, or from its box, to the cameras, in the object's frame.
+
+        No photograph is read: masks would move the centre a little, and the directions by some degrees.
+        """
+        poses = np.stack([frame.camera_to_world for frame in self.captures[name].frames])
+        box = box_of(self.box, name)
+        centre = nearest_to_axes(poses) if box is None else np.array(box).mean(0)
+        away = (poses[:, :3, 3] - centre) @ upright(np.array(self.up_of(name)), name).T
+        return away / np.linalg.norm(away, axis=1, keepdims=True)
 
     def _up(self, name: str) -> tuple[float, float, float] | None:
         up: Any = self.up.get(name) if isinstance(self.up, Mapping) else self.up

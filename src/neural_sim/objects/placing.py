@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from neural_sim.objects.capture import Capture, Frame, Lens
-from neural_sim.objects.pictures import Pictures
+from neural_sim.objects.pictures import Corners, Pictures
 
 _log = logging.getLogger(__name__)
 
@@ -51,10 +52,11 @@ class Placement:
         return moved
 
 
-def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placement:
+def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corners | None = None) -> Placement:
     """The placement of an object. Centre and radius are those of the visual hull (Laurentini 1994) of its silhouettes.
 
     ``up`` is in the capture's frame; None: that of its file, else the mean of the cameras' up vectors, which is logged.
+    ``box``: the hull ends at its sides, which are along the axes of the capture's frame.
 
     Raises:
         ValueError: masks without an object, or an empty visual hull.
@@ -70,7 +72,7 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None) -> Placemen
     turn = upright(np.array(chosen, dtype=np.float64), capture.name)
     silhouettes = [silhouette(pictures, frame) for frame in capture.frames]
     _doubt(capture, silhouettes)
-    centre, radius = sphere_of(capture, silhouettes)
+    centre, radius = sphere_of(capture, silhouettes, box)
     _log.info(
         "%s: centre (%.4g, %.4g, %.4g) and radius %.4g in the capture's unit, from %d silhouettes",
         capture.name, *centre, radius, len(capture.frames),
@@ -85,6 +87,13 @@ def mean_up(capture: Capture) -> tuple[float, float, float]:
     """The mean of the cameras' up vectors, in the capture's frame."""
     x, y, z = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames]).mean(0).tolist()
     return x, y, z
+
+
+def nearest_to_axes(camera_to_world: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
+    """The point nearest to the cameras' optical axes (least squares)."""
+    axes, centres = -camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return np.linalg.lstsq(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
 
 
 def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
@@ -124,9 +133,9 @@ def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]) -> None
 
 
 def sphere_of(
-    capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]
+    capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]], box: Corners | None = None
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Centre and radius of the silhouettes' visual hull, in the capture's frame."""
+    """Centre and radius of the silhouettes' visual hull, or of its part in a box, in the capture's frame."""
     empty = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if not mask.any()]
     if len(empty) == len(silhouettes):
         raise ValueError(
@@ -137,7 +146,8 @@ def sphere_of(
             "%s: no object in the masks of %d photographs, such as %s", capture.name, len(empty), empty[0]
         )
     shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
-    centre, half = _first_cube(shown)
+    ends = torch.tensor([[-math.inf] * 3, [math.inf] * 3] if box is None else box, dtype=torch.float64)
+    centre, half = _first_cube(shown) if box is None else _cube_of(box)
     # First by whole cells, in order not to miss a thin part; then in a cube that fits, by the cells' centres.
     for reach in (0.5 * np.sqrt(3.0), 0.0):
         cell = 2.0 * half / CELLS
@@ -145,7 +155,8 @@ def sphere_of(
         cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(
             -1, 3
         ) + torch.from_numpy(centre)
-        hull = cells[_carved(shown, cells, reach * cell)]
+        cells = cells[((cells + reach * cell > ends[0]) & (cells - reach * cell < ends[1])).all(1)]
+        hull = cells[_carved(shown, cells, reach * cell)] if len(cells) else cells
         if not len(hull):
             raise ValueError(
                 f"{capture.source}: the silhouettes of {capture.name} share no space; check masks, poses and axes"
@@ -155,6 +166,12 @@ def sphere_of(
         radius = float((hull - torch.from_numpy(centre)).norm(dim=-1).max()) + 0.5 * cell
         half = 1.1 * radius
     return centre, radius
+
+
+def _cube_of(box: Corners) -> tuple[np.ndarray, float]:
+    """The middle of a box, and half the side of a cube about it."""
+    low, high = np.array(box)
+    return 0.5 * (low + high), 0.5 * float((high - low).max())
 
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:

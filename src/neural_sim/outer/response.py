@@ -23,6 +23,7 @@ from neural_sim.outer.inner import InnerLoop, Numbers, Trained
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.records import Cost
 from neural_sim.outer.steps import LearnedObjects
+from neural_sim.parameter.bins import is_closed
 from neural_sim.parameter.factor import Factor
 
 PART = 0.15
@@ -157,4 +158,6 @@ def _moved(
     parts = inner.scene.distribution.split(psi)
     p = factor.p_of(parts[factor.name])
     moved = (1.0 - part) * p + part * torch.nn.functional.one_hot(bins, factor.size).to(p)
-    return inner.scene.distribution.join({**parts, factor.name: factor.psi_of(moved)})
+    return inner.scene.distribution.join(
+        {**parts, factor.name: factor.psi_of(moved, is_closed(parts[factor.name]))}
+    )

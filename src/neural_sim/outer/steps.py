@@ -204,7 +204,9 @@ def slopes_by_p(
     By logits it is p - floor times that by p, and would hardly move a bin of small p. ``error`` are the standard errors
     of ``gradient``; the second result has the variances of the first.
     """
-    scale = factor.log_slopes(psi).exp()
+    scale = (
+        factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)
+    )  # 0 in closed bins, as their slope is
     direction = -gradient / scale
     return direction - direction.mean(-1, keepdim=True), (error / scale).square()
 

@@ -9,13 +9,16 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
 # The softmax of a logit at its lowest (:func:`bounded`), in floors: there p is within this fraction of the floor.
 LOWEST = 0.25
+# The logit of a bin that nothing may be drawn from, such as one that no photograph of the object shows. Its p is 0 and
+# has no floor; no step of some logits brings it back.
+CLOSED = -1e4
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,21 @@ class BinNoise:
         return BinNoise(self.gumbel[index])
 
 
+def is_closed(psi: Float[Tensor, "*n k"]) -> Bool[Tensor, "*n k"]:
+    """Find the bins that nothing may be drawn from."""
+    return psi.detach() < 0.5 * CLOSED
+
+
+def closing(psi: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+    """Close bins, whatever psi was there; psi itself where there are none."""
+    return torch.where(closed, torch.full_like(psi, CLOSED), psi) if bool(closed.any()) else psi
+
+
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
-    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is.
+    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is. Closed bins have no floor,
+    and of k the open ones count.
 
     Raises:
         ValueError: unless 0 <= floor < 1 / k.
@@ -46,7 +60,11 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
     if not 0.0 <= floor < 1.0 / bins:
         raise ValueError(f"parameter: floor must lie in [0, 1/{bins}), got {floor}")
     above = log_slopes(psi, floor)
-    return above if floor == 0.0 else torch.logaddexp(above, torch.full_like(psi, math.log(floor)))
+    if floor == 0.0:
+        return above
+    floored = torch.logaddexp(above, torch.full_like(psi, math.log(floor)))
+    closed = is_closed(psi)
+    return torch.where(closed, above, floored) if bool(closed.any()) else floored
 
 
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
@@ -55,7 +73,10 @@ def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, 
     The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)). Divided by p in the place of w, derivatives of
     bins at the floor would vanish.
     """
-    return torch.log_softmax(psi, -1) + math.log1p(-psi.shape[-1] * floor)
+    closed = is_closed(psi)
+    if not bool(closed.any()):
+        return torch.log_softmax(psi, -1) + math.log1p(-psi.shape[-1] * floor)
+    return torch.log_softmax(psi, -1) + torch.log1p(-floor * (~closed).sum(-1, keepdim=True))
 
 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
@@ -66,24 +87,46 @@ def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n
     """
     if floor == 0.0:
         return psi
-    return torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(1.0 / (LOWEST * floor)))
+    raised = torch.maximum(psi, psi.amax(-1, keepdim=True) - math.log(1.0 / (LOWEST * floor)))
+    return closing(raised, is_closed(psi))
 
 
 def nearest(
-    values: Float[Tensor, "*n k"], floor: float = 0.0, least: Float[Tensor, "*n k"] | float = 0.0
+    values: Float[Tensor, "*n k"],
+    floor: float = 0.0,
+    least: Float[Tensor, "*n k"] | float = 0.0,
+    closed: Bool[Tensor, "*n k"] | None = None,
 ) -> Float[Tensor, "*n k"]:
     """Find the nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1.
 
-    Nor is any below the p of a logit that :func:`bounded` has raised, if the largest p is 1.
+    Nor is any below the p of a logit that :func:`bounded` has raised, if the largest p is 1. Those of ``closed`` bins
+    are 0.
     """
     bins = values.shape[-1]
     lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
+    if closed is not None and bool(closed.any()):
+        # So far below the others that the projection leaves nothing there.
+        lowest = lowest.masked_fill(closed, 0.0)
+        values = torch.where(
+            closed, values.masked_fill(closed, -torch.inf).amax(-1, keepdim=True) - 4.0, values
+        )
     rest = 1.0 - lowest.sum(-1, keepdim=True)
     return lowest + rest * project_simplex((values - lowest) / rest)
 
 
-def logits(probabilities: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
-    """Compute centred logits of ``probabilities``, clamped to just above the floor; see :func:`log_probabilities`."""
+def logits(
+    probabilities: Float[Tensor, "*n k"], floor: float = 0.0, closed: Bool[Tensor, "*n k"] | None = None
+) -> Float[Tensor, "*n k"]:
+    """Compute centred logits of ``probabilities``, clamped to just above the floor; see :func:`log_probabilities`.
+
+    What ``closed`` bins have of them goes to the others, in proportion.
+    """
+    if closed is not None and bool(closed.any()):
+        open_ = (~closed).sum(-1, keepdim=True)
+        p = probabilities.masked_fill(closed, 0.0)
+        above_floor = ((p / p.sum(-1, keepdim=True) - floor) / (1.0 - open_ * floor)).clamp_min(1e-6)
+        log_p = above_floor.log().masked_fill(closed, 0.0)
+        return closing(log_p - log_p.sum(-1, keepdim=True) / open_, closed)
     bins = probabilities.shape[-1]
     above_floor = ((probabilities - floor) / (1.0 - bins * floor)).clamp_min(1e-6)
     log_p = above_floor.log()

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
 
+import torch
 from annotated_types import Ge, Lt
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.parameter import bins as binned
@@ -35,12 +36,14 @@ class ConfiguredDistributions:
         biased: object name -> {initial: ..., target: ...}, see :func:`distributions.distribution`.
         gap: how far biased objects start from their target: ``disjoint`` as ``biased`` says, ``uniform``, or ``same``,
             at the target itself.
+        closed: object name -> its bins, from 1, that nothing is drawn from, whatever the distributions say of them.
     """
 
     initial: Specification = "uniform"
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
     gap: Gap = "disjoint"
+    closed: Mapping[str, tuple[int, ...]] | None = None
 
     def of(self, which: str, object_name: str) -> Specification:
         """Look up the ``initial`` or ``target`` specification of one object."""
@@ -98,8 +101,14 @@ class Factor(Protocol):
         """Compute the configured ``initial`` or ``target`` psi of an object, float64."""
         ...
 
-    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Map probabilities of bins, or weights of lights, to psi."""
+    def closed(self, object_name: str) -> Bool[Tensor, "k"]:
+        """Find the strata of an object that nothing is drawn from."""
+        ...
+
+    def psi_of(
+        self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
+    ) -> Float[Tensor, "*n k"]:
+        """Map probabilities of bins, or weights of lights, to psi; nothing is drawn from ``closed`` strata."""
         ...
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -193,12 +202,19 @@ class BinnedFactor:
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """Compute the logits that give :meth:`probabilities`."""
-        return self.psi_of(self.probabilities(which, object_name))
+        """Compute the logits that give :meth:`probabilities`, but for bins that are closed."""
+        return self.psi_of(self.probabilities(which, object_name), self.closed(object_name))
 
-    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute the logits that give the probabilities ``p``."""
-        return binned.logits(p, self.floor)
+    def closed(self, object_name: str) -> Bool[Tensor, "k"]:
+        """Find the bins that nothing is drawn from."""
+        bins = (self.configured.closed or {}).get(object_name, ())
+        return torch.tensor([number + 1 in bins for number in range(self.bins)])
+
+    def psi_of(
+        self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
+    ) -> Float[Tensor, "*n k"]:
+        """Compute the logits that give the probabilities ``p``; nothing is drawn from ``closed`` bins."""
+        return binned.logits(p, self.floor, closed)
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """Compute the probabilities of the bins."""
@@ -223,8 +239,8 @@ class BinnedFactor:
 
         None is lower than :meth:`project` lets it be, nor than the fraction ``keep`` of what it was.
         """
-        p = self.p_of(psi)
-        return binned.logits(binned.nearest(p + change, self.floor, keep * p), self.floor)
+        p, closed = self.p_of(psi), binned.is_closed(psi)
+        return binned.logits(binned.nearest(p + change, self.floor, keep * p, closed), self.floor, closed)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
         """Find the bin of each draw's coordinate: for a relaxed draw not always the bin that was drawn."""

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, cast
 
 import torch
 from annotated_types import Ge
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.parameter.distributions import Specification, distribution, project_simplex, project_sum
@@ -108,7 +108,13 @@ class Illumination:
             return _affine_numbers(cast(Sequence[float], specification), self.anchors, where)
         return distribution(specification, self.anchors, where)
 
-    def psi_of(self, p: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
+    def closed(self, object_name: str) -> Bool[Tensor, "k"]:
+        """Close no light."""
+        return torch.zeros(self.anchors, dtype=torch.bool)
+
+    def psi_of(
+        self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
+    ) -> Float[Tensor, "*n k"]:
         """Return the weights themselves."""
         return p
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
+from annotated_types import Gt, Le
+
 from neural_sim.parameter.distributions import Specification
 from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Floor, Gap
 from neural_sim.ranges import Ascending, Matching, Positive, PositiveInt, validated
@@ -34,6 +36,9 @@ class Pose:
             k + 1 - i show an object from the same sides, upright and on its head.
         other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
         temperature, bin_mean, floor: see :class:`BinnedFactor`; ``bin_mean`` is that of the full circle.
+        uncovered: what happens to bins that no photograph of an object is near: ``leave_out``, their p is 0, or
+            ``render``.
+        covered_within_deg: angle from a pose to a photograph's direction up to which it is near.
         initial, target, biased, gap: see :class:`ConfiguredDistributions`. With ``both``, {phi: ..., rho: ...} gives
             each angle a distribution; a single distribution is phi's, and rho is uniform.
 
@@ -52,6 +57,8 @@ class Pose:
     target: Specification = "uniform"
     biased: Mapping[str, Mapping[str, Specification]] | None = None
     gap: Gap = "disjoint"
+    uncovered: Literal["leave_out", "render"] = "leave_out"
+    covered_within_deg: Annotated[float, Gt(0), Le(180)] = 30.0
 
     def __post_init__(self) -> None:
         _ = self.factors  # raises for what their distributions do not take

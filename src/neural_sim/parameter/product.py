@@ -35,6 +35,15 @@ class Parameter(Protocol):
         ...
 
 
+class Covered(Protocol):
+    """What photographs show of a factor's bins."""
+
+    @property
+    def missing(self) -> list[int]:
+        """The bins, numbered from 1, that they do not show."""
+        ...
+
+
 @dataclass(frozen=True)
 class SceneNoise:
     """All randomness of n draws, drawn once and replayed in every pass (paper, Tool 2).
@@ -151,6 +160,33 @@ class SceneDistribution:
         return torch.stack(
             [torch.cat([factor.psi(which, name) for factor in self.factors]) for name in objects]
         )
+
+    def leaving_out(self, covered: Mapping[str, Mapping[str, Covered]]) -> SceneDistribution:
+        """Return the distribution without what is not covered, by object and factor: p of these bins is 0.
+
+        Raises:
+            ValueError: an object of which no bin is left.
+        """
+        factors: list[Factor] = []
+        for factor in self.factors:
+            closed = {
+                name: tuple(own[factor.name].missing) for name, own in covered.items() if factor.name in own
+            }
+            for name, bins in closed.items():
+                if len(bins) == factor.size:
+                    raise ValueError(
+                        f"parameter.{factor.name}: no bin of {name} is near a photograph; check objects.up and poses, "
+                        "or set parameter.pose.uncovered=render"
+                    )
+            if isinstance(factor, BinnedFactor) and any(closed.values()):
+                factor = replace(factor, configured=replace(factor.configured, closed=closed))
+            factors.append(factor)
+        return replace(self, factors=tuple(factors))
+
+    def uniform_of(self, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
+        """Compute the psi of the objects with uniform open bins and equal weights of lights."""
+        even = [(f, distribution("uniform", f.size)) for f in self.factors]
+        return torch.stack([torch.cat([f.psi_of(p, f.closed(name)) for f, p in even]) for name in objects])
 
     @property
     def uniform(self) -> Float[Tensor, "K"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from neural_sim.gradient.estimators import Estimator
 from neural_sim.objects.photos import Photos
 from neural_sim.outer.objective import Loss
 from neural_sim.outer.settings import Outer
+from neural_sim.parameter.coverage import Coverage
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.views import Views
@@ -55,7 +57,8 @@ class Run:
 class Imaging:
     """What makes images: of objects (``views``, ``field``, ``renderer``, ``synthesis``), and of the target.
 
-    ``camera`` is that of synthesised and of rendered target images.
+    ``camera`` is that of synthesised and of rendered target images. ``coverage`` says by object and factor what
+    photographs show; nothing is said of meshes.
 
     Raises:
         ValueError: fields that the renderer cannot draw.
@@ -69,6 +72,7 @@ class Imaging:
     target: Target
     camera: PinholeCamera
     distribution: SceneDistribution
+    coverage: Mapping[str, Mapping[str, Coverage]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         kind = self.field.kind

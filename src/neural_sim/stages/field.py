@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -10,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from neural_sim.field.base import RadianceField
+from neural_sim.field.quality import POOR
 from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
@@ -21,6 +23,17 @@ class FittedField:
 
     field: RadianceField
     history: list[dict[str, Any]]
+
+    @property
+    def psnr(self) -> float | None:
+        """PSNR in dB on the object's pixels of the held-out views; None without any."""
+        value = self.history[-1]["psnr_foreground"] if self.history else float("nan")
+        return None if math.isnan(value) else value
+
+    @property
+    def poor(self) -> bool:
+        """Whether the field does not show its object."""
+        return self.psnr is not None and self.psnr < POOR
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,21 @@ class FieldStage(Stage[FittedField]):
     @override
     def title(self) -> str:
         return f"field of {self.views.object}"
+
+    def usable(self, results: Results) -> RadianceField:
+        """Return the field, for what trains on its renders.
+
+        Raises:
+            ValueError: a field of photographs that does not show its object, unless ``objects.poor`` says otherwise.
+        """
+        fitted = results(self)
+        if fitted.poor and self.views.objects.refuses_poor:
+            raise ValueError(
+                f"{self.views.object}: its field has {fitted.psnr:.1f} dB on the object in held-out photographs, want "
+                f"at least {POOR:g}: renders of it would train for something else. stages=[field] shows it in "
+                "objects.html; objects.box, objects.masks and sharper photographs help, objects.poor=use goes on"
+            )
+        return fitted.field
 
     @override
     def make(self, results: Results) -> FittedField:

@@ -14,6 +14,7 @@ from neural_sim.devices import device_of
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.field import FieldStage
+from neural_sim.stages.quality import QualityStage
 from neural_sim.stages.scene import FieldSubjectStage, SceneStage
 from neural_sim.stages.symmetry import SymmetryStage
 from neural_sim.stages.target_sets import TargetSetsStage
@@ -21,6 +22,8 @@ from neural_sim.stages.views import Objects, ViewsStage
 from neural_sim.types import PinholeCamera
 
 Psi = Float[Tensor, "objects K"]
+THUMBNAIL = 96
+"""Pixels along each side of a bin's picture."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,16 @@ class Images:
         return tuple(FieldStage(views, recipe, self.device) for views in self.views)
 
     @cached_property
+    def qualities(self) -> tuple[QualityStage, ...]:
+        """How well every object's field shows it."""
+        imaging, radii = self.experiment.imaging, self.radii or (None,) * len(self.fields)
+        camera, distribution = imaging.views.camera(THUMBNAIL), imaging.distribution
+        return tuple(
+            QualityStage(field, imaging.renderer, radius, camera, distribution.drawn, distribution)
+            for field, radius in zip(self.fields, radii, strict=True)
+        )
+
+    @cached_property
     def scene(self) -> SceneStage:
         """What training images are synthesised from."""
         imaging = self.experiment.imaging
@@ -130,8 +143,8 @@ class Images:
 
     @property
     def uniform(self) -> Psi:
-        """The psi of equal probabilities."""
-        return self.experiment.imaging.distribution.uniform.expand_as(self.psi("initial"))
+        """The psi of equal probabilities of all bins that are not left out."""
+        return self.experiment.imaging.distribution.uniform_of(self.names)
 
     @property
     def target_psi(self) -> Psi | None:

@@ -48,7 +48,7 @@ def psi_of_file(
                 raise ValueError(
                     f"{key}: {file}: {name}.{factor.name}: want {factor.size} numbers that add up to 1, got {numbers}"
                 )
-            parts.append(factor.psi_of(p))
+            parts.append(factor.psi_of(p, factor.closed(name)))
         psi.append(torch.cat(parts))
     return torch.stack(psi)
 

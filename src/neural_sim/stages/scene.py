@@ -60,7 +60,7 @@ class FieldSubjectStage(SubjectStage[FieldSubject]):
 
     @override
     def make(self, results: Results) -> FieldSubject:
-        return FieldSubject(self.object, results(self.field).field, self.renderer, radius=self.radius)
+        return FieldSubject(self.object, self.field.usable(results), self.renderer, radius=self.radius)
 
 
 @dataclass(frozen=True)

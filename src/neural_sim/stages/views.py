@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 from typing_extensions import override
 
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
+from neural_sim.field.quality import Placed
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.objects.photos import Photos, PoseCorrector
 from neural_sim.objects.pictures import SceneMaskMaker
+from neural_sim.objects.placing import upright
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
@@ -29,6 +33,10 @@ from neural_sim.stages.store import from_bytes, to_bytes
 from neural_sim.synthesis.subjects import MeshSubject, PhotographedField, RenderedSubject
 from neural_sim.types import PinholeCamera, PosedViews
 
+PHOTOGRAPH = 320
+"""Pixels along a shown photograph's longer side, about."""
+DIMMED = 0.25
+"""Brightness of what is not the object in a shown photograph."""
 MasksOfFrames = tuple[Float[Tensor, "_ _"], ...]
 
 
@@ -206,6 +214,21 @@ class Objects(ABC):
         """Return how many of an object's views are held out."""
         return settings.held_out
 
+    @property
+    def refuses_poor(self) -> bool:
+        """Whether nothing may train on fields that do not show their objects."""
+        return False
+
+    def photographs(
+        self, name: str, settings: Views, masks: MasksOfFrames, held_out: Sequence[int]
+    ) -> tuple[Float[Tensor, "_ _ 3"], ...]:
+        """Return photographs of some held-out views, what is not the object dimmed; none of objects of meshes."""
+        return ()
+
+    def placed(self, name: str, settings: Views, views: PosedViews) -> Placed | None:
+        """Return where an object is in its capture; None for objects of meshes."""
+        return None
+
     def stage(self, name: str, settings: Views) -> ViewsStage:
         """Return the stage of an object's views."""
         return ViewsStage(name, self.digests[name], settings, self)
@@ -272,6 +295,34 @@ class Captures(Objects):
         pictures = self.source.pictures(name, masks)
         return self.source.views(name, settings.count, settings.held_out, settings.image_size, pictures)
 
+    @property
+    @override
+    def refuses_poor(self) -> bool:
+        return self.source.poor == "refuse"
+
+    @override
+    def photographs(
+        self, name: str, settings: Views, masks: MasksOfFrames, held_out: Sequence[int]
+    ) -> tuple[Float[Tensor, "_ _ 3"], ...]:
+        test = self.source.split(name, settings.count, settings.held_out)[1]
+        pictures = self.source.pictures(name, masks)
+        return tuple(dimmed(pictures.rgba(test[number])) for number in held_out)
+
+    @override
+    def placed(self, name: str, settings: Views, views: PosedViews) -> Placed:
+        frames = [
+            frame for part in self.source.split(name, settings.count, settings.held_out) for frame in part
+        ]
+        own = views.camera_to_world.double().numpy()
+        given = np.stack([frame.camera_to_world for frame in frames])
+        # Views keep their cameras' places: one similarity takes all of them from the capture's frame to the object's.
+        turn = upright(np.array(self.source.up_of(name)), name)
+        apart = [np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0)) for poses in (given, own)]
+        radius = float(apart[0] / apart[1])
+        centre = (given[:, :3, 3] - radius * own[:, :3, 3] @ turn).mean(0)
+        distance = np.linalg.norm(own[:, :3, 3], axis=1)
+        return Placed(_three(centre), radius, (float(distance.min()), float(distance.max())))
+
     @override
     def held_out(self, name: str, settings: Views) -> int:
         return len(self.source.split(name, settings.count, settings.held_out)[1])
@@ -282,3 +333,15 @@ class Captures(Objects):
         maker = source.scene if source.masks == "scene" else None
         masks = None if maker is None else MasksStage(name, content, maker, source)
         return ViewsStage(name, content, settings, self, masks, source.poses)
+
+
+def dimmed(rgba: Float[Tensor, "h w 4"]) -> Float[Tensor, "_ _ 3"]:
+    """Reduce a photograph, and dim what is not the object."""
+    pixels = rgba.movedim(-1, 0)[None]
+    pixels = avg_pool2d(pixels, max(1, round(max(pixels.shape[2:]) / PHOTOGRAPH)))[0].movedim(0, -1)
+    return pixels[..., :3] * (DIMMED + (1.0 - DIMMED) * pixels[..., 3:])
+
+
+def _three(point: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in point)
+    return x, y, z

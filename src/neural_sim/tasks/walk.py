@@ -15,6 +15,7 @@ from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.outer.inner import pooled
 from neural_sim.parameter.product import HardDraws
+from neural_sim.report.page.objects import ShownObject, write_objects_page
 from neural_sim.report.run_tracking import LiveRun
 from neural_sim.stages.account import Omission
 from neural_sim.stages.graph import Graph
@@ -52,6 +53,37 @@ class Phase(Task):
 
 
 @dataclass(frozen=True)
+class FieldPhase(Phase):
+    """The fields, and a page that says whether they show their objects."""
+
+    @override
+    def run(self, context: Context) -> None:
+        super().run(context)
+        graph = context.graph
+        shown = [
+            ShownObject(
+                stage.object,
+                context.results(stage),
+                not graph.objects.has_meshes,
+                graph.experiment.imaging.coverage.get(stage.object, {}),
+            )
+            for stage in graph.qualities
+        ]
+        page = write_objects_page(context.experiment.run.name, shown, context.folder)
+        for each in shown:
+            if each.poor:
+                _log.warning("%s: %s; see %s", each.name, each.verdict, page)
+        scores = [each.quality.psnr for each in shown if each.quality.psnr is not None]
+        if len(shown) == 1:
+            said = f"{shown[0].name}: {shown[0].verdict}"
+        elif scores:
+            said = f"{min(scores):.1f} to {max(scores):.1f} dB on {len(scores)} objects in held-out views"
+        else:
+            said = "no views are held out to score them"
+        _log.info("fields: %s; see %s", said, page)
+
+
+@dataclass(frozen=True)
 class EvaluateTask(Task):
     """The scores of the detectors that a run compares."""
 
@@ -69,7 +101,7 @@ class EvaluateTask(Task):
 
 PHASES: Mapping[str, Task] = {
     "views": Phase("views", lambda graph: graph.views),
-    "field": Phase(
+    "field": FieldPhase(
         "field",
         lambda graph: graph.fields,
         lambda live, stage, fitted: live.fields({stage.views.object: fitted.history}),
@@ -97,6 +129,8 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         None where nothing was evaluated.
     """
     phases = PHASES.keys() & tasks.keys()
+    if phases:
+        warn_of_uncovered(context.graph)
     wanted = [stage for task in tasks.values() for stage in task.reads(context)]
     if wanted:
         missing = Counter(stage.phase for stage in context.results.check(wanted) if stage.stored)
@@ -113,6 +147,23 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
         return None
     # val steered psi too: a score to choose settings by, never one to report. Nothing of test is in it.
     return context.results(context.graph.validation(context.results(context.graph.learned))).ap.mean
+
+
+def warn_of_uncovered(graph: Graph) -> None:
+    """Name the bins that no photograph is near: a field shows debris where no photograph looked."""
+    distribution = graph.experiment.imaging.distribution
+    for name, factors in graph.experiment.imaging.coverage.items():
+        for factor, found in factors.items():
+            if found.missing:
+                out = bool(distribution.factor(factor).closed(name).any())
+                _log.warning(
+                    "%s: no photograph is within %.0f degrees of most poses of %d of the %d bins of parameter.%s: %s; "
+                    "%s",
+                    name, found.within_deg, len(found.missing), len(found.fractions), factor,
+                    ", ".join(str(number) for number in found.missing),
+                    "they are left out, parameter.pose.uncovered=render keeps them" if out
+                    else "they are rendered, and may show debris",
+                )  # fmt: skip
 
 
 def omitted(graph: Graph) -> list[Omission]:

@@ -62,7 +62,9 @@ class Reader:
         for one in object_.found:
             if one.finding == "moves":
                 factor = self.distribution.factor(one.factor)
-                new[one.factor] = factor.project(factor.psi_of(torch.tensor(one.p, dtype=torch.float64)))
+                new[one.factor] = factor.project(
+                    factor.psi_of(torch.tensor(one.p, dtype=torch.float64), factor.closed(name))
+                )
         return object_.found, self.distribution.join(new)
 
 

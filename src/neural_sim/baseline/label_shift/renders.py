@@ -44,7 +44,7 @@ def known_crops(part: Scene, compositions: int, generator: torch.Generator, whol
     """Compose images of uniform bins over fresh backgrounds and cut out their boxes."""
     distribution, subject = part.distribution, part.subjects[0]
     assert isinstance(subject, PooledSubject)
-    psi = distribution.uniform.expand(len(part.subjects), -1)
+    psi = distribution.uniform_of([subject.name for subject in part.subjects])
     parts: list[Known] = []
     for _ in range(compositions):
         drawn = part.training_set(psi, len(subject.maps), generator)

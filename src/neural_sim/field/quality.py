@@ -1,0 +1,80 @@
+"""What says whether a field shows its object: scores on held-out views, and pictures that let one judge."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from neural_sim.field.appearance import AppearanceField
+from neural_sim.field.base import RadianceField
+from neural_sim.field.recipe import RAYS_PER_CHUNK, TERMINATION
+from neural_sim.field.rendering import render_views
+from neural_sim.field.scores import fit_codes, render_lit, where_known
+from neural_sim.types import PosedViews
+
+POOR = 18.0
+"""PSNR in dB on the object below which a field does not show it: debris of real captures had 11 to 14 dB, what one
+recognises 20 and more."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where an object is in its capture, in the capture's frame and unit.
+
+    ``distances`` are those of the nearest and the farthest camera, in object radii.
+    """
+
+    centre: tuple[float, float, float]
+    radius: float
+    distances: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well a field shows an object, with the pictures that let one judge.
+
+    Args:
+        psnr: in dB on the object's pixels of the held-out views; None without any.
+        ssim: on these pixels of the views that are shown.
+        cells: of a grid; None for other fields.
+        views: held-out views over white, their masks and the field's renders of them, as bytes.
+        photographs: whole photographs of these views with what is not the object dimmed; none of a mesh.
+        bins: the object from the middle of every bin, by factor.
+        placed: of an object of photographs.
+    """
+
+    psnr: float | None
+    ssim: float | None
+    cells: int | None
+    views: tuple[UInt8[Tensor, "n s s 3"], UInt8[Tensor, "n s s 1"], UInt8[Tensor, "n s s 3"]]
+    photographs: tuple[UInt8[Tensor, "_ _ 3"], ...]
+    bins: Mapping[str, UInt8[Tensor, "bins h w 3"]]
+    placed: Placed | None
+
+
+def as_views(field: RadianceField, views: PosedViews) -> Float[Tensor, "n h w 4"]:
+    """Premultiplied renders from the views' cameras; under a light fitted to each where the field has lights."""
+    if not len(views):
+        return views.images
+    if isinstance(field, AppearanceField):
+        codes = fit_codes(field, views, TERMINATION)
+        return where_known(render_lit(field, codes, views, TERMINATION, RAYS_PER_CHUNK), views)
+    rendered = render_views(field, views.camera, views.camera_to_world, TERMINATION, RAYS_PER_CHUNK)
+    return where_known(rendered, views)
+
+
+def similarity(
+    rendered: Float[Tensor, "n h w 3"], truth: Float[Tensor, "n h w 3"], inside: Bool[Tensor, "n h w"]
+) -> float | None:
+    """Mean of the similarity map over the object's pixels; None where nothing shows it."""
+    if not bool(inside.any()):
+        return None
+    every = structural_similarity_index_measure(
+        rendered.movedim(-1, 1), truth.movedim(-1, 1), data_range=1.0, return_full_image=True
+    )
+    assert isinstance(every, tuple)
+    return float(every[1].mean(1)[inside].mean())
