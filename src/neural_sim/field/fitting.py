@@ -28,6 +28,8 @@ BelowOne = Annotated[float, Ge(0), Lt(1)]
 LARGE = 0.05
 """Smallest connected part of a field of photographs that is kept, relative to the largest: their poses are not exact,
 and where few look a field has pictures of its own in the air."""
+BRIDGED = 2
+"""Cells by which parts are grown before they connect: a surface may have holes about pieces of itself."""
 BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 
@@ -146,8 +148,8 @@ def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]
     grid = torch.zeros_like(occupied)
     grid[occupied] = seen
     parts = np.zeros(tuple(grid.shape), dtype=np.int64)
-    scipy.ndimage.label(grid.cpu().numpy(), np.ones((3, 3, 3)), output=parts)
+    full = np.ones((3, 3, 3))
+    scipy.ndimage.label(scipy.ndimage.binary_dilation(grid.cpu().numpy(), full, BRIDGED), full, output=parts)
     label = torch.from_numpy(parts).to(occupied.device)[occupied]
-    sizes = torch.bincount(label)
-    sizes[0] = 0
-    return (sizes >= LARGE * float(sizes.max()))[label] & seen
+    sizes = torch.bincount(label[seen])
+    return seen & (sizes >= LARGE * float(sizes.max()))[label.clamp_max(len(sizes) - 1)]
