@@ -133,6 +133,35 @@ def seen_colours(path: Path, name: str) -> list[list[int]]:
     return [colour.int().tolist() for colour, count in zip(colours, counts, strict=True) if count > 30]
 
 
+def test_13_frames_are_divided_as_the_file_says(tmp_path, caplog):
+    out = laid_out("13", tmp_path)
+    with caplog.at_level(logging.INFO):
+        photos = Photos(out)
+        train, scored = photos.split("ball", 100, 100)
+    assert [frame.image.name for frame in scored] == [f"f{number:03d}.png" for number in range(12, 16)]
+    assert len(train) == 12 and "train 12, val 2, test 2" in caplog.text
+
+
+def test_14_intrinsics_are_the_frames_own_or_refused_by_file_frame_and_key(tmp_path):
+    out = laid_out("14", tmp_path)
+    for name in ("backslash", "bom", "no_suffix", "frame_angle", "per_frame_only", "null_values"):
+        lens = Photos(out, [name]).captures[name].frames[0].lens
+        assert (lens.fx, lens.cx, lens.cy) == pytest.approx((140.0, 60.0, 45.0)), name
+    reasons = {
+        "angle_zero": r"frames\[0\] .*camera_angle_x: want an angle in radians .*got 0",
+        "angle_degrees": r"frames\[0\] .*camera_angle_x: want an angle in radians .*got 46\.",
+        "w_nan": r"frames\[0\] .*w: want a number, got nan", "strings": r"frames\[0\] .*fl_x: want a number, got '140",
+        "halved_no_wh": r"frames\[0\] .*cx and cy \(120, 90\) are outside", "halved_wh": r"frames\[0\] .*240 x 180",
+        "some_frames": r"frames\[0\] .*want intrinsics", "unregistered": r"frames\[3\] .*has no pose",
+        "duplicated": r"frames\[0\] and frames\[1\] are both of 'images/000\.png'",
+        "fisheye_name": r"frames\[0\] .*camera_model: .*'FISHEYE'",
+        "equirectangular": r"frames\[0\] .*camera_model: .*EQUI",
+    }  # fmt: skip
+    for name, reason in reasons.items():
+        with pytest.raises(ValueError, match=rf"{name}/transforms\.json: {reason}"):
+            Photos(out, [name])
+
+
 def test_16_every_primitive_of_a_glb_has_its_own_colour(tmp_path):
     """By glTF 2.0, in linear space: sRGB of linear 0.02, 0.2, 0.7 is 39, 124, 218."""
     out = laid_out("16", tmp_path)

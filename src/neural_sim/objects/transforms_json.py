@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +12,14 @@ from neural_sim.documents import read_json
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.pictures import Header, by, read_header
 
+_log = logging.getLogger(__name__)
+
 NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
+PARTS = ("train", "val", "test")
+HELD_OUT = "held out"
+"""Key under which the files of frames that score are kept beside what the file says."""
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -57,7 +64,57 @@ def _read(path: Path) -> dict[str, Any]:
         or not document["frames"]
     ):
         raise ValueError(f"{path}: want a list 'frames' with at least one frame")
-    return document
+    first: dict[str, int] = {}
+    for number, entry in enumerate(document["frames"]):
+        if not isinstance(entry, dict):
+            continue  # refused where it is read
+        for key in ("file_path", "mask_path"):
+            if isinstance(entry.get(key), str):
+                entry[key] = entry[key].replace("\\", "/")
+        written = entry.get("file_path")
+        if isinstance(written, str) and first.setdefault(written, number) != number:
+            raise ValueError(f"{path}: frames[{first[written]}] and frames[{number}] are both of {written!r}")
+    return _with_own_lenses(_divided(document, path, first))
+
+
+def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out nulls, and give the file's focal lengths and angles to the frames that have none of their own."""
+    common = {key: value for key, value in document.items() if value is not None}
+    focal = {key: common.pop(key) for key in FOCAL if key in common}
+    frames = []
+    for entry in document["frames"]:
+        own = entry
+        if isinstance(entry, dict):
+            own = {key: value for key, value in entry.items() if value is not None}
+            own = own if any(key in own for key in FOCAL) else {**focal, **own}
+        frames.append(own)
+    return {**common, "frames": frames}
+
+
+def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
+    """Follow nerfstudio's lists of files: those of ``val`` and ``test`` score, what is in none is left out."""
+    lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
+    if not lists:
+        return document
+    for part, names in lists.items():
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{path}: {part}_filenames: want a list of file names, got {names!r}")
+        lists[part] = [name.replace("\\", "/") for name in names]
+        strange = [name for name in lists[part] if name not in known]
+        if strange:
+            raise ValueError(f"{path}: {part}_filenames: no frame has the file_path {strange[0]!r}")
+    held = {name for part in PARTS[1:] for name in lists.get(part, ())}
+    listed = held | set(lists.get("train", known))
+    others = set(known) - listed
+    frames = [
+        e for e in document["frames"] if not isinstance(e, dict) or str(e.get("file_path")) not in others
+    ]
+    counts = ", ".join(f"{part} {len(names)}" for part, names in lists.items())
+    _log.info("%s: frames as its lists of file names say (%s)", path, counts)
+    if len(frames) < len(document["frames"]):
+        left = len(document["frames"]) - len(frames)
+        _log.warning("%s: %d frames are in none of its lists of file names and are left out", path, left)
+    return {**document, "frames": frames, HELD_OUT: held}
 
 
 def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] | None:
@@ -88,7 +145,8 @@ def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, t
     mask = entry.get("mask_path")
     if mask is not None and not (source.parent / str(mask)).is_file():
         raise ValueError(f"{where}: mask_path: no such file: {source.parent / str(mask)}")
-    return Frame(image, pose, lens, None if mask is None else source.parent / mask, test)
+    held_out = test or entry["file_path"] in document.get(HELD_OUT, ())
+    return Frame(image, pose, lens, None if mask is None else source.parent / mask, held_out)
 
 
 def _image(path: Path, where: str) -> Path:
@@ -102,9 +160,15 @@ def _image(path: Path, where: str) -> Path:
 def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
-        if type(value) not in (int, float):
+        if type(value) not in (int, float) or not math.isfinite(value):
             raise ValueError(f"{where}: {key}: want a number, got {value!r}")
         return float(value)
+
+    def focal(key: str, side: int) -> float:
+        angle = number(key, 0.0)
+        if not 0.0 < angle < math.pi:
+            raise ValueError(f"{where}: {key}: want an angle in radians between 0 and pi, got {angle:g}")
+        return 0.5 * side / math.tan(0.5 * angle)
 
     width, height = header.stored
     stated = round(number("w", width)), round(number("h", height))
@@ -121,21 +185,23 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
         )
     if "fl_x" not in values and "camera_angle_x" not in values:
         raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, of the frame or of the file")
-    fx = (
-        number("fl_x", 0.0)
-        if "fl_x" in values
-        else 0.5 * width / math.tan(0.5 * number("camera_angle_x", 0.0))
-    )
+    fx = number("fl_x", 0.0) if "fl_x" in values else focal("camera_angle_x", width)
     fy = fx
     if "fl_y" in values:
         fy = number("fl_y", 0.0)
     elif "fl_x" not in values and "camera_angle_y" in values:
-        fy = 0.5 * height / math.tan(0.5 * number("camera_angle_y", 0.0))
+        fy = focal("camera_angle_y", height)
+    cx, cy = number("cx", 0.5 * width), number("cy", 0.5 * height)
+    if "w" not in values and "h" not in values and not (0.0 < cx < width and 0.0 < cy < height):
+        raise ValueError(
+            f"{where}: cx and cy ({cx:g}, {cy:g}) are outside of the image's {by(header.stored)} pixels; its "
+            "intrinsics are of another size: want w and h"
+        )
     radial = tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4))
     tangential = (number("p1", 0.0), number("p2", 0.0))
     try:
         return Lens(
-            width, height, fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height),
+            width, height, fx, fy, cx, cy,
             radial if any(radial) else (), (), tangential, fisheye,
         )  # fmt: skip
     except ValueError as error:
