@@ -50,7 +50,7 @@ GROUPS = {
 SMALL = [
     "scale=smoke", "progress=false", "objects.names=[can,mug]", "views.count=16", "views.held_out=2",
     "views.image_size=24", "views.supersample=1", "views.backend=raycast", "budget.grid.steps=8",
-    "budget.grid.resolution=32", "budget.grid.refine_steps=[2]", "budget.grid.prune_steps=[4]",
+    "budget.grid.resolution=64", "budget.grid.refine_steps=[2]", "budget.grid.prune_steps=[4]",
     "budget.mlp.steps=4", "budget.mlp.width=8", "budget.mlp.coarse_samples=4", "budget.mlp.fine_samples=4",
     "training.image_size=48", "training.images_per_object=4", "training.warm_epochs=1", "training.cold_epochs=1",
     "training.batch_size=8", "outer.iterations=2", "outer.images_per_object=4", "outer.epochs=1",
