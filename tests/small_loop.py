@@ -35,9 +35,11 @@ FREE = {
     "trust": Trust(on_untrusted="shrink"),
 }
 """The paper's: steps as they come, of the loss, by the implicit derivative."""
+EVERY_STEP = TrustRegion(take_back=False)
+"""The last psi is the result."""
 CHECKED = {
     "objective": SmoothAP(),
-    "steps": TrustRegion(),
+    "steps": EVERY_STEP,
     "adjoint": Unrolled(),
     "train_first": True,
     "trust": Trust(level=None, on_untrusted="shrink"),
@@ -53,6 +55,7 @@ def small_loop(
     detector=None,
     psi=None,
     shown=slice(None),
+    first=None,
     **outer,
 ):
     generator = torch.Generator().manual_seed(0)
@@ -63,4 +66,4 @@ def small_loop(
     inputs = LoopInputs(detector, detector.init(generator), validation)
     training = Training(batch_size=4, weight_decay=0.0)
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator, estimator.draws)
-    return SimulatorModule(inner, psi, estimator, solver, generator)
+    return SimulatorModule(inner, psi, estimator, solver, generator, first)

@@ -16,7 +16,7 @@ def test_streams_keep_their_seeds():
     assert seeds == {
         "detector": 8_000_025, "psi": 8_000_026, "photographs": 8_000_027, "fine-tuning": 8_000_028,
         "target parts": 7, "target val": 16_000_024, "target test": 16_000_025, "target train": 16_000_026,
-        "common images": 16_000_024, "common training": 16_000_025,
+        "common images": 16_000_024, "common training": 16_000_025, "common first step": 16_000_026,
     }  # fmt: skip
 
 

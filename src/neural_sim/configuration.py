@@ -77,6 +77,8 @@ MOVED: dict[str, str] = {
     "outer.light_update": "outer.steps.light_update",
     "outer.final_step": "outer.steps.final_step",
     "outer.adjoint": "outer/adjoint",
+    "outer.first_step=derivative": "outer/first_step=derivative",
+    "outer.first_step=label_shift": "outer/first_step=label_shift",
     "outer.unrolled": "outer.adjoint",
     "outer.curvature_images": "outer.adjoint.curvature_images",
     "outer.trust.max_residual": "outer.adjoint.max_residual",

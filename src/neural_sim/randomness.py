@@ -15,9 +15,11 @@ STREAMS: dict[str, tuple[int, int]] = {
     "target val": (2_000_003, 0),
     "target test": (2_000_003, 1),
     "target train": (2_000_003, 2),
-    # Streams of a psi loop, derived from its generator: numbers common to trainings that differ by psi alone.
+    # Streams of a psi loop, derived from its generator: numbers common to trainings that differ by psi alone, and those
+    # of what reads the first step off the target.
     "common images": (2_000_003, 0),
     "common training": (2_000_003, 1),
+    "common first step": (2_000_003, 2),
 }
 """Multiplier m and offset o of every stream, whose generator is seeded with m (seed + 1) + o.
 

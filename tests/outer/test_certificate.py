@@ -210,12 +210,15 @@ def test_steps_that_were_not_trusted_are_counted():
         judge(result(p_values=(0.3, 0.01)), on_untrusted="skip").waiting({("a", "pose"), ("b", "pose")}),
     ]
     records = [
-        {"certificate": dataclasses.asdict(certificate), "verdicts": {}} for certificate in certificates
+        {"certificate": dataclasses.asdict(certificate), "verdicts": {}, "taken_back": {}}
+        for certificate in certificates
     ]
+    back = {"kept": 1, "accepted": 3, "gain": 0.02}
+    records.append({"certificate": None, "verdicts": {}, "taken_back": {"a": back}})
     assert untrusted(records) == {
         "steps": 8, "waited": 1, "untrusted": 5, "actions": {"shrunk": 4, "skipped": 1},
         "doubts": {"stationarity": 2, "cosine": 2, "residual": 2, "signal": 1},
-        "judged": 0, "rejected": 0, "cosines": [0.9, 0.1],
+        "judged": 0, "rejected": 0, "taken_back": {"a": back}, "cosines": [0.9, 0.1],
     }  # fmt: skip
     assert untrusted([])["untrusted"] == 0
 

@@ -1,17 +1,20 @@
 """The loop of checked steps: what is trained on, under which random numbers, and what is differentiated."""
 
-import dataclasses
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
-from small_loop import CHECKED, small_loop
+from small_loop import CHECKED, EVERY_STEP, small_loop
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.gradient.estimators import StratifiedEstimator
 from neural_sim.outer.descent import learned_objects
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import FreeSteps, Proposal
 from neural_sim.outer.trust_region import TrustRegion
 
 
@@ -77,7 +80,7 @@ def test_a_checked_loop_reports_what_its_last_training_accepted(scene):
 
 
 def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
-    learned = learn_psi(checked_loop(scene, steps=TrustRegion(waits_below=1.0)), progress=False)
+    learned = learn_psi(checked_loop(scene, steps=replace(EVERY_STEP, waits_below=1.0)), progress=False)
     first, second, _ = learned.records
     assert first.certificate
     actions = {name: by_factor["pose"] for name, by_factor in first.certificate.actions.items()}
@@ -86,7 +89,7 @@ def test_a_record_tells_the_step_that_waited_from_the_one_that_was_taken(scene):
 
 
 def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_has_others(scene, monkeypatch):
-    module = checked_loop(scene, steps=TrustRegion(trainings=2))
+    module = checked_loop(scene, steps=replace(EVERY_STEP, trainings=2))
     calls, psis = watch(monkeypatch, InnerLoop, "train"), []
     train_on = module.train_on
 
@@ -110,7 +113,7 @@ def test_a_step_is_judged_under_the_numbers_of_its_derivative_and_the_next_one_h
 
 
 def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(scene, monkeypatch):
-    module = checked_loop(scene, 4, steps=TrustRegion(trainings=2))
+    module = checked_loop(scene, 4, steps=replace(EVERY_STEP, trainings=2))
     calls = watch(monkeypatch, SimulatorModule, "_derivative")
     learn_psi(module, progress=False)
     seen = [objective.images.images for _, (_, objective), _ in calls]
@@ -123,7 +126,7 @@ def test_derivatives_are_of_one_half_of_the_validation_images_after_the_other(sc
 
 
 def test_a_certified_derivative_is_of_all_validation_images_as_its_reference_is(scene, monkeypatch):
-    module = checked_loop(scene, 3, steps=TrustRegion(trainings=2), certify_every=2)
+    module = checked_loop(scene, 3, steps=replace(EVERY_STEP, trainings=2), certify_every=2)
     calls = watch(monkeypatch, SimulatorModule, "_derivative")
     learn_psi(module, progress=False)
     assert [len(objective.images) for _, (_, objective), _ in calls] == [3, 3, 6]
@@ -159,7 +162,120 @@ def test_objects_that_validation_does_not_show_keep_their_psi(scene, caplog):
 def test_validation_without_an_object_is_refused(scene):
     module = checked_loop(scene)
     images = module.inner.objective.images
-    empty = dataclasses.replace(images, labels=torch.full_like(images.labels, -1))
-    objective = dataclasses.replace(module.inner.objective, images=empty)
+    empty = replace(images, labels=torch.full_like(images.labels, -1))
+    objective = replace(module.inner.objective, images=empty)
     with pytest.raises(ValueError, match="show none of the objects"):
-        learned_objects(dataclasses.replace(module.inner, objective=objective))
+        learned_objects(replace(module.inner, objective=objective))
+
+
+SHOWN = (
+    FactorEstimate(
+        "a", "pose", 9, (0.25,) * 4, (0.85, 0.05, 0.05, 0.05), (0.7, 0.0, 0.0, 0.0), (0.9, 0.1, 0.1, 0.1),
+        ((1,), (2,), (3,), (4,)), 0.005, 0.05, 0.9, "moves",
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fake:
+    """A first step that proposes a given psi, and notes what it was given."""
+
+    psi: torch.Tensor
+    p_values: tuple[float, ...] = (1e-3, 1e-3)
+    given: list = field(default_factory=list)
+
+    def propose(self, scene, images, psi, generator):
+        self.given.append((scene, images, psi))
+        return Proposal(self.psi, torch.tensor(self.p_values), images=7, shown=SHOWN)
+
+
+THERE = torch.tensor([[3.0, 0.0, 0.0, 0.0], [0.0, 3.0, 0.0, 0.0]])
+
+
+def scored_by(monkeypatch, worth):
+    """Let trainings score what ``worth`` says of their psi [objects, K], alike in every validation image."""
+    scores = property(lambda trained: worth(trained.psi).double()[:, None].expand(2, 6) / 6)
+    monkeypatch.setattr(Trained, "scores", scores)
+
+
+def test_the_first_step_is_judged_by_a_training_object_by_object(scene, monkeypatch):
+    """The proposal is right of the first object and wrong of the second; derivatives then start where it is right."""
+    first = Fake(THERE)
+    module = checked_loop(scene, first=first)
+    scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0], -psi[1, 1]]))
+    where, train_on = [], module.train_on
+
+    def noted(psi, recording=None):
+        where.append((psi.detach().clone(), module.numbers.index))
+        return train_on(psi, recording)
+
+    module.train_on = noted
+    learned = learn_psi(module, progress=False)
+    (drawn_from, images, psi), record = first.given[0], learned.records[0]
+    assert len(first.given) == 1 and drawn_from is module.inner.pool and not psi.any()
+    assert images is module.inner.objective.images
+    assert {name: v.accepted for name, v in record.verdicts.items()} == {"a": True, "b": False}
+    assert learned.shown == SHOWN and "first_step" in record.seconds
+    right = torch.stack([THERE[0], torch.zeros(4)]).double()
+    # The start and the proposal have their random numbers in common, the derivative has others.
+    assert [index for _, index in where[:3]] == [0, 0, 1]
+    for (psi, _), wanted in zip(where[1:3], (THERE.double(), right), strict=True):
+        torch.testing.assert_close(psi, wanted)
+    assert (
+        record.images == 7 + sum(len(images) for images in (torch.empty(12),) * 4) + 2 * 4 * 2 + 2 * 4
+    )  # the estimate's, four trainings', probes of two trials, half of which are new in the second
+
+
+def test_a_first_step_that_is_wrong_is_taken_back_and_the_loop_goes_on(scene, monkeypatch):
+    plain = learn_psi(checked_loop(scene), progress=False)
+    wrong = checked_loop(scene, first=Fake(THERE))
+    original = Trained.scores
+    monkeypatch.setattr(
+        Trained, "scores", property(lambda t: original.fget(t) - float(t.psi.abs().max() == 3.0))
+    )
+    learned = learn_psi(wrong, progress=False)
+    assert not any(verdict.accepted for verdict in learned.records[0].verdicts.values())
+    assert learned.records[0].certificate and learned.records[1].verdicts
+    assert len(learned.records) == len(plain.records)
+    assert not torch.equal(learned.trajectory[1], learned.trajectory[0])  # the derivative's step
+
+
+def test_a_first_step_that_finds_nothing_costs_no_training(scene):
+    plain, module = (checked_loop(scene, 2, **more) for more in ({}, {"first": Fake(torch.zeros(2, 4))}))
+    one, other = (learn_psi(loop, progress=False) for loop in (plain, module))
+    assert [r.detector_steps for r in one.records] == [r.detector_steps for r in other.records]
+    assert other.records[0].verdicts == {} and other.shown == SHOWN
+    assert torch.equal(one.last, other.last)
+
+
+def test_one_iteration_takes_the_first_step_alone(scene, monkeypatch):
+    module = checked_loop(scene, 1, first=Fake(THERE))
+    scored_by(monkeypatch, lambda psi: torch.stack([psi[0, 0], psi[1, 1]]))
+    learned = learn_psi(module, progress=False)
+    assert torch.equal(learned.last, THERE.double()) and learned.records[0].certificate is None
+
+
+def test_a_first_step_wants_a_training_that_judges_it():
+    with pytest.raises(ValueError, match="outer/first_step"):
+        Outer(first_step=LabelShift(), steps=FreeSteps())
+
+
+def test_a_loop_returns_the_best_psi_on_the_way(scene, monkeypatch):
+    """Every training that judges a step finds a small gain; those of the derivatives find that psi is ever worse."""
+    module = checked_loop(scene, 4, steps=TrustRegion())
+    falls, last = {}, [1.0]
+
+    def score(trained):
+        if trained.trajectory is None:
+            return last[0] + 0.01
+        last[0] = falls.setdefault(tuple(trained.psi.flatten().tolist()), 1.0 - 0.3 * len(falls))
+        return last[0]
+
+    monkeypatch.setattr(
+        Trained, "scores", property(lambda t: torch.full((2, 6), score(t) / 6, dtype=torch.float64))
+    )
+    learned = learn_psi(module, progress=False)
+    taken = learned.records[-1].taken_back
+    assert set(taken) == {"a", "b"} and all(back.kept == 0 < back.accepted for back in taken.values())
+    assert torch.equal(learned.last, learned.trajectory[0])
+    assert all(not record.taken_back for record in learned.records[:-1])

@@ -24,6 +24,7 @@ def results():
         "validation_loss": 0.5, "training_loss": float("nan"), "seconds": {"render": 0.5},
         "scores": [0.4, 0.2],
         "verdicts": {"a": {"accepted": False, "expected_gain": 0.1, "measured_gain": -0.01, "error": 0.02}},
+        "taken_back": {"b": {"kept": 1, "accepted": 3, "gain": 0.02}},
         "images_without_box": 3, "images": 24, "detector_steps": 6, "products": 9, "cpu_seconds": 0.4,
         "certificate": {
             "adjoint": {
@@ -113,6 +114,7 @@ def test_summary_names_every_method_and_object(results):
     text = results.summary()
     trust = (
         "untrusted psi steps of objects: 2 of 4; shrunk 2; signal 2; rejected after training on them 2 of 2; "
+        "taken back at the end b (keeps 1 of 3 steps); "
     )
     trust += "cosine with the response of training 0.90, 0.90"
     images = ("validation images, learned: 25.0", "without a box: 6")

@@ -271,7 +271,8 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Counted are steps (one for each object and factor), trusted ones that waited, untrusted ones, what happened to these
     and why (failed conditions, or ``signal``: no significance), objects' steps that were judged, and those that were
-    rejected. Every measured cosine is listed.
+    rejected. Every measured cosine is listed; ``taken_back`` are the objects that the loop returned at an earlier psi,
+    with their accepted steps and how many of them they keep.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [
@@ -290,5 +291,6 @@ def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "doubts": dict(Counter(doubt for _, doubts in doubted for doubt in doubts)),
         "judged": len(accepted),
         "rejected": accepted.count(False),
+        "taken_back": {name: back for record in records for name, back in record["taken_back"].items()},
         "cosines": [c["cosine"] for c in certificates if c["cosine"] is not None],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,12 +15,15 @@ from typing_extensions import override
 from neural_sim.detector.trajectory import Recording
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, certify
+from neural_sim.outer.first_step import FirstStep
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.loop import OuterLoop
 from neural_sim.outer.objective import Objective
-from neural_sim.outer.records import Cost
+from neural_sim.outer.records import Cost, Outcome
 from neural_sim.outer.steps import LearnedObjects, PValues, Steps, Verdict
-from neural_sim.outer.trust_region import TrustRegion
+from neural_sim.outer.trust_region import TrustRegion, TrustRegionSteps
+from neural_sim.outer.way import Way
+from neural_sim.randomness import stream
 
 _log = logging.getLogger(__name__)
 
@@ -37,37 +41,77 @@ class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
 
     In a trust region, consecutive trainings have common random numbers, an iteration begins with a training that
-    accepts or rejects the last step, and the last iteration ends with it.
+    accepts or rejects the last step, and the last iteration ends with it. Before its first derivative, it tries the psi
+    that ``first`` proposes, if any. At the end every object goes back to its best psi on the way.
     """
 
-    def __init__(self, inner: InnerLoop, psi: Float[Tensor, "objects K"], generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        inner: InnerLoop,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+        first: FirstStep | None = None,
+    ) -> None:
         super().__init__(inner, psi, inner.settings.iterations, generator)
+        self.first = first
         self.objects = learned_objects(inner)
         self._labels = list(self.objects.labels)
-        self._judges = isinstance(self.settings.steps, TrustRegion)
+        steps = self.settings.steps
+        self._judges = isinstance(steps, TrustRegion)
+        self._takes_back = isinstance(steps, TrustRegion) and steps.take_back
         self.numbers = replace(self.numbers, common=self._judges)
         start = self.psi[self._labels]
         self.steps: Steps = self.settings.steps.begin(self.objects, start, self.settings.iterations)
         self._recording: Recording | None = None
         self._before = psi.new_zeros(0, 0)
+        self._way = Way.begin(self.objects.names, start)
+        self._offered = False
         self._folds: list[Objective] = []
         self._stopped = False
 
     @override
     def training_step(self, batch: int, batch_idx: int) -> None:
         """Judge the last step, differentiate a training, and take the next step."""
-        if self._judges and len(self.records) + 1 == self.rounds:
+        last = self._judges and len(self.records) + 1 == self.rounds
+        trained, verdicts, certificate, result = None, {}, None, None
+        if not self.records:
+            self._offer()
+        if last or self.steps.pending:
             trained, verdicts = self._judge()
-            self.record(trained, trained.scores.sum(1), verdicts)
-        else:
-            verdicts = self._judge()[1] if self.steps.pending else {}
             self.psi.data[self._labels] = self.steps.reported
+        if trained is None or not last:
             derived = self._derive()
+            trained, result = derived.trained, derived.result
             certificate = self._step(derived)
-            self.record(derived.trained, self._before.sum(1), verdicts, certificate, derived.result)
             self._stopped = certificate.stopped
+        best = self._way.best() if self._takes_back and (last or self._stopped) else {}
+        scores = trained.scores if result is None else self._before
+        outcome = Outcome(verdicts, {name: back for name, (_, back) in best.items()})
+        self.record(trained, scores.sum(1), outcome, certificate, result)
         self.psi.data[self._labels] = self.steps.reported
+        for name, (stay, _) in best.items():
+            self.psi.data[self.scene.names.index(name)] = stay.psi
         self.trajectory.append(self.psi.detach().clone())
+
+    def _offer(self) -> None:
+        """Go to the psi that the first step proposes, after a training at the start, by which it will be judged."""
+        steps = self.steps
+        if self.first is None or not isinstance(steps, TrustRegionSteps):
+            return
+        with self.timed("first_step"):
+            scene, images = self.inner.pool or self.scene, self.inner.objective.images
+            numbers = stream(0, "common first step", self.numbers.generator)
+            proposal = self.first.propose(scene, images, self.psi.detach().clone(), numbers)
+            tried = steps.offer(proposal)
+        self.charge(Cost(images=proposal.images))
+        self._offered, self.shown = tried.pending, proposal.shown
+        for one in proposal.shown:
+            _log.info("first step: %s", one.sentence)
+        if self._offered:
+            self._before = self.train_on(self.psi).scores
+            self._saw(self._before, self.objects.names)
+            self.steps = tried
+            self.psi.data[self._labels] = tried.reported
 
     def _judge(self) -> tuple[Trained, dict[str, Verdict]]:
         """Train at psi, and accept or reject the step that led there."""
@@ -76,13 +120,23 @@ class GradientLoop(OuterLoop, ABC):
             scores = trained.scores
             if self.steps.pending:
                 self.steps, verdicts = self.steps.judge(self._before, scores)
+        for name, verdict in verdicts.items():
+            if verdict.accepted:
+                self._way = self._way.moved(name, self.psi[self.scene.names.index(name)].detach())
+        rejected = [name for name, verdict in verdicts.items() if not verdict.accepted]
+        self._saw(scores, [name for name in self.objects.names if name not in rejected])
         return trained, verdicts
+
+    def _saw(self, scores: Float[Tensor, "classes images"], names: Iterable[str]) -> None:
+        """Note what a training says of the objects that it saw at the psi where they stand."""
+        for name in names:
+            self._way = self._way.seen(name, float(scores[self.scene.names.index(name)].sum()))
 
     def _derive(self) -> Derived:
         """Take the derivative at psi: of one training, in a trust region's first iteration of several."""
         first = not self.records
         for trial in range(self.settings.steps.trainings if first else 1):
-            if trial or not first:
+            if trial or not first or self._offered:
                 self.renew()  # what is peculiar to one training averages out of the derivatives
             trained, result = self._differentiated()
             self.steps, p_values = self.steps.observe(result)
@@ -102,6 +156,7 @@ class GradientLoop(OuterLoop, ABC):
             trained = self.train_on(self.psi, self._recording)
         with self.timed("judge"):
             self._before = trained.scores
+        self._saw(self._before, self.objects.names)
         objective = self.inner.objective if self._certifies else self._fold()
         with self.timed("hypergradient"):
             result = self._derivative(trained, objective)

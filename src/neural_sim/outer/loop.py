@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from neural_sim.baseline.base import RewardMethod
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.trajectory import Recording
 from neural_sim.devices import trainer_on
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop, Numbers, Trained, timed
-from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi
-from neural_sim.outer.steps import Verdict
+from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,8 @@ class OuterLoop(pl.LightningModule):
 
     ``inner`` draws an iteration's images and trains the detector on them, from ``theta`` where a training goes on from
     the one before, under the random ``numbers``. A subclass's ``training_step`` ends with :meth:`record` and, after the
-    step of psi, appends to ``trajectory`` the method's result if it ended there.
+    step of psi, appends to ``trajectory`` the method's result if it ended there. ``shown`` is what the target's boxes
+    showed, where they were read.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class OuterLoop(pl.LightningModule):
         self.psi = nn.Parameter(psi.detach().clone().double(), requires_grad=False)
         self.records: list[IterationRecord] = []
         self.trajectory = [self.psi.detach().clone()]
+        self.shown: tuple[FactorEstimate, ...] = ()
         self.on_record: Callable[[IterationRecord], object] = lambda record: None
         self._cost, self._seconds = Cost(), {"pool": inner.preparation.seconds}
         self._cpu = time.process_time() - inner.preparation.cpu_seconds
@@ -92,7 +94,7 @@ class OuterLoop(pl.LightningModule):
         self,
         trained: Trained,
         scores: Float[Tensor, "classes"] | None = None,
-        verdicts: Mapping[str, Verdict] | None = None,
+        outcome: Outcome | None = None,
         certificate: Certificate | None = None,
         gradient: Hypergradient | None = None,
     ) -> IterationRecord:
@@ -101,10 +103,11 @@ class OuterLoop(pl.LightningModule):
         Args:
             trained: its last training.
             scores: of the classes, before the step.
-            verdicts: on the last step.
+            outcome: of steps.
             certificate: of its derivative.
             gradient: the derivative.
         """
+        outcome = outcome or Outcome()
         p_by_factor, cpu = self.scene.distribution.probabilities(trained.psi), time.process_time()
         present = trained.rendered.images.present
         last = IterationRecord(
@@ -122,9 +125,10 @@ class OuterLoop(pl.LightningModule):
             products=self._cost.products,
             images_without_box=int((~present.any(-1)).sum()),
             scores=[] if scores is None else scores.tolist(),
-            verdicts=dict(verdicts or {}),
+            verdicts=dict(outcome.verdicts),
             seconds=self._seconds,
             cpu_seconds=cpu - self._cpu,
+            taken_back=dict(outcome.taken_back),
         )
         self.records.append(last)
         self._cost, self._seconds, self._cpu = Cost(), {}, cpu
@@ -180,13 +184,14 @@ def learn_psi(
         warnings.filterwarnings("ignore", module="lightning")
         # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
         trainer_on(torch.device("cpu"), progress=progress).fit(module)
-    return LearnedPsi(torch.stack(module.trajectory), module.records)
+    return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)
 
 
 def _outcomes(record: IterationRecord) -> str:
-    """Name accepted and rejected steps of objects, for the log."""
+    """Name accepted and rejected steps of objects, and those that were taken back at the end, for the log."""
     text = ""
     for outcome, accepted in (("accepted", True), ("rejected", False)):
         names = [name for name, verdict in record.verdicts.items() if verdict.accepted == accepted]
         text += f"; {outcome} {', '.join(names)}" if names else ""
-    return text
+    backs = [f"{name} (keeps {b.kept} of {b.accepted} steps)" for name, b in record.taken_back.items()]
+    return text + (f"; taken back {', '.join(backs)}" if backs else "")

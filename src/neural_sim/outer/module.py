@@ -18,6 +18,7 @@ from neural_sim.gradient.implicit import Implicit, InnerProblem, curvature_rows,
 from neural_sim.gradient.unrolled import Accumulated, Unrolled
 from neural_sim.outer.derivative import bound_losses, object_images, probe_groups, recorded
 from neural_sim.outer.descent import GradientLoop
+from neural_sim.outer.first_step import FirstStep
 from neural_sim.outer.inner import InnerLoop, Trained
 from neural_sim.outer.objective import Objective
 from neural_sim.outer.probing import ProbeSet
@@ -36,8 +37,9 @@ class SimulatorModule(GradientLoop):
         estimator: Estimator,
         solver: AdjointSolver,
         generator: torch.Generator,
+        first: FirstStep | None = None,
     ) -> None:
-        super().__init__(inner, psi, generator)
+        super().__init__(inner, psi, generator, first)
         self.estimator, self.solver = estimator, solver
         self._probes: ProbeSet | None = None
         self._adjoint: Tensor | None = None

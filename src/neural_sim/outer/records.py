@@ -12,6 +12,7 @@ from torch import Tensor
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.outer.certificate import Certificate, ImplicitQuality, UnrolledQuality
 from neural_sim.outer.steps import Verdict
+from neural_sim.outer.way import TakenBack
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,19 @@ class Cost:
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """What trainings made of steps in an iteration.
+
+    Attributes:
+        verdicts: of the objects whose last step was accepted or rejected.
+        taken_back: at the end, the objects whose best psi was not their last one.
+    """
+
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    taken_back: Mapping[str, TakenBack] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class IterationRecord:
     """One outer iteration.
 
@@ -48,8 +62,8 @@ class IterationRecord:
     ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase,
     ``cpu_seconds`` the processor time over all cores, which other processes on the machine disturb less.
     ``certificate`` is None for methods without a hypergradient, and in an iteration that takes none. ``scores``
-    [classes] are those of the loop's objective, more is better. ``verdicts`` are of the objects whose last step was
-    accepted or rejected.
+    [classes] are those of the loop's objective, more is better. ``verdicts``
+    and ``taken_back`` are those of an :class:`Outcome`.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -67,6 +81,7 @@ class IterationRecord:
     verdicts: dict[str, Verdict]
     seconds: dict[str, float]
     cpu_seconds: float
+    taken_back: dict[str, TakenBack]
 
 
 def cost_of(record: IterationRecord) -> Cost:
@@ -84,6 +99,7 @@ def record_of(stored: Mapping[str, Any]) -> IterationRecord:
             **stored,
             "certificate": certificate and _certificate_of(certificate),
             "verdicts": {name: Verdict(**verdict) for name, verdict in stored["verdicts"].items()},
+            "taken_back": {name: TakenBack(**back) for name, back in stored["taken_back"].items()},
         }
     )
 
@@ -101,8 +117,9 @@ class LearnedPsi:
     """The loop's result.
 
     ``trajectory`` has the method's psi before the first iteration and after each; a checked step is in it at once, and
-    undone an iteration later if it is rejected. ``before`` is the cost before the first iteration: the warm start,
-    whose backbone every loop uses, or the estimate of a method that reads psi off the target, which is ``shown``.
+    undone an iteration later if it is rejected. The last one has every object's best psi on its way. ``before`` is the
+    cost before the first iteration: the warm start, whose backbone every loop uses, or the estimate of a method that
+    reads psi off the target, which is ``shown``.
     """
 
     trajectory: Float[Tensor, "iterations+1 objects K"]

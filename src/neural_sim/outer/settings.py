@@ -8,11 +8,13 @@ from typing import Annotated, Literal
 
 from annotated_types import MinLen
 
+from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.configuration import UserError
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.gradient.implicit import Implicit
 from neural_sim.gradient.unrolled import Unrolled
 from neural_sim.outer.certificate import Trust
+from neural_sim.outer.first_step import Derivative
 from neural_sim.outer.objective import Loss
 from neural_sim.outer.steps import FreeSteps
 from neural_sim.outer.trust_region import TrustRegion
@@ -48,6 +50,7 @@ class Outer:
             get no probes and no second derivatives.
         certify_every: iterations from one comparison of the hypergradient with the response of training at this psi
             (:mod:`outer.response`, one training for each bin) to the next; 0: never.
+        first_step: what proposes the psi that is tried first: the first derivative, or what the target's boxes show.
         steps: how psi follows its derivative: in a trust region, under common random numbers, and the last iteration
             only trains, to accept or reject the last step; or freely.
         adjoint: the hypergradient of the training that was run, or of a stationary point (the paper's Eq. 2).
@@ -72,6 +75,7 @@ class Outer:
     quality: Quality | None = None
     learned: Annotated[Sequence[str], MinLen(1)] | None = None
     certify_every: NonNegativeInt = 0
+    first_step: Derivative | LabelShift = field(default_factory=Derivative)
     steps: TrustRegion | FreeSteps = field(default_factory=TrustRegion)
     adjoint: Unrolled | Implicit = field(default_factory=Unrolled)
     objective: SmoothAP | SmoothAccuracy | Loss = field(default_factory=SmoothAP)
@@ -83,6 +87,11 @@ class Outer:
             raise UserError(
                 "outer/steps=trust_region compares trainings: want train_first=true, start=fresh or warm and epochs of "
                 f"at least 1, got {self.train_first}, {self.start} and {self.epochs}"
+            )
+        if not isinstance(self.first_step, Derivative) and not isinstance(self.steps, TrustRegion):
+            raise UserError(
+                "outer/first_step: a training accepts or rejects what is proposed: want outer/steps=trust_region with "
+                "it, or outer/first_step=derivative"
             )
         if isinstance(self.adjoint, Unrolled) and not trains:
             raise UserError(

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
 from neural_sim.parameter.factor import Factor
@@ -33,6 +34,23 @@ class Verdict:
     expected_gain: float
     measured_gain: float
     error: float
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A psi of all objects that no derivative proposes.
+
+    Attributes:
+        psi: that is proposed; the present one of an object that should stay.
+        p_values: by object, of the null that the present psi is the right one.
+        images: that were composed for it.
+        shown: what it was read off.
+    """
+
+    psi: Float[Tensor, "objects K"]
+    p_values: Float[Tensor, "objects"]
+    images: int = 0
+    shown: tuple[FactorEstimate, ...] = ()
 
 
 @dataclass(frozen=True)

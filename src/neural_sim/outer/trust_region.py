@@ -30,7 +30,7 @@ from neural_sim.configuration import UserError
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate
 from neural_sim.outer.evidence import Average
-from neural_sim.outer.steps import LearnedObjects, PValues, Verdict, fractions, slopes_by_p, stacked
+from neural_sim.outer.steps import LearnedObjects, Proposal, PValues, Verdict, fractions, slopes_by_p, stacked
 from neural_sim.parameter.factor import Factor
 from neural_sim.ranges import Fraction, NonNegative, Positive, PositiveInt, validated
 
@@ -63,6 +63,8 @@ class TrustRegion:
         waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
             largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
             present mistakes in it, and another once they have moved.
+        take_back: whether, at the end, every object goes back to its best psi on the way, by the mean of all trainings
+            that saw each (:mod:`outer.way`); else the last one is the result.
         grow: factor of the radius after an accepted step that raised the score.
         shrink: factor after one that lowered it; its square root after another rejected step.
         momentum: factor of a derivative's weight in the average for every later move of its object.
@@ -80,6 +82,7 @@ class TrustRegion:
     errors: NonNegative = 1.0
     level: Annotated[float, Gt(0), Lt(1)] = 0.05
     waits_below: Fraction = 0.2
+    take_back: bool = True
     grow: Annotated[float, Ge(1)] = 1.3
     shrink: Annotated[float, Gt(0), Lt(1)] = 0.4
     momentum: Fraction = 0.5
@@ -125,9 +128,11 @@ class TrustRegionSteps:
         observed: these and the derivatives since the last step.
         moved: whether the pending step moved an object, by factor.
         expected: its expected gain.
-        significance: that of the derivatives by which the pending step moved an object, in standard deviations.
+        significance: that of the derivatives by which the pending step moved an object, or of the proposal that did, in
+            standard deviations.
         at_rest: for each judgment, the mean square of what objects that did not move gained or lost beyond the errors
             of images: the variance of trainings.
+        offered: objects that the pending step moved to a proposal; their radii are those of steps, and stay.
     """
 
     settings: TrustRegion
@@ -141,6 +146,7 @@ class TrustRegionSteps:
     expected: Float[Tensor, "objects"]
     significance: Float[Tensor, "objects"]
     at_rest: tuple[float, ...] = ()
+    offered: Bool[Tensor, "objects"] | None = None
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
@@ -165,7 +171,20 @@ class TrustRegionSteps:
     @property
     def _pending(self) -> Bool[Tensor, "objects"]:
         """Objects that moved, by any factor, and whose step is neither accepted nor rejected yet."""
-        return torch.stack([*self.moved.values()]).any(0)
+        moved = torch.stack([*self.moved.values()]).any(0)
+        return moved if self.offered is None else moved | self.offered
+
+    def offer(self, proposal: Proposal) -> TrustRegionSteps:
+        """Try a psi that no derivative proposes, before any is known."""
+        labels = list(self.objects.labels)
+        psi, p_values = (values[labels].double() for values in (proposal.psi, proposal.p_values))
+        return replace(
+            self,
+            trial=psi.to(self.accepted),
+            offered=(psi != self.accepted).any(1),
+            expected=torch.zeros_like(self.expected),
+            significance=_quantile(p_values.clamp(SMALLEST, 1.0 - SMALLEST)),
+        )
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
@@ -211,6 +230,7 @@ class TrustRegionSteps:
             observed=averages,
             moved={name: torch.zeros_like(pending) for name in self.moved},
             at_rest=at_rest,
+            offered=None,
         )
         return judged, verdicts
 

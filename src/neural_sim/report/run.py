@@ -229,6 +229,11 @@ def _trust_line(trust: Mapping[str, Any]) -> str:
         text += f"; of the others, {trust['waited']} waited (little gain, or a spent trust radius)"
     if trust["judged"]:
         text += f"; rejected after training on them {trust['rejected']} of {trust['judged']}"
+    if trust["taken_back"]:
+        backs = (
+            f"{name} (keeps {b['kept']} of {b['accepted']} steps)" for name, b in trust["taken_back"].items()
+        )
+        text += f"; taken back at the end {', '.join(backs)}"
     if trust["cosines"]:
         text += "; cosine with the response of training " + ", ".join(f"{c:.2f}" for c in trust["cosines"])
     return text

@@ -133,6 +133,8 @@ def _of_iteration(record: Mapping[str, Any], names: Sequence[str]) -> dict[str, 
             metrics[f"psi/{name}/score"] = record["scores"][i]
         if name in record["verdicts"]:
             metrics[f"psi/{name}/accepted"] = float(record["verdicts"][name]["accepted"])
+        if name in record["taken_back"]:
+            metrics[f"psi/{name}/steps_kept"] = float(record["taken_back"][name]["kept"])
     metrics |= {f"psi/{key}": record[key] for key in _COUNTED}
     if certificate:
         numbers = {**(certificate["adjoint"] or {}), "cosine": certificate["cosine"]}

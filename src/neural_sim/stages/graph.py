@@ -19,6 +19,7 @@ from neural_sim.stages.images import Images, Psi
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import PictureSubjectStage
 from neural_sim.stages.shown import ShownStage
+from neural_sim.stages.symmetry import SymmetryStage
 
 
 @dataclass(frozen=True)
@@ -119,12 +120,17 @@ class Graph(Images):
         x, settings = self.experiment, self.experiment.loop.method
         if not isinstance(settings, LabelShift):
             settings = LabelShift(per_bin=x.loop.outer.pool_per_bin or LabelShift.per_bin)
-        distribution = x.imaging.distribution
-        angles = [factor.name for factor in distribution.binned if factor.coordinate in ("phi", "rho")]
         return ShownStage(
-            self.scene, self.targets, tuple(self.symmetry(name, angle) for name in self.names for angle in angles),
-            distribution, settings, self.psi("initial"), x.score == "accuracy", x.run.seed,
+            self.scene, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
+            x.score == "accuracy", x.run.seed,
         )  # fmt: skip
+
+    @property
+    def _symmetries(self) -> tuple[SymmetryStage, ...]:
+        """The bins of every object and angle that look the same."""
+        binned = self.experiment.imaging.distribution.binned
+        angles = [factor.name for factor in binned if factor.coordinate in ("phi", "rho")]
+        return tuple(self.symmetry(name, angle) for name in self.names for angle in angles)
 
     @cached_property
     def learned(self) -> PsiStage:
@@ -132,10 +138,11 @@ class Graph(Images):
         x = self.experiment
         follows = isinstance(x.loop.method, HypergradientLoop)
         parts = HypergradientParts(x.loop.gradient, x.loop.solver) if follows else None
+        reads = follows and isinstance(x.loop.outer.first_step, LabelShift)
         return PsiStage(
             self.warm_start, self.targets, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
             self.psi("initial"), x.run.seed, self.shown if isinstance(x.loop.method, LabelShift) else None,
-            x.run.progress, self.on_record,
+            self._symmetries if reads else (), x.run.progress, self.on_record,
         )  # fmt: skip
 
     def synthetic(self, psi: Psi, called: str) -> DetectorStage:

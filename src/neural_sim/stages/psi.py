@@ -15,8 +15,10 @@ from typing_extensions import override
 from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
 from neural_sim.baseline.label_shift.evidence import estimates_of
 from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.detector.classifier import Classifier
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.implicit import Implicit
+from neural_sim.outer.first_step import Derivative, FirstStep, WhatTheTargetShows
 from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
@@ -27,8 +29,9 @@ from neural_sim.parameter.product import HARD, Draws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
-from neural_sim.stages.shown import ShownStage
+from neural_sim.stages.shown import ShownStage, groups_of
 from neural_sim.stages.stage import UNKEYED, Results, Stage
+from neural_sim.stages.symmetry import SymmetryStage
 from neural_sim.stages.target_sets import TargetSetsStage
 
 Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
@@ -47,7 +50,8 @@ class PsiStage(Stage[LearnedPsi]):
     """The psi loop of ``method`` from the warm start's distribution.
 
     ``parts`` are those of a method that follows the hypergradient, ``shown`` is what the method reads off the target's
-    boxes; None for others. ``on_record`` is called with every iteration's record as it ends.
+    boxes; None for others. ``symmetries`` are of the bins that ``outer.first_step`` reads off them. ``on_record`` is
+    called with every iteration's record as it ends.
 
     Raises:
         ValueError: ``outer.loop_layers`` of a backbone that has no such stages, or a solver that does not take the
@@ -66,6 +70,7 @@ class PsiStage(Stage[LearnedPsi]):
     initial: Float[Tensor, "objects K"]
     seed: int
     shown: ShownStage | None = None
+    symmetries: tuple[SymmetryStage, ...] = ()
     progress: bool = field(default=False, metadata=UNKEYED)
     on_record: Callable[[IterationRecord], object] | None = field(default=None, metadata=UNKEYED)
 
@@ -127,12 +132,22 @@ class PsiStage(Stage[LearnedPsi]):
         generator = stream(self.seed, "psi")
         inner = InnerLoop.prepare(scene, inputs, self.outer, training, generator, self.draws)
         if self.parts is not None:
-            return SimulatorModule(inner, self.initial, self.parts.estimator, self.parts.solver, generator)
+            first = self._first_step(results, isinstance(detector, Classifier))
+            return SimulatorModule(
+                inner, self.initial, self.parts.estimator, self.parts.solver, generator, first
+            )
         if isinstance(method, Response):
             return ResponseLoop(inner, self.initial, method.part, generator)
         if isinstance(method, (Fixed, LabelShift, HypergradientLoop)):
             raise ValueError(f"baseline={method.name} has no outer loop")
         return RewardLoop(inner, self.initial, method, generator)
+
+    def _first_step(self, results: Results, whole: bool) -> FirstStep | None:
+        """Return what proposes the loop's first step; None: its first derivative."""
+        settings = self.outer.first_step
+        if isinstance(settings, Derivative):
+            return None
+        return WhatTheTargetShows(settings, groups_of(self.symmetries, results), whole)
 
     @override
     def pack(self, value: LearnedPsi) -> dict[str, Any]:

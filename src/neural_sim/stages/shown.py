@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.baseline.label_shift.estimate import Estimate, estimate
+from neural_sim.baseline.label_shift.estimate import Estimate, Groups, estimate
 from neural_sim.baseline.label_shift.evidence import estimates_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.parameter.product import SceneDistribution
@@ -49,9 +49,7 @@ class ShownStage(Stage[Estimate]):
 
     @override
     def make(self, results: Results) -> Estimate:
-        groups: dict[str, dict[str, list[list[int]]]] = {name: {} for name in self.scene.names}
-        for stage in self.symmetries:
-            groups[stage.object][stage.angle] = results(stage)
+        groups = groups_of(self.symmetries, results)
         scene, validation = results(self.scene), results(self.targets).val
         generator = stream(self.seed, "psi")
         return estimate(scene, validation, self.psi, self.settings, generator, groups, self.whole)
@@ -63,3 +61,11 @@ class ShownStage(Stage[Estimate]):
     @override
     def unpack(self, stored: Mapping[str, Any]) -> Estimate:
         return Estimate(**{**stored, "factors": estimates_of(stored["factors"])})
+
+
+def groups_of(symmetries: Sequence[SymmetryStage], results: Results) -> Groups:
+    """Return the bins that look the same, by object and angle."""
+    groups: dict[str, dict[str, list[list[int]]]] = {}
+    for stage in symmetries:
+        groups.setdefault(stage.object, {})[stage.angle] = results(stage)
+    return groups

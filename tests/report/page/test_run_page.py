@@ -51,7 +51,7 @@ def results():
                    "cosine": None, "adjoint": None,
                    "actions": {"mug": {"pose": "kept"}, "can": {"pose": "skipped"}}}  # fmt: skip
     record = {"probabilities": {"pose": uniform.tolist()}, "certificate": certificate, "verdicts": {},
-              "images_without_box": 0}  # fmt: skip
+              "images_without_box": 0, "taken_back": {}}  # fmt: skip
     judged = {"mug": {"accepted": True, "expected_gain": 0.1, "measured_gain": 0.2, "error": 0.01}}
     last = {**record, "certificate": None, "verdicts": judged}
     scores = {"ap": 0.5, "ap50": 0.7, "per_class": {"mug": 0.6, "can": 0.4}, "per_class_ap50": {}}
@@ -103,6 +103,17 @@ def test_a_page_has_every_part_and_refers_to_no_file_that_is_not_there(results, 
     # 6 of 24 images were right before, 18 are now.
     assert all(text in page for text in ("Won (12 of 24)", "Still wrong (6 of 24)", "Right (6 of 24)"))
     assert "Lost (" not in page and 'title="pose: p = 0.01; expected fall of the outer loss 0.100; ' in page
+
+
+def test_a_page_says_what_the_first_step_was_and_what_was_taken_back(results, shown, tmp_path):
+    first, last = results.records
+    first = {**first, "verdicts": last["verdicts"]}
+    last = {**last, "taken_back": {"mug": {"kept": 1, "accepted": 3, "gain": 0.02}}}
+    text = write_run_page(
+        dataclasses.replace(results, records=[first, last]), shown, COMMANDS, tmp_path
+    ).read_text()
+    assert "read off the target's boxes" in text and "mug accepted (+0.200 ± 0.010" in text
+    assert "mug went back to where it was after 1 of 3 accepted steps" in text
 
 
 def test_a_page_says_that_photographs_have_an_unknown_distribution(results, shown, tmp_path):

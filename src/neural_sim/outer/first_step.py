@@ -1,0 +1,85 @@
+"""``outer/first_step``: what proposes the psi that a loop tries first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from neural_sim.baseline.label_shift.estimate import Groups, estimate
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.outer.steps import Proposal
+from neural_sim.ranges import validated
+from neural_sim.synthesis.scene import Scene
+from neural_sim.types import LabelledImages
+
+
+@validated
+@dataclass(frozen=True)
+class Derivative:
+    """``outer.first_step``: nothing is proposed; the first step is that along the first derivative."""
+
+
+class FirstStep(Protocol):
+    """Proposes the psi that a training accepts or rejects, object by object, before the first derivative is taken."""
+
+    def propose(
+        self,
+        scene: Scene,
+        images: LabelledImages,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+    ) -> Proposal:
+        """Propose a psi.
+
+        Args:
+            scene: draws images of all bins, without rendering where the loop has a pool.
+            images: labelled ones of the target.
+            psi: where the loop stands.
+            generator: of all draws.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class WhatTheTargetShows(FirstStep):
+    """Proposes the psi that the target's boxes show.
+
+    Attributes:
+        settings: how it is read off them.
+        groups: bins that look the same.
+        whole: read whole images, which have no boxes.
+    """
+
+    settings: LabelShift
+    groups: Groups = field(default_factory=dict)
+    whole: bool = False
+
+    @override
+    def propose(
+        self,
+        scene: Scene,
+        images: LabelledImages,
+        psi: Float[Tensor, "objects K"],
+        generator: torch.Generator,
+    ) -> Proposal:
+        found = estimate(scene, images, psi, self.settings, generator, self.groups, self.whole)
+        p_values = torch.tensor(
+            [p_value_of(found.factors, name) for name in scene.names], dtype=torch.float64
+        )
+        return Proposal(found.psi, p_values, found.images, found.factors)
+
+
+def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
+    """Compute the p-value of the null that psi of an object is right where it stands.
+
+    Among several factors that move, the most significant one counts, its p-value times their number (Bonferroni).
+    """
+    moving = [one.p_value for one in factors if one.name == name and one.finding == "moves"]
+    return min(1.0, len(moving) * min(moving)) if moving else 1.0

@@ -1,0 +1,136 @@
+"""The psi that an object had on its way, and which of them a loop returns.
+
+Trainings scatter, and a step is judged by one pair of them: a small loss is accepted, and one that shows only over
+later trainings is never seen. At the end every psi that was accepted is therefore scored again, by all the trainings
+that saw it. The largest of several noisy means is too often one that was lucky; so the values m_v of an object's psi
+are fitted to the scores y_t of its trainings in such a way that neighbours on the way are worth about the same:
+
+    minimise over m    sum_t (y_t - m_v(t))^2 + w sum_v f(m_v - m_(v-1)),    f(x) = c^2 log(1 + x^2 / c^2)
+
+It is the most probable m where scores have normal errors of standard deviation s between trainings, and steps change
+them by about s / sqrt(w), a few by much more (Student's t). c is three times s.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+WEIGHT = 4.0
+"""w, for steps that mostly change a score by half of what it scatters by. On simulated ways (tests/outer/test_way.py)
+1 takes too many good steps back and 8 too few bad ones."""
+LARGE = 3.0
+"""c in units of s: what a step changes a score by, beyond which neighbours on the way are not held together."""
+REPETITIONS = 50
+
+
+@dataclass(frozen=True)
+class Stay:
+    """One psi on an object's way.
+
+    Attributes:
+        psi: that the object had.
+        scores: of the object in every training that saw this psi, more is better.
+    """
+
+    psi: Float[Tensor, "K"]
+    scores: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class TakenBack:
+    """An object that goes back on its way at the end.
+
+    Attributes:
+        kept: number of its accepted steps that are kept; 0: it goes back to the start.
+        accepted: number of all of them.
+        gain: by how much the psi that is returned is estimated to score above the last one.
+    """
+
+    kept: int
+    accepted: int
+    gain: float
+
+
+@dataclass(frozen=True)
+class Way:
+    """What every learned object was worth on its way, ``stays`` by name."""
+
+    stays: Mapping[str, tuple[Stay, ...]]
+
+    @staticmethod
+    def begin(names: Sequence[str], psi: Float[Tensor, "objects K"]) -> Way:
+        """Stand at ``psi`` before the first training."""
+        return Way({name: (Stay(row.clone()),) for name, row in zip(names, psi, strict=True)})
+
+    def moved(self, name: str, psi: Float[Tensor, "K"]) -> Way:
+        """Let an object go to another psi."""
+        return self._with(name, (*self.stays[name], Stay(psi.clone())))
+
+    def seen(self, name: str, score: float) -> Way:
+        """Add the score of a training that saw an object at its present psi."""
+        *before, here = self.stays[name]
+        return self._with(name, (*before, replace(here, scores=(*here.scores, score))))
+
+    def _with(self, name: str, stays: tuple[Stay, ...]) -> Way:
+        return Way({**self.stays, name: stays})
+
+    @property
+    def variance(self) -> float | None:
+        """Variance of a score between trainings at one psi, pooled over objects; None if nothing was trained twice."""
+        squares, freedom = 0.0, 0
+        for scores in (stay.scores for stays in self.stays.values() for stay in stays):
+            if len(scores) > 1 and all(map(math.isfinite, scores)):
+                squares, freedom = (
+                    squares + (len(scores) - 1) * statistics.variance(scores),
+                    freedom + len(scores) - 1,
+                )
+        return squares / freedom if freedom else None
+
+    def best(self) -> dict[str, tuple[Stay, TakenBack]]:
+        """Return the objects whose best psi is not their last one, and what is taken back.
+
+        Nothing is where no psi was trained on twice: how far trainings scatter is then not known.
+        """
+        found, variance = {}, self.variance
+        for name, stays in self.stays.items():
+            if variance is None or not all(math.isfinite(score) for stay in stays for score in stay.scores):
+                continue
+            values = fitted_scores([stay.scores for stay in stays], variance)
+            place = int(values.argmax())
+            gain = float(values[place] - values[-1])
+            if gain > 0.0:
+                found[name] = stays[place], TakenBack(place, len(stays) - 1, gain)
+        return found
+
+
+def fitted_scores(
+    scores: Sequence[Sequence[float]], variance: float, weight: float = WEIGHT
+) -> Float[Tensor, "stays"]:
+    """Estimate what each psi of an object's way is worth, by least squares with weights that follow the solution.
+
+    Args:
+        scores: of the trainings that saw each psi; of every psi at least one.
+        variance: s^2, of a score between trainings.
+        weight: w; how many trainings count as much as a neighbour on the way.
+
+    Raises:
+        ValueError: a psi without a score.
+    """
+    if not scores or not all(scores):
+        raise ValueError(f"fitted_scores: want a score of every psi, got {scores}")
+    counts = torch.tensor([len(each) for each in scores], dtype=torch.float64)
+    sums = torch.tensor([sum(each) for each in scores], dtype=torch.float64)
+    steps = torch.diff(torch.eye(len(scores), dtype=torch.float64), dim=0)
+    large = max(LARGE**2 * variance, torch.finfo(torch.float64).tiny)
+    values = sums / counts
+    for _ in range(REPETITIONS):
+        held = weight / (1.0 + (steps @ values).square() / large)
+        values = torch.linalg.solve(torch.diag(counts) + steps.T @ (held[:, None] * steps), sums)
+    return values

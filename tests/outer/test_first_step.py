@@ -1,0 +1,67 @@
+"""The first step that the target's boxes propose: which objects move, on what evidence, by whose renders."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_loop import CHECKED, small_loop
+
+from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.baseline.label_shift.network import Fitting
+from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.gradient.estimators import StratifiedEstimator
+from neural_sim.outer.first_step import WhatTheTargetShows, p_value_of
+from neural_sim.outer.loop import learn_psi
+from neural_sim.synthesis.scene import Scene
+
+QUICK = LabelShift(per_bin=8, fitting=Fitting(epochs=8), draws=19, fewest=1, strange=1.0)
+
+
+def estimate(name, factor, p_value, finding="moves"):
+    half = (0.5, 0.5)
+    return FactorEstimate(name, factor, 9, half, half, half, half, ((1,), (2,)), p_value, 0.05, 0.9, finding)
+
+
+def test_several_factors_that_move_pay_for_their_number():
+    factors = (
+        estimate("a", "pose", 0.01), estimate("a", "zoom", 0.03), estimate("b", "pose", 0.01),
+        estimate("b", "zoom", 0.001, "stays"), estimate("c", "pose", 0.001, "fits no render"),
+        estimate("d", "pose", 0.8), estimate("d", "zoom", 0.9),
+    )  # fmt: skip
+    found = [p_value_of(factors, name) for name in "abcde"]
+    assert found == pytest.approx([0.02, 0.01, 1.0, 1.0, 1.0])
+
+
+def test_the_boxes_of_a_target_are_read_off_the_loop_s_renders(scene, monkeypatch):
+    """All images of the target are of one bin of the first object; the loop's pool is all that is rendered."""
+    estimator = StratifiedEstimator(probes_per_bin=2)
+    first = WhatTheTargetShows(QUICK)
+    module = small_loop(scene, estimator, 2, pool_per_bin=8, first=first, **CHECKED)
+    peaked = torch.tensor([[0.0, 0.0, 9.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    images = scene.training_set(peaked, 24, torch.Generator().manual_seed(3)).images
+    module.inner = replace(module.inner, objective=replace(module.inner.objective, images=images))
+    rendered, render = [], Scene.render
+
+    def watched(self, label, draw):
+        rendered.append(label)
+        return render(self, label, draw)
+
+    monkeypatch.setattr(Scene, "render", watched)
+    proposal = first.propose(module.inner.pool, images, module.psi.detach(), torch.Generator().manual_seed(0))
+    assert rendered == [] and proposal.images > 0
+    assert [one.name for one in proposal.shown] == ["a", "b"]
+    p = scene.distribution.probabilities(proposal.psi)["pose"][0]
+    before = scene.distribution.probabilities(torch.zeros(2, 4))["pose"][0]
+    wanted = scene.distribution.probabilities(peaked)["pose"][0]
+    assert float(proposal.p_values[0]) <= 0.05
+    assert float((p - wanted).abs().sum()) < 0.7 * float((before - wanted).abs().sum())
+
+
+def test_a_loop_tries_what_the_boxes_show_and_reports_it(scene):
+    first = WhatTheTargetShows(replace(QUICK, level=1.0))
+    module = small_loop(
+        scene, StratifiedEstimator(probes_per_bin=2), 2, pool_per_bin=8, first=first, **CHECKED
+    )
+    learned = learn_psi(module, progress=False)
+    assert [one.name for one in learned.shown] == ["a", "b"]
+    assert set(learned.records[0].verdicts) == {"a", "b"} and "first_step" in learned.records[0].seconds
