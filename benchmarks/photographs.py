@@ -77,7 +77,7 @@ def of_photographs(options: argparse.Namespace, kind: str, rounds: int) -> list[
     """Return the overrides that take the photographs as objects."""
     return [
         f"scale={options.scale}", "objects=photos", "objects.up=-y", f"objects.root={options.out / kind}",
-        f"objects.poses.rounds={rounds}",
+        f"objects.refinement.rounds={rounds}",
     ]  # fmt: skip
 
 

@@ -70,6 +70,13 @@ GONE: dict[str, str] = {
 
 MOVED: dict[str, str] = {
     "baseline=neural_sim_paper_reinforce": "baseline=auto_sim_paper",
+    "objects.poses=given": "objects/poses=given",
+    "objects.poses=colmap": "objects/poses=colmap",
+    **{
+        f"objects.poses.{key}": f"objects.refinement.{key}"
+        for key in ("rounds", "updates", "image_size", "resolution", "steps", "batch_rays", "seed")
+    },
+    "budget.poses": "budget.refinement",
     "outer.steps=checked": "outer/steps=trust_region",
     "outer.steps=free": "outer/steps=free",
     "outer.checks": "outer.steps",

@@ -93,6 +93,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         score_at=tuple(plain["score_at"]),
         task=plain["task"],
     )
+    parts["objects"] = _with_cameras(parts["objects"], run)
     images = {name: parts[name] for name in ("objects", "views", "field", "renderer", "synthesis", "target")}
     distribution, covered = _covered(_product(parameters, parts), parameters, parts["objects"])
     imaging = Imaging(**images, camera=_camera(parts), distribution=distribution, coverage=covered)
@@ -150,6 +151,21 @@ def _camera(parts: Mapping[str, Any]) -> Any:
     views = parts["views"]
     try:
         return parts["camera"].camera(parts["training"].image_size, views.field_of_view_deg, parts["target"])
+    except ValueError as error:
+        raise UserError(first_line(error)) from error
+
+
+def _with_cameras(objects: Any, run: Any) -> Any:
+    """Return the objects; cameras of photographs alone are found, or read from the store."""
+    from neural_sim.objects.photos import Photos
+    from neural_sim.stages.cameras import with_cameras
+    from neural_sim.stages.stage import Results
+    from neural_sim.stages.store import Store
+
+    if not isinstance(objects, Photos):
+        return objects
+    try:
+        return with_cameras(objects, Results(Store(run.store)), run.progress)
     except ValueError as error:
         raise UserError(first_line(error)) from error
 

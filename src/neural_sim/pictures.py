@@ -124,6 +124,16 @@ def read_header(path: Path, where: str = "") -> Header:
         return Header(image.size, _orientation(image), image.mode, image.format, image.has_transparency_data)
 
 
+def read_exif(path: Path) -> dict[int, object]:
+    """Return what a picture's EXIF says by its tags; nothing where there is none, or it is damaged."""
+    try:
+        with Image.open(path) as image:
+            held = image.getexif()
+            return {**held, **held.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # Pillow's parsers raise many kinds
+        return {}
+
+
 def check_headers(paths: Iterable[Path], key: str) -> None:
     """Refuse pictures that cannot be read by what their headers say, before anything is computed.
 
@@ -272,17 +282,29 @@ def read_grid(path: Path, size: Size | None = None) -> np.ndarray:
     return grid
 
 
-def read_mask(path: Path) -> Float[np.ndarray, "height width"]:
+def read_mask(path: Path, value: int | None = None) -> Float[np.ndarray, "height width"]:
     """Read a mask's opacity in [0, 1].
+
+    Args:
+        path: the file.
+        value: the object's, in an image of labels (grey values, or indices of a palette); None: as follows.
 
     Two values, whichever they are, are the background and the object, the darker or smaller being the background; one
     value other than 0 is the object. More values of grey are opacities by the format's white. Of a coloured palette the
     index counts. A picture with an alpha channel is a mask by its alpha where that says something, else by its colours.
 
     Raises:
-        ValueError: a file that cannot be read, or several labels or colours, of which none is known to be the object's.
+        ValueError: a file that cannot be read, or several labels or colours, of which none is known to be the object's;
+            colours where ``value`` is given.
     """
     image, where = _loaded(path, str(path))[0], str(path)
+    if value is not None:
+        labels = np.asarray(image)
+        if labels.ndim != 2:
+            raise ValueError(
+                f"{where}: want labels in one channel for objects.mask_value={value}, got {image.mode}"
+            )
+        return (labels == value).astype(np.float32)
     lossy = image.format in _LOSSY
     if image.has_transparency_data:
         picture = eight_bits(image, where)
@@ -346,7 +368,8 @@ def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height wi
 
 def _several(where: str, what: str, count: int) -> str:
     return (
-        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey"
+        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey; of "
+        "labels, objects.mask_value says which is the object's"
     )
 
 

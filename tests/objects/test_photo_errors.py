@@ -1,6 +1,7 @@
 """What is wrong with a capture is named: its file, the frame, and what is wanted."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -51,6 +52,11 @@ def no_image(document, home):
     (home / "images" / "002.png").unlink()
 
 
+def no_images(document, home):
+    for path in (home / "images").iterdir():
+        path.unlink()
+
+
 def other_size(document, home):
     Image.new("RGB", (100, 75)).save(home / "images" / "002.png")
 
@@ -78,7 +84,7 @@ def bad_up(document, home):
         (mirrored, r"frames\[2\].*transform_matrix.*no rotation.*determinant -1"),
         (stretched, r"frames\[2\].*transform_matrix.*no rotation"),
         (not_numbers, r"frames\[2\].*want a matrix of 4 x 4 numbers, got 'identity'"),
-        (no_image, r"frames\[2\].*no such image: .*002\.png"),
+        (no_images, r"transforms\.json: none of its 16 photographs has a file, such as images/000\.png"),
         (other_size, r"frames\[2\].*has 100 x 75 pixels, its intrinsics w and h say 200 x 150"),
         (other_model, r"frames\[0\].*camera_model: want one of .*got 'THIN_PRISM_FISHEYE'"),
         (no_focal_length, r"frames\[0\].*want intrinsics fl_x or camera_angle_x"),
@@ -89,6 +95,44 @@ def bad_up(document, home):
 def test_what_is_wrong_in_a_file_is_named(made, tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
         Photos(broken(made, tmp_path, change))
+
+
+def test_listed_photographs_without_a_file_are_left_out_with_a_count(made, tmp_path, caplog):
+    photos = Photos(broken(made, tmp_path / "json", no_image))
+    assert len(photos.captures["can"].frames) == 15
+    assert (
+        "transforms.json: 1 of 16 photographs have no file and are left out, such as images/002.png"
+        in caplog.text
+    )
+    home = tmp_path / "model" / "can"
+    shutil.copytree(made["colmap_text"].folder, home)
+    for name in ("003.png", "007.png"):
+        (home / "images" / name).unlink()
+    assert len(Photos(home.parent).captures["can"].frames) == 14
+    assert "sparse/0: 2 of 16 photographs have no file and are left out, such as" in caplog.text
+
+
+def test_of_several_models_the_one_with_the_most_photographs_is_taken(made, tmp_path, caplog):
+    home = tmp_path / "can"
+    shutil.copytree(made["colmap_text"].folder, home)
+    shutil.copytree(home / "sparse" / "0", home / "sparse" / "1")
+    lines = (home / "sparse" / "0" / "images.txt").read_text().splitlines()
+    (home / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:6]) + "\n")
+    assert len(Photos(tmp_path).captures["can"].frames) == 16
+    assert (
+        "sparse/1: of 2 models, the one with the most photographs (16) is taken; left out: 0 (3)"
+        in caplog.text
+    )
+
+
+def test_a_folder_of_one_object_is_its_root(made):
+    assert Photos(made["transforms"].folder).names() == ["can"]
+
+
+def test_photographs_alone_are_refused_with_what_finds_their_cameras(made, tmp_path):
+    shutil.copytree(made["transforms"].folder / "images", tmp_path / "can")
+    with pytest.raises(ValueError, match=r"objects/poses=colmap finds the cameras of photographs alone"):
+        Photos(tmp_path)
 
 
 def test_what_is_wrong_with_masks_is_named(made, tmp_path):
@@ -139,6 +183,19 @@ def test_a_model_that_colmap_cannot_read_is_named(made, tmp_path):
         ({"names": []}, r"Photos\.names: want 1 or more values or null, got \[\]"),
         ({"names": ["mug"]}, r"objects\.names: 'mug' is not in"),
         ({"masks": "scene"}, r"objects\.masks=scene: want objects\.scene, which computes masks, got none"),
+        ({"masks": "command"}, r"objects\.mask_command goes with objects\.masks=command, got .*None"),
+        (
+            {"mask_command": "true {images} {masks}"},
+            r"objects\.mask_command goes with objects\.masks=command",
+        ),
+        (
+            {"masks": "command", "mask_command": "true {images}"},
+            r"objects\.mask_command: want \{images\} and \{masks\} in it, got 'true \{images\}' without \{masks\}",
+        ),
+        (
+            {"masks": "command", "mask_command": "no-such-program {images} {masks}"},
+            r"objects\.mask_command: no such program: no-such-program",
+        ),
         (
             {"box": [[0, 0, 0], [1, 1, 1]]},
             r"objects\.box wants objects\.masks=scene, got objects\.masks=auto",

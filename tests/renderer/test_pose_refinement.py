@@ -183,7 +183,7 @@ def test_photographs_come_with_corrected_poses(tmp_path, caplog):
     before = Photos(tmp_path).views("can", 8, 2, 48)
     poses = PoseRefinement(rounds=1, updates=2, image_size=32, steps=30, batch_rays=1024)
     with caplog.at_level("INFO"):
-        after = Photos(tmp_path, poses=poses).views("can", 8, 2, 48)
+        after = Photos(tmp_path, refinement=poses).views("can", 8, 2, 48)
     assert len(after) == len(made.poses) - 1  # an eighth of ten photographs tests
     assert torch.equal(before.images, after.images) and after.camera == before.camera
     assert bool((after.camera_to_world != before.camera_to_world).flatten(1).any(1).all())
@@ -198,7 +198,7 @@ def test_fields_of_a_telephones_photographs_gain_decibels(tmp_path):
     capture(tmp_path, "drill", count=30, width=128, height=96, renderer=RaycastRenderer(1), pose_noise=0.01)
 
     def psnr(poses):
-        views = Photos(tmp_path, poses=poses).views("drill", 27, 3, 96)
+        views = Photos(tmp_path, refinement=poses).views("drill", 27, 3, 96)
         fitting = GridFitting(GridField(), resolution=128, refine_steps=(40,), prune_steps=(80,))
         generator = torch.Generator().manual_seed(0)
         return fit_field(views, fitting, generator, steps=120, held_out=3)[1][-1]["psnr_foreground"]

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+_log = logging.getLogger(__name__)
 
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity: files round to six digits, and pose optimisers drift."""
@@ -50,6 +54,14 @@ class Lens:
             raise ValueError(f"want a size of pixels and finite numbers, got {self}")
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise ValueError(f"want positive focal lengths, got {self.fx} and {self.fy}")
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The lens for the same photograph in another size."""
+        across, down = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=across * self.fx, fy=down * self.fy, cx=across * self.cx,
+            cy=down * self.cy,
+        )  # fmt: skip
 
     def project(self, local: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Pixels (x, y) of points in the camera's OpenGL frame, and which of them are visible.
@@ -147,6 +159,23 @@ class Capture:
     source: Path
     files: tuple[Path, ...]
     up: tuple[float, float, float] | None = None
+
+
+def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
+    """Warn of listed photographs without a file, which are left out.
+
+    Raises:
+        ValueError: none of the ``listed`` has one.
+    """
+    if missing and len(missing) == listed:
+        raise ValueError(
+            f"{source}: none of its {listed} photographs has a file, such as {missing[0]}; want them where it says"
+        )
+    if missing:
+        _log.warning(
+            "%s: %d of %d photographs have no file and are left out, such as %s",
+            source, len(missing), listed, missing[0],
+        )  # fmt: skip
 
 
 def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:

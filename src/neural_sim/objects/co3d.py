@@ -21,7 +21,7 @@ from neural_sim.objects.files import Names
 from neural_sim.objects.photos import Photos, PoseCorrector, Up
 from neural_sim.objects.pictures import Box, Masks, SceneMaskMaker
 from neural_sim.pictures import read_header
-from neural_sim.ranges import Positive, validated
+from neural_sim.ranges import NonNegativeInt, Positive, validated
 
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 FORMATS = ("ndc_norm_image_bounds", "ndc_isotropic")
@@ -38,7 +38,7 @@ class Co3d(Photos):
         names: categories; null: all.
         sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
             the highest ``viewpoint_quality_score``, of those without one the longest.
-        masks, up, size, box, scene, poses, poor: see :class:`Photos`.
+        masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see :class:`Photos`.
 
     Raises:
         ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
@@ -55,11 +55,15 @@ class Co3d(Photos):
         size: Positive | Mapping[str, Positive | None] | None = None,
         box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
-        poses: PoseCorrector | None = None,
+        refinement: PoseCorrector | None = None,
         poor: Literal["refuse", "use"] = "refuse",
+        mask_command: str | None = None,
+        mask_value: NonNegativeInt | Mapping[str, NonNegativeInt | None] | None = None,
     ) -> None:
         self.sequences = dict(sequences or {})
-        super().__init__(root, names, masks, up, size, box, scene, poses, poor)
+        super().__init__(
+            root, names, masks, up, size, box, scene, refinement, poor, None, mask_command, mask_value
+        )
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
             raise ValueError(f"objects.sequences: {strange} are no objects, these are {self.names()}")

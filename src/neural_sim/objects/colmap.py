@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from neural_sim.extras import require
 from neural_sim.interruption import signals_kept
-from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
+from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose, say_missing
 from neural_sim.pictures import by, read_header
 
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+_log = logging.getLogger(__name__)
+
+MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
+"""Where models lie, the likelier first. COLMAP numbers several (``sparse/0``, ``sparse/1``), of which the one with the
+most photographs is taken."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {
@@ -28,12 +34,14 @@ PARAMETERS: dict[str, str] = {
 }
 
 
-def model_folder(folder: Path) -> Path | None:
-    """Folder of a capture's sparse model, None without one."""
+def model_folders(folder: Path) -> list[Path]:
+    """Folders of a capture's sparse models: those of the first place that has any."""
     for place in MODELS:
-        if any((folder / place / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
-            return folder / place
-    return None
+        found = [folder] if place == "." else sorted(folder.glob(place))
+        models = [one for one in found if any((one / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))]
+        if models:
+            return models
+    return []
 
 
 def read_colmap(folder: Path, name: str) -> Capture:
@@ -41,49 +49,74 @@ def read_colmap(folder: Path, name: str) -> Capture:
 
     Raises:
         ValueError: a model that pycolmap cannot read (such as one of another version) or without posed images, an
-            unknown camera model, an image that is missing or whose size is not its camera's.
+            unknown camera model, images that are all missing, one whose size is not its camera's.
     """
-    model = model_folder(folder)
-    if model is None:
+    models = model_folders(folder)
+    if not models:
         raise ValueError(
             f"{folder}: holds no COLMAP model; want one of {', '.join(MODELS)} with cameras.bin or .txt"
         )
-    require("photos", str(model))
-    with signals_kept():
-        import pycolmap
-
-    try:
-        read = pycolmap.Reconstruction(str(model))
-        posed = {number: image for number, image in read.images.items() if image.has_pose}
-    except Exception as error:  # pycolmap raises whatever its C++ checks raise
-        raise ValueError(
-            f"{model}: pycolmap {pycolmap.__version__} cannot read this model: {error}"
-        ) from error
-    if not posed:
+    require("photos", str(models[0]))
+    each = [(model, *_model(model)) for model in models]
+    model, read, with_pose = max(each, key=lambda one: len(one[2]))
+    if not with_pose:
         raise ValueError(f"{model}: holds no image with a pose")
+    if len(each) > 1:
+        others = ", ".join(f"{path.name} ({len(has)})" for path, _, has in each if path != model)
+        _log.warning(
+            "%s: of %d models, the one with the most photographs (%d) is taken; left out: %s",
+            model, len(each), len(with_pose), others,
+        )  # fmt: skip
+    unposed = len(read.images) - len(with_pose)
+    if unposed:
+        _log.warning("%s: %d photographs have no pose and are left out", model, unposed)
     images = folder / "images"
-    frames = [
-        _frame(posed[number], read, images if images.is_dir() else folder, model) for number in sorted(posed)
-    ]
+    place = images if images.is_dir() else folder
+    have = {number: (place / image.name).is_file() for number, image in with_pose.items()}
+    missing = sorted(str(place / image.name) for number, image in with_pose.items() if not have[number])
+    say_missing(model, missing, len(with_pose))
+    frames = [_frame(image, read, place, model) for number, image in with_pose.items() if have[number]]
     frames.sort(key=lambda frame: str(frame.image))
     parts = sorted(path for path in model.iterdir() if path.is_file() and path.suffix in (".bin", ".txt"))
     return Capture(name, tuple(frames), model, (*parts, *(frame.image for frame in frames)))
 
 
+def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
+    """A model, and its images with a pose."""
+    with signals_kept():
+        import pycolmap
+
+    try:
+        read = pycolmap.Reconstruction(str(folder))
+        return read, {number: image for number, image in read.images.items() if image.has_pose}
+    except Exception as error:  # pycolmap raises whatever its C++ checks raise
+        raise ValueError(
+            f"{folder}: pycolmap {pycolmap.__version__} cannot read this model: {error}"
+        ) from error
+
+
 def _frame(image: Any, read: Any, folder: Path, model: Path) -> Frame:
     where, path = f"{model}: image {image.name}", folder / image.name
-    if not path.is_file():
-        raise ValueError(f"{where}: no such image: {path}")
-    lens = _lens(read.cameras[image.camera_id], where)
+    pose, lens = posed(image, read, where)
     header = read_header(path, f"{where}: {path}")
     if header.stored != (lens.width, lens.height):
         raise ValueError(
             f"{where}: the image has {by(header.stored)} pixels, its camera {image.camera_id} "
             f"{lens.width} x {lens.height}{header.turning}"
         )
+    return Frame(path, pose, lens)
+
+
+def posed(image: Any, read: Any, where: str) -> tuple[Float[np.ndarray, "4 4"], Lens]:
+    """Camera-to-world matrix (OpenGL axes) and lens of an image of a model.
+
+    Raises:
+        ValueError: a pose that is no rotation, or an unknown camera model.
+    """
     world_to_camera = np.eye(4)
     world_to_camera[:3] = image.cam_from_world().matrix()
-    return Frame(path, checked_pose(np.linalg.inv(world_to_camera) @ OPENCV_TO_OPENGL, where), lens)
+    pose = checked_pose(np.linalg.inv(world_to_camera) @ OPENCV_TO_OPENGL, where)
+    return pose, _lens(read.cameras[image.camera_id], where)
 
 
 def _lens(camera: Any, where: str) -> Lens:

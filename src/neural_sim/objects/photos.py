@@ -1,21 +1,29 @@
-"""Photographs of objects: one folder per object, with ``transforms.json`` or a COLMAP sparse model."""
+"""Photographs of objects: one folder per object, with cameras (``transforms.json``, COLMAP's model) or without."""
 
 from __future__ import annotations
 
+import copy
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neural_sim.objects.album import FOLDER, Album, Shot, pictures_of, read_album
 from neural_sim.objects.capture import Capture, Frame
-from neural_sim.objects.colmap import model_folder, read_colmap
+from neural_sim.objects.colmap import model_folders, read_colmap
 from neural_sim.objects.files import Names, choose, content_digest, folder_of
+from neural_sim.objects.found import FoundCapture
+from neural_sim.objects.mask_command import MaskCommand
 from neural_sim.objects.pictures import (
+    FOLDER as MASKS_FOLDER,
+)
+from neural_sim.objects.pictures import (
+    MADE,
     Box,
     Direction,
     Masks,
@@ -23,12 +31,16 @@ from neural_sim.objects.pictures import (
     SceneMaskMaker,
     box_of,
     check_masks,
+    given_mask,
+    mask_beside,
     mask_of,
+    refuse_size,
 )
 from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
 from neural_sim.objects.resampling import pixels_per_pixel, resample
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
-from neural_sim.ranges import Matching, Positive, validated
+from neural_sim.pictures import read_header, read_picture
+from neural_sim.ranges import Matching, NonNegativeInt, Positive, validated
 from neural_sim.types import PosedViews
 
 _log = logging.getLogger(__name__)
@@ -37,6 +49,23 @@ Up = (
     Literal["+x", "-x", "+y", "-y", "+z", "-z"]
     | Annotated[Direction, Matching(any, "three numbers, not all of them zero")]
 )
+
+
+class PoseFinder(Protocol):
+    """Finds the cameras of photographs."""
+
+    def find(
+        self,
+        album: Album,
+        mask: Callable[[Shot], Bool[np.ndarray, "_ _"] | None],
+        progress: bool = False,
+    ) -> FoundCapture:
+        """Return the cameras; ``mask`` says where a photograph shows the object, if anything does.
+
+        Raises:
+            ValueError: photographs whose cameras cannot be found.
+        """
+        ...
 
 
 class PoseCorrector(Protocol):
@@ -52,7 +81,7 @@ class Photos:
     """Captures of a folder; an object has the name of its folder.
 
     Args:
-        root: the folder of the objects' folders.
+        root: the folder of the objects' folders, or the folder of one object.
         names: objects to load; null: all.
         masks: source of the objects' masks, see :class:`Pictures`.
         up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by
@@ -62,12 +91,17 @@ class Photos:
         box: with ``masks="scene"``: two corners of a box about the object, along the axes of the capture's frame and in
             its unit, or a mapping by object's name; null: the object is looked for where the cameras look.
         scene: what computes masks where ``masks="scene"``.
-        poses: what corrects the cameras' poses; null: they stay as they are given.
+        refinement: what corrects the cameras' poses; null: they stay as they are.
         poor: what happens where a field does not show its object: nothing trains on it (``refuse``), or ``use``.
+        poses: what finds the cameras of photographs alone; null: they are given, by ``transforms.json`` or a model of
+            COLMAP's.
+        mask_command: with ``masks="command"``: see :class:`MaskCommand`.
+        mask_value: the object's value in masks that are images of labels, or a mapping by object's name.
 
     Raises:
         ValueError: a missing folder, one without captures, an unknown name, ``masks="scene"`` without ``scene``,
-            ``box`` without ``masks="scene"``, or a capture that its reader refuses.
+            ``box`` without ``masks="scene"``, ``masks="command"`` without a command, or a capture that its reader
+            refuses.
     """
 
     def __init__(
@@ -79,28 +113,58 @@ class Photos:
         size: Positive | Mapping[str, Positive | None] | None = None,
         box: Box | Mapping[str, Box | None] | None = None,
         scene: SceneMaskMaker | None = None,
-        poses: PoseCorrector | None = None,
+        refinement: PoseCorrector | None = None,
         poor: Literal["refuse", "use"] = "refuse",
+        poses: PoseFinder | None = None,
+        mask_command: str | None = None,
+        mask_value: NonNegativeInt | Mapping[str, NonNegativeInt | None] | None = None,
     ) -> None:
-        self.root = folder_of(root)
+        self.root, self.poses = folder_of(root), poses
         captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
-        self.up, self.size, self.box, self.scene, self.poses, self.poor = up, size, box, scene, poses, poor
+        self.up, self.size, self.box, self.scene, self.poor = up, size, box, scene, poor
+        self.refinement, self.mask_value = refinement, mask_value
         if masks == "scene" and scene is None:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
             raise ValueError(f"objects.box wants objects.masks=scene, got objects.masks={masks}")
-        for capture in self.captures.values():  # errors in a file are raised here, not in a later stage
-            if masks in ("auto", "files"):
-                check_masks(capture)
+        if (masks == "command") != (mask_command is not None):
+            raise ValueError(
+                f"objects.mask_command goes with objects.masks=command, got objects.masks={masks} and {mask_command!r}"
+            )
+        self.command = None if mask_command is None else MaskCommand(mask_command)
+        self._check()
+
+    def _check(self) -> None:
+        """Raise errors in files here, not in a later stage."""
+        if self.poses is None:
+            for capture in self.captures.values():
+                if self.masks in ("auto", "files"):
+                    check_masks(capture)
+            return
+        for album in self.albums.values():
+            for shot in album.shots:
+                file = mask_beside(shot.image, album.folder) if self.masks in ("auto", "files") else None
+                if file is not None:
+                    refuse_size(file, read_header(file).stored, shot.image, shot.size)
 
     def _found(self) -> dict[str, Path]:
-        """The captures' folders below the root, by the names of their objects."""
-        captures = {p.name: p for p in sorted(self.root.iterdir()) if p.is_dir() and is_capture(p)}
+        """The captures' folders by the names of their objects: those below the root, else the root itself."""
+        usable = is_capture if self.poses is None else has_photographs
+        below = [
+            p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
+        ]
+        captures = {p.name: p for p in below if usable(p)}
+        if not captures and usable(self.root):
+            return {self.root.resolve().name: self.root}
         if not captures:
+            if self.poses is not None:
+                raise ValueError(f"objects.root: {self.root} holds no photographs, nor a folder with any")
+            bare = any(has_photographs(p) for p in (self.root, *below))
             raise ValueError(
                 f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
+                + ("; objects/poses=colmap finds the cameras of photographs alone" if bare else "")
             )
         return captures
 
@@ -113,8 +177,61 @@ class Photos:
 
     @cached_property
     def captures(self) -> dict[str, Capture]:
-        """Frames and cameras by object; photographs are not read."""
+        """Frames and cameras by object. Given ones are read, without the photographs; others are found, in minutes."""
+        if self.poses is not None:
+            return {name: self.find(name).capture for name in self._folders}
         return {name: self._read(name) for name in self._folders}
+
+    @cached_property
+    def albums(self) -> dict[str, Album]:
+        """Photographs whose cameras are to be found, by object."""
+        return {name: read_album(folder, name) for name, folder in self._folders.items()}
+
+    def find(
+        self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None, progress: bool = False
+    ) -> FoundCapture:
+        """Find the cameras of an object's photographs.
+
+        Args:
+            name: of the object.
+            computed: its :meth:`command_masks`; None: they are computed now.
+            progress: whether to show a bar.
+
+        Raises:
+            ValueError: cameras that are given, or cannot be found.
+        """
+        if self.poses is None:
+            raise ValueError(f"objects/poses=given: the cameras of {name} are given")
+        album = self.albums[name]
+        made = self.command_masks(name) if computed is None else computed
+        by_image = dict(zip(self.images(name), made, strict=True)) if made else {}
+
+        def mask(shot: Shot) -> Bool[np.ndarray, "_ _"] | None:
+            if self.masks in MADE:
+                found = by_image.get(shot.image)
+            else:
+                file = mask_beside(shot.image, album.folder)
+                picture = read_picture(shot.image, upright=False)
+                found = given_mask(shot.image, file, picture, self.masks, self._value(name))
+            return None if found is None else found.numpy() > 0.5
+
+        return self.poses.find(album, mask, progress)
+
+    def with_cameras(self, captures: Iterable[Capture]) -> Photos:
+        """Return this source with captures whose cameras were found."""
+        made = copy.copy(self)
+        made.captures = {capture.name: capture for capture in captures}
+        return made
+
+    def images(self, name: str) -> tuple[Path, ...]:
+        """Return all photographs of an object."""
+        if self.poses is not None:
+            return tuple(shot.image for shot in self.albums[name].shots)
+        return tuple(frame.image for frame in self.captures[name].frames)
+
+    def command_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
+        """Return a mask for each of :meth:`images` where ``masks="command"``, else none."""
+        return () if self.command is None else self.command.masks(self.images(name), self._value(name))
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of each capture's files, masks included, and of the options that apply to it."""
@@ -152,10 +269,15 @@ class Photos:
         return self.scene.masks(self.captures[name], self._up(name), box_of(self.box, name))
 
     def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
-        """An object's photographs; ``computed`` are its :meth:`computed_masks`, None: they are computed now."""
-        return Pictures(
-            self.captures[name], self.masks, self.computed_masks(name) if computed is None else computed
-        )
+        """An object's photographs.
+
+        ``computed`` are its :meth:`command_masks` or :meth:`computed_masks`; None: they are computed now.
+        """
+        made = (self.command_masks(name) or self.computed_masks(name)) if computed is None else computed
+        if self.command is not None:
+            by_image = dict(zip(self.images(name), made, strict=True))
+            made = tuple(by_image[frame.image] for frame in self.captures[name].frames)
+        return Pictures(self.captures[name], self.masks, made, self._value(name))
 
     def placement(self, name: str, pictures: Pictures | None = None) -> Placement:
         """An object's pose and radius in its capture's frame."""
@@ -164,7 +286,7 @@ class Photos:
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
     ) -> PosedViews:
-        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`; then ``poses``."""
+        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`; then refined."""
         train, test = self.split(name, count, held_out)
         pictures = pictures or self.pictures(name)
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
@@ -173,7 +295,7 @@ class Photos:
             "%s: %d photographs train and %d score; a pixel of views.image_size=%d covers up to %.1f of theirs a side",
             name, len(train), len(test), image_size, finest,
         )  # fmt: skip
-        return views if self.poses is None else self.poses.refine(views, len(test))
+        return views if self.refinement is None else self.refinement.refine(views, len(test))
 
     def up_of(self, name: str) -> tuple[float, float, float]:
         """The up direction in an object's capture's frame: as set, else its file's, else the mean of the cameras'."""
@@ -198,22 +320,47 @@ class Photos:
         x, y, z = AXES[up] if isinstance(up, str) else up
         return float(x), float(y), float(z)
 
+    def _value(self, name: str) -> int | None:
+        return self.mask_value.get(name) if isinstance(self.mask_value, Mapping) else self.mask_value
+
     def _digest(self, name: str) -> str:
+        """Digest of the object's files and options, and of cameras that were found."""
         capture, folder = self.captures[name], self._folders[name]
-        read = () if self.masks == "scene" else capture.frames
-        masks = (mask_of(frame, capture.source) for frame in read)
-        files = dict.fromkeys([*capture.files, *(path for path in masks if path is not None)])
-        listed = {
-            str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path
-            for path in files
-        }
-        options = f"{self.masks} {self._up(name)} {box_of(self.box, name)} "
-        return content_digest({options: Path(), **listed})
+        masks = () if self.masks in MADE else (mask_of(frame, capture.source) for frame in capture.frames)
+        files = _named([*capture.files, *(path for path in masks if path is not None)], folder)
+        options = (
+            f"{self.masks} {self._up(name)} {box_of(self.box, name)} {self._value(name)} {self.command} "
+        )
+        if self.poses is not None:
+            options += "".join(f"{frame.camera_to_world.tolist()} {frame.lens}" for frame in capture.frames)
+        return content_digest({options: Path(), **files})
+
+    def found_digest(self, name: str) -> str:
+        """Digest of what found cameras depend on: the photographs, their masks, and how these are read."""
+        options = f"{self.masks} {self._value(name)} {self.command} "
+        return content_digest({options: Path(), **self._pictures_and_masks(name)})
+
+    def _pictures_and_masks(self, name: str) -> dict[str, Path]:
+        images, folder = self.images(name), self._folders[name]
+        beside = () if self.masks in MADE else (mask_beside(image, folder) for image in images)
+        return _named([*images, *(path for path in beside if path is not None)], folder)
+
+
+def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
+    """Files by their names in a folder; those elsewhere by their paths."""
+    return {
+        str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path for path in files
+    }
+
+
+def has_photographs(folder: Path) -> bool:
+    """Whether a folder holds pictures of its own, or in a folder ``images``."""
+    return bool(pictures_of(folder))
 
 
 def is_capture(folder: Path) -> bool:
     """Whether a folder has a capture's camera files."""
-    return has_transforms(folder) or model_folder(folder) is not None
+    return has_transforms(folder) or bool(model_folders(folder))
 
 
 def _spread(frames: list[Frame], count: int) -> list[Frame]:

@@ -18,7 +18,9 @@ from neural_sim.objects.capture import Capture, Frame
 from neural_sim.pictures import Size, alpha_of, by, read_header, read_mask, read_picture
 from neural_sim.ranges import Matching, validated
 
-Masks = Literal["auto", "alpha", "files", "scene"]
+Masks = Literal["auto", "alpha", "files", "scene", "command"]
+MADE = ("scene", "command")
+"""Masks that are computed before photographs are read."""
 Direction = tuple[float, float, float]
 Corners = tuple[Direction, Direction]
 """The lowest and the highest corner of a box along the axes of the capture's frame, in its unit."""
@@ -65,8 +67,8 @@ class Pictures:
 
     ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image of its name in a
     folder ``masks`` beside the images or beside the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
-    first of these that a frame has; ``scene``: ``computed``, a mask of any size for each of the capture's frames, in
-    their order.
+    first of these that a frame has; ``scene`` and ``command``: ``computed``, a mask of any size for each of the
+    capture's frames, in their order. In files of labels, ``value`` is the object's.
 
     Raises:
         ValueError: computed masks that are missing or too few; from :meth:`rgba`, a frame without a
@@ -76,9 +78,10 @@ class Pictures:
     capture: Capture
     masks: Masks = "auto"
     computed: tuple[Float[Tensor, "_ _"], ...] = ()
+    value: int | None = None
 
     def __post_init__(self) -> None:
-        wanted = len(self.capture.frames) if self.masks == "scene" else 0
+        wanted = len(self.capture.frames) if self.masks in MADE else 0
         if len(self.computed) != wanted:
             raise ValueError(
                 f"objects.masks={self.masks}: want {wanted} computed masks for the {len(self.capture.frames)} "
@@ -89,26 +92,41 @@ class Pictures:
         """Colour and mask of a frame: straight alpha, float32 in [0, 1]."""
         picture = read_picture(frame.image, upright=False)
         colours = _values(picture.convert("RGB"))
-        if self.masks == "scene":
+        if self.masks in MADE:
             number = next(i for i, other in enumerate(self.capture.frames) if other is frame)
-            mask = self.computed[number][None, None]
+            alpha = self.computed[number]
             size = (picture.height, picture.width)
-            alpha = functional.interpolate(mask, size, mode="bilinear", align_corners=False)[0, 0, :, :, None]
-            alpha = (0.5 + SHARPNESS * (alpha - 0.5)).clamp(0.0, 1.0)
-            return torch.cat([colours, alpha], -1)
-        file = mask_of(frame, self.capture.source) if self.masks != "alpha" else None
-        if file is not None:
-            mask = read_mask(file)
-            refuse_size(file, (mask.shape[1], mask.shape[0]), frame.image, picture.size)
-            return torch.cat([colours, torch.from_numpy(mask)[..., None]], -1)
-        own = alpha_of(picture) if self.masks != "files" else None
-        if own is None:
+            if alpha.shape != size:
+                alpha = functional.interpolate(alpha[None, None], size, mode="bilinear", align_corners=False)[
+                    0, 0
+                ]
+            if self.masks == "scene":
+                alpha = (0.5 + SHARPNESS * (alpha - 0.5)).clamp(0.0, 1.0)
+            return torch.cat([colours, alpha[:, :, None]], -1)
+        mask = given_mask(frame.image, mask_of(frame, self.capture.source), picture, self.masks, self.value)
+        if mask is None:
             raise ValueError(
                 f"{frame.image}: nothing says which of its pixels are the object's; want an alpha channel that "
                 f"is not opaque everywhere, a mask_path, or a mask of its name in a folder {FOLDER!r}; "
                 "objects.masks=scene finds masks without any"
             )
-        return torch.cat([colours, _values(own)[..., None]], -1)
+        return torch.cat([colours, mask[:, :, None]], -1)
+
+
+def given_mask(
+    image: Path, file: Path | None, picture: Image.Image, masks: Masks, value: int | None
+) -> Float[Tensor, "h w"] | None:
+    """Return a photograph's mask, from its ``file`` or its own alpha channel; None where there is none.
+
+    Raises:
+        ValueError: a file that is no mask of the photograph.
+    """
+    if file is not None and masks != "alpha":
+        mask = read_mask(file, value)
+        refuse_size(file, (mask.shape[1], mask.shape[0]), image, picture.size)
+        return torch.from_numpy(mask)
+    own = alpha_of(picture) if masks != "files" else None
+    return None if own is None else _values(own)
 
 
 def check_masks(capture: Capture) -> None:
@@ -126,10 +144,12 @@ def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
-    """The file of a frame's mask, None without one. COLMAP calls it ``image.jpg.png``, others ``image.png``."""
-    if frame.mask is not None:
-        return frame.mask
-    image = frame.image
+    """The file of a frame's mask, None without one."""
+    return frame.mask or mask_beside(frame.image, source)
+
+
+def mask_beside(image: Path, source: Path) -> Path | None:
+    """The file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``."""
     root = source if source.is_dir() else source.parent
     folders = dict.fromkeys([image.parent / FOLDER, image.parent.parent / FOLDER, root / FOLDER])
     for folder in folders:

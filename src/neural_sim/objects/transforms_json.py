@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.documents import read_json
-from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
+from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose, say_missing
 from neural_sim.pictures import Header, by, read_header
 
 _log = logging.getLogger(__name__)
@@ -32,11 +32,13 @@ def read_transforms(folder: Path, name: str) -> Capture:
     """The capture of a folder.
 
     It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` beside it, whose
-    frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's.
+    frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
+    image is missing are left out with a warning.
 
     Raises:
         ValueError: a file that is not readable or has no frames, a frame without a pose or with a matrix that is no
-            rotation, an image that is missing or whose size is not that of its intrinsics, an unknown camera model.
+            rotation, images that are all missing, one whose size is not that of its intrinsics, an unknown camera
+            model.
     """
     whole = (folder / NAMES[0]).is_file()
     sources = (
@@ -48,10 +50,13 @@ def read_transforms(folder: Path, name: str) -> Capture:
         document = _read(source)
         up = _up(document, source) or up
         held_out = source.name in NAMES[2:]
-        frames += [
+        read = [
             _frame(entry, number, document, source, held_out)
             for number, entry in enumerate(document["frames"])
         ]
+        missing = [frame for frame in read if isinstance(frame, str)]
+        say_missing(source, missing, len(read))
+        frames += [frame for frame in read if isinstance(frame, Frame)]
     files = [*sources, *(path for frame in frames for path in (frame.image, frame.mask) if path is not None)]
     return Capture(name, tuple(frames), sources[0], tuple(files), up)
 
@@ -132,7 +137,8 @@ def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] |
     return float(up[0]), float(up[1]), float(up[2])
 
 
-def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool) -> Frame:
+def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool) -> Frame | str:
+    """Return an entry's frame, or where its image is missing, that path as it is written."""
     where = f"{source}: frames[{number}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError(f"{where}: want a file_path, got {entry!r}")
@@ -140,7 +146,9 @@ def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, t
     if "transform_matrix" not in entry:
         raise ValueError(f"{where}: has no pose; want a transform_matrix")
     pose = checked_pose(entry["transform_matrix"], f"{where}: transform_matrix")
-    image = _image(source.parent / entry["file_path"], where)
+    image = _image(source.parent / entry["file_path"])
+    if image is None:
+        return entry["file_path"]
     lens = _lens({**document, **entry}, read_header(image, f"{where}: {image}"), where)
     mask = entry.get("mask_path")
     if mask is not None and not (source.parent / str(mask)).is_file():
@@ -149,12 +157,10 @@ def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, t
     return Frame(image, pose, lens, None if mask is None else source.parent / mask, held_out)
 
 
-def _image(path: Path, where: str) -> Path:
-    """The image's file; NeRF-synthetic omits the suffix."""
-    for candidate in (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES)):
-        if candidate.is_file():
-            return candidate
-    raise ValueError(f"{where}: no such image: {path}")
+def _image(path: Path) -> Path | None:
+    """The image's file, None without one; NeRF-synthetic omits the suffix."""
+    candidates = (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:

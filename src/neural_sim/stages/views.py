@@ -1,4 +1,4 @@
-"""The objects of a run, of meshes or of photographs, and stages ``masks`` and ``views``: what fields are fitted to."""
+"""The objects of a run, of meshes or of photographs, and stage ``views``: what fields are fitted to."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from neural_sim.field.base import RadianceField
 from neural_sim.field.quality import Placed
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.objects.photos import Photos, PoseCorrector
-from neural_sim.objects.pictures import SceneMaskMaker
 from neural_sim.objects.placing import upright
 from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.nerf import NerfRenderer
 from neural_sim.renderer.nerf_w import NerfWRenderer
 from neural_sim.renderer.rig import LightRig
 from neural_sim.renderer.views import Views, choose_mesh_renderer
+from neural_sim.stages.cameras import CommandMasksStage, MasksOfFrames, MasksStage, command_masks
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.store import from_bytes, to_bytes
 from neural_sim.synthesis.subjects import MeshSubject, PhotographedField, RenderedSubject
@@ -37,47 +37,6 @@ PHOTOGRAPH = 320
 """Pixels along a shown photograph's longer side, about."""
 DIMMED = 0.25
 """Brightness of what is not the object in a shown photograph."""
-MasksOfFrames = tuple[Float[Tensor, "_ _"], ...]
-
-
-@dataclass(frozen=True)
-class MasksStage(Stage[MasksOfFrames]):
-    """Masks of an object's photographs from the geometry of their scene, one a photograph.
-
-    The run's seed has no part in them, so that runs share masks.
-
-    Args:
-        object: its name.
-        content: digest of the capture's files and options.
-        scene: the source's, with its budget.
-        source: the captures.
-    """
-
-    phase: ClassVar[str] = "views"
-    kind: ClassVar[str] = "masks"
-    keep: ClassVar[bool] = False  # read once, by the views
-
-    object: str
-    content: str
-    scene: SceneMaskMaker
-    source: Photos = field(metadata=UNKEYED)
-
-    @property
-    @override
-    def title(self) -> str:
-        return f"masks of {self.object}"
-
-    @override
-    def make(self, results: Results) -> MasksOfFrames:
-        return self.source.computed_masks(self.object)
-
-    @override
-    def pack(self, value: MasksOfFrames) -> list[Tensor]:
-        return [to_bytes(mask) for mask in value]
-
-    @override
-    def unpack(self, stored: list[Tensor]) -> MasksOfFrames:
-        return tuple(from_bytes(mask) for mask in stored)
 
 
 @dataclass(frozen=True)
@@ -90,7 +49,7 @@ class ViewsStage(Stage[PosedViews]):
         settings: of the views; where they are photographs, only the counts and the image size apply.
         objects: all of the run.
         masks: of photographs, where they are computed.
-        poses: what corrects the poses of photographs.
+        refinement: what corrects the poses of photographs.
     """
 
     phase: ClassVar[str] = "views"
@@ -101,8 +60,8 @@ class ViewsStage(Stage[PosedViews]):
     content: str
     settings: Views
     objects: Objects = field(metadata=UNKEYED)
-    masks: MasksStage | None = None
-    poses: PoseCorrector | None = None
+    masks: MasksStage | CommandMasksStage | None = None
+    refinement: PoseCorrector | None = None
 
     @property
     @override
@@ -330,9 +289,10 @@ class Captures(Objects):
     @override
     def stage(self, name: str, settings: Views) -> ViewsStage:
         content, source = self.digests[name], self.source
-        maker = source.scene if source.masks == "scene" else None
-        masks = None if maker is None else MasksStage(name, content, maker, source)
-        return ViewsStage(name, content, settings, self, masks, source.poses)
+        masks = command_masks(source, name)
+        if source.masks == "scene" and source.scene is not None:
+            masks = MasksStage(name, content, source.scene, source)
+        return ViewsStage(name, content, settings, self, masks, source.refinement)
 
 
 def dimmed(rgba: Float[Tensor, "h w 4"]) -> Float[Tensor, "_ _ 3"]:

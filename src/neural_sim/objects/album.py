@@ -1,0 +1,136 @@
+"""Photographs whose cameras are not known yet: which files they are, and what their EXIF says of the camera."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import ExifTags
+
+from neural_sim.pictures import (
+    PHOTO_SUFFIXES,
+    Header,
+    Size,
+    picture_files,
+    read_exif,
+    read_header,
+    without_leftovers,
+)
+
+_log = logging.getLogger(__name__)
+
+FOLDER = "images"
+OTHER_FORMATS = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw")
+"""Formats of telephones and cameras that are not read."""
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+FILM_DIAGONAL = 43.27
+"""Millimetres of the 36 x 24 mm film that EXIF's equivalent focal length is of."""
+UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+"""Where the upright picture's up lies in the stored one (x to the right, y up), by EXIF orientation."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph: its header, and what took it.
+
+    ``focal`` is the focal length in pixels that EXIF says, None if it does not. Photographs of one ``camera`` share
+    their intrinsics.
+    """
+
+    image: Path
+    header: Header
+    camera: tuple[object, ...]
+    focal: float | None
+
+    @property
+    def size(self) -> Size:
+        """Width and height of the stored pixels."""
+        return self.header.stored
+
+    @property
+    def up(self) -> Float[np.ndarray, "3"]:
+        """The direction that EXIF says is up, in the camera's OpenGL frame."""
+        return np.array([*UP[self.header.orientation], 0.0])
+
+
+@dataclass(frozen=True)
+class Album:
+    """The photographs of an object, by name. ``folder`` is what their names are relative to."""
+
+    name: str
+    folder: Path
+    shots: tuple[Shot, ...]
+
+    def called(self, shot: Shot) -> str:
+        """Return a photograph's name in messages and results."""
+        return shot.image.relative_to(self.folder).as_posix()
+
+
+def pictures_of(folder: Path) -> list[Path]:
+    """Return the photographs of a capture's folder: all in ``images``, else those in the folder itself."""
+    if (folder / FOLDER).is_dir():
+        return picture_files(folder / FOLDER)
+    own = sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
+    )
+    return without_leftovers(own, folder)
+
+
+def read_album(folder: Path, name: str) -> Album:
+    """Return the photographs of a capture's folder by their headers.
+
+    Raises:
+        ValueError: a photograph that cannot be read, or a folder without any.
+    """
+    strange = [path.name for path in _files(folder) if path.suffix.lower() in OTHER_FORMATS]
+    if strange:
+        _log.warning(
+            "%s: %d files such as %s are of a format that is not read, and left out; convert them to JPEG",
+            folder, len(strange), strange[0],
+        )  # fmt: skip
+    pictures = pictures_of(folder)
+    if not pictures:
+        raise ValueError(f"{folder}: {_without_pictures(folder, strange)}")
+    return Album(name, folder, tuple(_shot(path) for path in pictures))
+
+
+def _files(folder: Path) -> list[Path]:
+    inner = folder / FOLDER
+    return sorted(path for path in (inner if inner.is_dir() else folder).iterdir() if path.is_file())
+
+
+def _without_pictures(folder: Path, strange: Sequence[str]) -> str:
+    videos = [path.name for path in _files(folder) if path.suffix.lower() in VIDEOS]
+    if videos:
+        return (
+            "holds a video and no photographs; take some 60 frames of it, such as two a second, with "
+            f"ffmpeg -i {videos[0]} -vf fps=2 -q:v 2 images/%04d.jpg"
+        )
+    return f"holds no photographs ({', '.join(PHOTO_SUFFIXES)})" + (
+        "; convert them to JPEG" if strange else ""
+    )
+
+
+def _shot(path: Path) -> Shot:
+    header = read_header(path)
+    known = read_exif(path)
+    tags = ExifTags.Base
+    camera = (
+        header.stored,
+        *(known.get(tag) for tag in (tags.Make, tags.Model, tags.LensModel, tags.FocalLength)),
+    )
+    equivalent = _number(known.get(tags.FocalLengthIn35mmFilm))
+    focal = equivalent * float(np.hypot(*header.stored)) / FILM_DIAGONAL if equivalent else None
+    return Shot(path, header, (*camera, equivalent), focal)
+
+
+def _number(value: object) -> float | None:
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if np.isfinite(number) and number > 0.0 else None

@@ -1,0 +1,162 @@
+"""Cameras that were found: how good they are, and why some or all were not found."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from neural_sim.objects.album import Album, Shot
+from neural_sim.objects.capture import Capture
+
+_log = logging.getLogger(__name__)
+
+LEAST = 8
+"""Fewest photographs of which an object can be made at all."""
+ONE_PLACE = 0.08
+"""Largest extent of the cameras, relative to the distance of what they show, that counts as one place."""
+TURNED_ALONE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
+"""COLMAP's names of pairs that a turn of the camera explains, without a step."""
+MOST_TURNS = 0.5
+"""Share of these pairs above which photographs are taken to come from one place."""
+POOR_ERROR = 1.5
+"""Pixels of the reduced photographs above which cameras are doubted; a good capture has 0.3 to 0.8."""
+FEW = 0.7
+"""Share of the photographs below which the missing ones are a warning with what to do."""
+NAMED = 12
+"""Most photographs that a message lists by name."""
+SIDEWAYS = 0.5
+"""By how much another of a camera's axes must fit the others' up better than its own, for a photograph on its side."""
+
+_OVERLAP = "let each photograph show two thirds of what the one before shows, and much texture, such as a printed sheet"
+
+
+@dataclass(frozen=True)
+class FoundCapture:
+    """A capture with found cameras.
+
+    Args:
+        capture: the photographs that have one.
+        error: mean distance between features and their points' projections, in pixels of the reduced photographs.
+        points: how many points the cameras were found from.
+        missing: names of the photographs without a camera.
+        apart: how many of these belong together in another group.
+        turning: whether the room stands still in the photographs while the object turns.
+    """
+
+    capture: Capture
+    error: float
+    points: int
+    missing: tuple[str, ...] = ()
+    apart: int = 0
+    turning: bool = False
+
+    def tell(self) -> None:
+        """Log what was found and what was left out."""
+        name, known = self.capture.name, len(self.capture.frames)
+        total = known + len(self.missing)
+        _log.info(
+            "%s: cameras of %d of %d photographs found from %d points, mean error %.2f pixels",
+            name, known, total, self.points, self.error,
+        )  # fmt: skip
+        if self.missing:
+            advice = f"; {_OVERLAP}" if known < FEW * total else ""
+            apart = f"; {self.apart} of them fit together, but to none of the others" if self.apart else ""
+            _log.warning(
+                "%s: no camera found for %d photographs, which are left out: %s%s%s",
+                name, len(self.missing), listed(self.missing), apart, advice,
+            )  # fmt: skip
+        if self.error > POOR_ERROR:
+            _log.warning(
+                "%s: the cameras fit the photographs by %.2f pixels only: did the object or the room move, or is the "
+                "picture stabilised or zoomed?", name, self.error,
+            )  # fmt: skip
+        if self.turning:
+            _log.warning(
+                "%s: the room stands still in the photographs while the object turns: cameras are relative to the "
+                "object, and the room is of no use; want masks (objects.masks=files or command), objects.masks=scene "
+                "cannot find them", name,
+            )  # fmt: skip
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in words, of many the first."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def judged(
+    album: Album,
+    models: Sequence[tuple[Any, Capture]],
+    verified: Mapping[tuple[int, int], tuple[str, int]],
+    turning: bool,
+) -> FoundCapture:
+    """Return the largest of COLMAP's models, if an object can be made of it.
+
+    Args:
+        album: the photographs.
+        models: COLMAP's, the largest first, each with its capture.
+        verified: pairs of photographs that a motion explains: the kind of motion, and how many matches.
+        turning: see :class:`FoundCapture`.
+
+    Raises:
+        ValueError: too few photographs that belong together, or photographs from one place, with what to do.
+    """
+    total = len(album.shots)
+    if not models or len(models[0][1].frames) < LEAST:
+        count = len(models[0][1].frames) if models else 0
+        raise ValueError(f"{album.folder}: {_why_not(verified, count, total)}")
+    model, capture = models[0]
+    extent = _extent(model, capture)
+    if extent < ONE_PLACE:
+        raise ValueError(
+            f"{album.folder}: the photographs are taken from nearly one place (within {100.0 * extent:.1f} % of the "
+            "distance to what they show); walk round the object, a step between photographs"
+        )
+    known = {frame.image for frame in capture.frames}
+    missing = tuple(album.called(shot) for shot in album.shots if shot.image not in known)
+    apart = len({frame.image for _, other in models[1:2] for frame in other.frames} - known)
+    error = float(model.compute_mean_reprojection_error())
+    return FoundCapture(capture, error, model.num_points3D(), missing, apart, turning)
+
+
+def _why_not(verified: Mapping[tuple[int, int], tuple[str, int]], count: int, total: int) -> str:
+    """Return why no cameras were found, and what to do."""
+    if not verified:
+        return f"no two of {total} photographs show enough of one place to find cameras; {_OVERLAP}"
+    kinds = Counter(kind for kind, _ in verified.values())
+    if sum(kinds[kind] for kind in TURNED_ALONE) > MOST_TURNS * len(verified):
+        return "the photographs are taken from one place; walk round the object, a step between photographs"
+    return f"only {count} of {total} photographs fit together, want at least {LEAST}; {_OVERLAP}"
+
+
+def _extent(model: Any, capture: Capture) -> float:
+    """Return the largest distance of a camera from their middle, in median distances of what they show."""
+    centres = np.stack([frame.camera_to_world[:3, 3] for frame in capture.frames])
+    points = np.array([point.xyz for point in model.points3D.values()])
+    away = np.median(np.linalg.norm(points - centres.mean(0), axis=1))
+    return float(np.linalg.norm(centres - centres.mean(0), axis=1).max() / max(away, 1e-12))
+
+
+def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple[float, float, float]:
+    """Return the direction that is up in most photographs, in the capture's frame.
+
+    A photograph that lies on its side, and whose EXIF does not say so, counts by the axis that fits the others.
+    """
+    own = np.stack([pose[:3, :3] @ shot.up for pose, shot in zip(poses, shots, strict=True)])
+    axes = np.concatenate([poses[:, :3, :2], -poses[:, :3, :2]], -1)  # right, up, left, down of each camera
+    chosen = own
+    for _ in range(8):
+        mean = chosen.mean(0)
+        mean /= max(float(np.linalg.norm(mean)), 1e-12)
+        fits = np.einsum("nik,i->nk", axes, mean)
+        best = np.take_along_axis(axes, fits.argmax(1)[:, None, None], 2)[:, :, 0]
+        turned = fits.max(1) > own @ mean + SIDEWAYS
+        chosen = np.where(turned[:, None], best, own)
+    x, y, z = chosen.mean(0).tolist()
+    return x, y, z

@@ -1,0 +1,96 @@
+"""Masks by another program: it is given a folder of photographs, and writes one mask for each into another."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neural_sim.objects.pictures import refuse_size
+from neural_sim.pictures import picture_files, read_mask, read_picture
+
+PLACES = ("{images}", "{masks}")
+KEY = "objects.mask_command"
+
+
+@dataclass(frozen=True)
+class MaskCommand:
+    """A command line that writes masks, such as ``rembg p -om {images} {masks}``.
+
+    ``{images}`` becomes a folder of photographs, as PNG without EXIF, and ``{masks}`` an empty one. A mask has its
+    photograph's name, or begins with it. The line is not read by a shell.
+
+    Raises:
+        ValueError: a line without the two folders, or a program that is not installed.
+    """
+
+    command: str
+
+    def __post_init__(self) -> None:
+        missing = [place for place in PLACES if place not in self.command]
+        if missing:
+            raise ValueError(
+                f"{KEY}: want {' and '.join(PLACES)} in it, got {self.command!r} without {missing[0]}"
+            )
+        program = self._words("", "")[0]
+        if shutil.which(program) is None:
+            raise ValueError(f"{KEY}: no such program: {program}")
+
+    def masks(self, images: Sequence[Path], value: int | None = None) -> tuple[Float[Tensor, "_ _"], ...]:
+        """Return the program's masks of photographs; in an image of labels, ``value`` is the object's.
+
+        Raises:
+            ValueError: a program that fails, a photograph without a mask, or a mask that cannot be read.
+        """
+        with tempfile.TemporaryDirectory(prefix="neural-sim-") as place:
+            given, made = Path(place) / "images", Path(place) / "masks"
+            given.mkdir()
+            made.mkdir()
+            for number, image in enumerate(images):
+                read_picture(image, upright=False).convert("RGB").save(
+                    given / f"{number:05d}.png", compress_level=1
+                )
+            self._run(given, made)
+            written = picture_files(made)
+            return tuple(self._mask(number, image, written, value) for number, image in enumerate(images))
+
+    def _words(self, images: str, masks: str) -> list[str]:
+        try:
+            words = shlex.split(self.command)
+        except ValueError as error:
+            raise ValueError(f"{KEY}: {error}, got {self.command!r}") from error
+        return [word.replace(PLACES[0], images).replace(PLACES[1], masks) for word in words]
+
+    def _run(self, images: Path, masks: Path) -> None:
+        done = subprocess.run(
+            self._words(str(images), str(masks)),
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if done.returncode:
+            said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+            last = said[-1].strip() if said else "it said nothing"
+            raise ValueError(f"{KEY}: {self.command!r} ended with status {done.returncode}: {last}")
+
+    def _mask(
+        self, number: int, image: Path, written: Sequence[Path], value: int | None
+    ) -> Float[Tensor, "_ _"]:
+        own = [path for path in written if path.name.startswith(f"{number:05d}")]
+        if len(own) != 1:
+            raise ValueError(
+                f"{KEY}: {self.command!r} wrote {len(own)} masks named {number:05d}*, want one, that of {image}; "
+                f"it wrote {len(written)} pictures"
+            )
+        mask = read_mask(own[0], value)
+        refuse_size(own[0], (mask.shape[1], mask.shape[0]), image, read_picture(image, upright=False).size)
+        return torch.from_numpy(mask)
