@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from neural_sim.field.scene.surface import SeenSurface
 SHOWS = 0.4
 """Smallest contribution of a cell to some pixel with which it counts as solid."""
 HITS = 2
-"""Rays that end in a cell from which on it counts as solid: a blurred surface contributes less, cell by cell."""
+"""Least rays that end in a cell which counts as solid: cell by cell, a blurred surface contributes less."""
 REACH = 1.5
 """The object lies inside the ball of this radius in the normalised frame."""
 LARGE = 0.1
@@ -82,16 +83,20 @@ def connected_region(
     """What is connected and nearest to the origin, None where nothing is. ``within``, where it is given, holds the
     object and little else: all that is solid there is taken.
     """
-    solid = ((surface.largest > SHOWS) | (surface.hits >= HITS)) & _allowed(grid, plane, APART)
+    shows, allowed = surface.largest > SHOWS, _allowed(grid, plane, APART)
     if within is not None:
-        solid &= within
+        solid = (shows | (surface.hits >= HITS)) & allowed & within
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
-    reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
-    if reach is None:
-        return None
-    return enclosed(grid, _nearest_part(solid & (distance < reach), centres, grid.resolution), plane)
+    # Large cells, and fields of few steps, have ends of rays in the air, too: more rays must then end in what is solid.
+    for least in (HITS, 2 * HITS, 4 * HITS, 8 * HITS, math.inf):
+        solid = (shows | (surface.hits >= least)) & allowed
+        reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
+        if reach is not None:
+            part = _nearest_part(solid & (distance < reach), centres, grid.resolution)
+            return enclosed(grid, part, plane)
+    return None
 
 
 def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
