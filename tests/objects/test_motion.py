@@ -131,7 +131,15 @@ def test_cameras_are_those_that_took_the_photographs(walk, found):
     assert apart < 0.02 and degrees < 1.0
     # Upright photographs, others on their side by EXIF: up is up.
     up = rotation @ np.array(found.capture.up)
-    assert up[2] / np.linalg.norm(up) > 0.75
+    assert up[2] / np.linalg.norm(up) > 0.99
+
+
+def test_found_cameras_stand_round_the_origin_on_the_side_of_x(found):
+    places = np.stack([frame.camera_to_world[:3, 3] for frame in found.capture.frames])
+    assert np.median(np.linalg.norm(places, axis=1)) == pytest.approx(1.0)
+    across = places[:, :2] / np.linalg.norm(places[:, :2], axis=1, keepdims=True)
+    assert np.arctan2(*across.mean(0)[::-1]) == pytest.approx(0.0, abs=1e-9) and (places[:, 2] > 0.3).all()
+    assert found.capture.up == (0.0, 0.0, 1.0)
 
 
 def test_photographs_of_one_camera_share_its_lens_at_their_own_size(found):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from neural_sim.objects.album import Album, Shot
 from neural_sim.objects.capture import Capture
+from neural_sim.objects.placing import mean_up, nearest_to_axes, upright
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +31,10 @@ FEW = 0.7
 """Share of the photographs below which the missing ones are a warning with what to do."""
 NAMED = 12
 """Most photographs that a message lists by name."""
+ONE_SIDED = 0.2
+"""Length of the mean of the cameras' horizontal directions above which they are on one side; all round, it is 0."""
+LEVEL = 0.1
+"""Root mean square of the horizontal axes' second direction, above which they say what is up."""
 SIDEWAYS = 0.5
 """By how much another of a camera's axes must fit the others' up better than its own, for a photograph on its side."""
 
@@ -118,6 +123,7 @@ def judged(
             f"{album.folder}: the photographs are taken from nearly one place (within {100.0 * extent:.1f} % of the "
             "distance to what they show); walk round the object, a step between photographs"
         )
+    capture = in_own_frame(capture)
     known = {frame.image for frame in capture.frames}
     missing = tuple(album.called(shot) for shot in album.shots if shot.image not in known)
     apart = len({frame.image for _, other in models[1:2] for frame in other.frames} - known)
@@ -146,7 +152,9 @@ def _extent(model: Any, capture: Capture) -> float:
 def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple[float, float, float]:
     """Return the direction that is up in most photographs, in the capture's frame.
 
-    A photograph that lies on its side, and whose EXIF does not say so, counts by the axis that fits the others.
+    It is across of all pictures' horizontal axes, for people hold cameras level and look down; where these are nearly
+    one axis, the mean of the pictures' own ups. A photograph that lies on its side, and whose EXIF does not say so,
+    counts by the axis that fits the others.
     """
     own = np.stack([pose[:3, :3] @ shot.up for pose, shot in zip(poses, shots, strict=True)])
     axes = np.concatenate([poses[:, :3, :2], -poses[:, :3, :2]], -1)  # right, up, left, down of each camera
@@ -158,5 +166,33 @@ def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple
         best = np.take_along_axis(axes, fits.argmax(1)[:, None, None], 2)[:, :, 0]
         turned = fits.max(1) > own @ mean + SIDEWAYS
         chosen = np.where(turned[:, None], best, own)
-    x, y, z = chosen.mean(0).tolist()
+    mean = chosen.mean(0)
+    spread, axes = np.linalg.svd(np.cross(chosen, poses[:, :3, 2]))[1:]
+    if spread[1] > LEVEL * np.sqrt(len(poses)):
+        mean = axes[2] * np.sign(axes[2] @ mean)
+    x, y, z = mean.tolist()
     return x, y, z
+
+
+def in_own_frame(capture: Capture) -> Capture:
+    """Return a capture in a frame that means something, where COLMAP's is arbitrary.
+
+    +z is up, the origin is where the cameras look, their median distance is 1, and they are on the side of +x, by their
+    mean or, all round, by the first.
+    """
+    poses = np.stack([frame.camera_to_world for frame in capture.frames])
+    up = np.array(capture.up if capture.up is not None else mean_up(capture))
+    turn, centre = upright(up, capture.name), nearest_to_axes(poses)
+    places = (poses[:, :3, 3] - centre) @ turn.T
+    scale = 1.0 / max(float(np.median(np.linalg.norm(places, axis=1))), 1e-12)
+    across = places[:, :2] / np.linalg.norm(places[:, :2], axis=1, keepdims=True).clip(1e-12)
+    ahead = across.mean(0) if np.linalg.norm(across.mean(0)) > ONE_SIDED else across[0]
+    angle = float(np.arctan2(ahead[1], ahead[0]))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ turn
+    frames = []
+    for frame, pose in zip(capture.frames, poses, strict=True):
+        moved = np.eye(4)
+        moved[:3, :3], moved[:3, 3] = turn @ pose[:3, :3], scale * turn @ (pose[:3, 3] - centre)
+        frames.append(replace(frame, camera_to_world=moved))
+    return replace(capture, frames=tuple(frames), up=(0.0, 0.0, 1.0))

@@ -169,26 +169,28 @@ class _Search:
         groups: dict[object, list[int]] = {}
         for number, shot in enumerate(self.album.shots):
             groups.setdefault(shot.camera, []).append(number)
+        with self._open(pycolmap):
+            pass  # an empty file, which is wanted below
         for numbers in groups.values():
-            camera = -1
-            for begin in range(0, len(numbers), BATCH):
-                batch = numbers[begin : begin + BATCH]
-                reader = pycolmap.ImageReaderOptions()
-                reader.existing_camera_id = camera
-                if masked:
-                    reader.mask_path = str(self.place / "masks")
-                shot = self.album.shots[batch[0]]
-                if shot.focal is not None and camera < 0:
-                    width, height = self._reduced(shot)
-                    focal = shot.focal * width / shot.size[0]
-                    reader.camera_params = f"{focal},{0.5 * width},{0.5 * height},0"
-                pycolmap.extract_features(
-                    self.database, self.place / "images", [_file(number) for number in batch],
-                    pycolmap.CameraMode.SINGLE, reader, options,
-                )  # fmt: skip
-                with self._open(pycolmap) as database:
-                    camera = database.read_image_with_name(_file(batch[0])).camera_id
-                bar.update(len(batch))
+            reader, shot = pycolmap.ImageReaderOptions(), self.album.shots[numbers[0]]
+            if shot.focal is not None:
+                width, height = self._reduced(shot)
+                focal = shot.focal * width / shot.size[0]
+                reader.camera_params = f"{focal},{0.5 * width},{0.5 * height},0"
+            # Here photographs get their numbers, in their order; the threads of the extraction have none.
+            pycolmap.import_images(
+                self.database, self.place / "images", pycolmap.CameraMode.SINGLE,
+                [_file(number) for number in numbers], reader,
+            )  # fmt: skip
+        reader = pycolmap.ImageReaderOptions()
+        if masked:
+            reader.mask_path = str(self.place / "masks")
+        for begin in range(0, len(self.album.shots), BATCH):
+            batch = [_file(number) for number in range(begin, min(begin + BATCH, len(self.album.shots)))]
+            pycolmap.extract_features(
+                self.database, self.place / "images", batch, pycolmap.CameraMode.AUTO, reader, options
+            )
+            bar.update(len(batch))
 
     @contextmanager
     def _open(self, pycolmap: Any) -> Iterator[Any]:
