@@ -17,8 +17,9 @@ from neural_sim.parameter.distributions import project_simplex
 # The softmax of a logit at its lowest (:func:`bounded`), in floors: there p is within this fraction of the floor.
 LOWEST = 0.25
 # The logit of a bin that nothing may be drawn from, such as one that no photograph of the object shows. Its p is 0 and
-# has no floor; no step of some logits brings it back.
-CLOSED = -1e4
+# has no floor; no step of some logits brings it back. Far below what steps reach, so that no low logit is taken for
+# one, and not so far that it takes the digits of others in a mean.
+CLOSED = -1e9
 
 
 @dataclass(frozen=True)

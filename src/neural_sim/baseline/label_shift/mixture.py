@@ -2,7 +2,7 @@
 
 A classifier trained on renders of equally frequent cells c (a bin of every factor) gives the posterior q(c | x) of a
 box x, in proportion to the likelihood p(x | c). Boxes of the target are a mixture p(x) = sum_c p_c p(x | c), whose
-maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 2002, Eq. 2.10)
+maximum-likelihood p is the fixed point of (Saerens, Latinne and Decaestecker 2002, equation 2.10)
 
     p_c <- mean_n r_n(c),    r_n(c) = p_c q(c | x_n) / sum_d p_d q(d | x_n).
 
