@@ -18,7 +18,7 @@ from neural_sim.report.tracking import tracking_uri
 from neural_sim.tasks.walk import PHASES
 
 CONF = program.conf_directory()
-FILES = ("json", "md", "png", "py", "yaml", "db", "pt", "safetensors")
+FILES = ("json", "md", "html", "png", "py", "yaml", "db", "pt", "safetensors")
 
 
 @pytest.fixture(scope="module")

@@ -170,7 +170,7 @@ class MeshFiles:
         self,
         root: Path,
         files: dict[str, Path],
-        names: list[str] | None,
+        names: Sequence[Any] | None,
         aliases: dict[str, str],
         wanted: str,
     ) -> None:
