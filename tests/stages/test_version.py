@@ -105,17 +105,27 @@ def modules():
 def test_touching_any_module_that_a_stage_imports_changes_its_version_and_no_other_does(
     tmp_path, stage, modules
 ):
+    """The modules that a stage imports are shared out among the stages, since each costs a version."""
     copy = tmp_path / PACKAGE
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns("__pycache__"))
     name = f"{PACKAGE}.stages.{stage}"
     imported = closure([name])
     before = code_version([name], copy)
-    for module, path in modules.items():
-        place = copy / path.relative_to(ROOT)
-        text = place.read_text()
-        place.write_text(text + "\n_TOUCHED = 1\n")
-        assert (code_version([name], copy) != before) == (module in imported), module
-        place.write_text(text)
+
+    def version_with(*touched):
+        texts = {copy / modules[module].relative_to(ROOT): None for module in touched}
+        for place in texts:
+            texts[place] = place.read_text()
+            place.write_text(texts[place] + "\n_TOUCHED = 1\n")
+        version = code_version([name], copy)
+        for place, text in texts.items():
+            place.write_text(text)
+        return version
+
+    assert version_with(*(module for module in modules if module not in imported)) == before
+    for module in sorted(imported & modules.keys())[STAGES.index(stage) :: len(STAGES)]:
+        assert version_with(module) != before, module
+    assert version_with() == before
 
 
 @pytest.mark.parametrize("stage", ["views", "psi"])  # a process each
