@@ -221,7 +221,8 @@ class _Search:
     def _map(self, pycolmap: Any, standing: bool, bar: Any) -> list[Any]:
         """Return COLMAP's models, the largest first."""
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed, options.extract_colors = _threads(), SEED, False
+        # One thread: the sums of several are rounded by who comes first, and equal photographs must have equal cameras.
+        options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
         options.min_model_size, options.max_num_models = 3, 5
         # A turning object fills a small part of the photographs, which says little of the lens.
         lens = not (standing and all(shot.focal for shot in self.album.shots))
