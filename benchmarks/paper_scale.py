@@ -1,4 +1,4 @@
-"""What `+experiment=pose_bin1_ycb +variant=paper scale=paper` would take: `python benchmarks/paper_scale.py`.
+"""Estimate the cost of `+experiment=pose_bin1_ycb +variant=paper scale=paper`: `python benchmarks/paper_scale.py`.
 
 It measures the processor seconds of a part of each kind of work, rays of the paper's network and images of its
 RetinaNet at 256 pixels, and multiplies them with the counts of the configuration.

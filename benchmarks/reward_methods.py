@@ -1,4 +1,4 @@
-"""What methods that learn from rewards make of a reward without images: ``python benchmarks/reward_methods.py``.
+"""Compare methods that learn from rewards on a simulated reward: ``python benchmarks/reward_methods.py``.
 
 As in pose_gap, two of six objects begin at another bin than their target's. An object's score is concave in the
 probabilities of its target's bins, and trainings scatter as they do at scale=quick. The table has the mean score that

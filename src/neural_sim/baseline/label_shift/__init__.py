@@ -1,1 +1,1 @@
-"""What the target shows: psi read off the target's boxes by label shift, without training a detector."""
+"""Estimate psi from the target's labelled boxes by label shift, without training a detector."""

@@ -34,7 +34,7 @@ Groups = Mapping[str, Mapping[str, Sequence[Sequence[int]]]]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the target shows.
+    """The distributions that the target's boxes show.
 
     Attributes:
         factors: object by object, each factor of psi.
@@ -52,7 +52,7 @@ class Estimate:
 
     @property
     def sentences(self) -> list[str]:
-        """What the target shows, for people."""
+        """A sentence for each object and factor, for the console and the pages."""
         return [one.sentence for one in self.factors]
 
 

@@ -1,4 +1,4 @@
-"""What a target shows of one object and factor, and how far that can be trusted."""
+"""The estimate of one object's factor, with the evidence for it."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class FactorEstimate:
 
     @property
     def sentence(self) -> str:
-        """What the target shows, for people."""
+        """A sentence that says what the target shows, for the console and the pages."""
         if self.finding == "too few boxes":
             return f"{self.name}: {self.boxes} boxes are too few to read its {self.factor} off"
         if self.finding == "fits no render":

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 Probabilities = tuple[Float[Tensor, "*batch k"], ...]
-"""Of every factor's bins."""
+"""The probabilities of every factor's bins."""
 
 
 class Status(enum.Enum):

@@ -51,7 +51,7 @@ class PerObject(nn.Module):
 
 
 class BinNetwork(nn.Module):
-    """From a crop, its box and its object to logits of the cells and weights of the lights.
+    """A network from a crop, its box and its object to logits of the cells and weights of the lights.
 
     Convolutions are common to all objects; each scales and shifts their last features, reads its boxes by a layer of
     its own and ends in one.
@@ -148,7 +148,7 @@ class Fitting:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a network says of crops: logits of the cells, guesses of the lights' weights, features behind both."""
+    """A network's outputs on crops: logits of the cells, guesses of the lights' weights, features behind both."""
 
     logits: Float[Tensor, "n cells"]
     weights: Float[Tensor, "n lights"]
