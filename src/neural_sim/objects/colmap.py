@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ _log = logging.getLogger(__name__)
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
 """Where models lie, the likelier first. COLMAP numbers several (``sparse/0``, ``sparse/1``), of which the one with the
 most photographs is taken."""
+PLACES = ("images", "input")
+"""Where photographs lie, ``input`` being that of 3D Gaussian splatting's tools; else in the folder itself."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {
@@ -45,7 +49,7 @@ def model_folders(folder: Path) -> list[Path]:
 
 
 def read_colmap(folder: Path, name: str) -> Capture:
-    """The capture of a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images``.
+    """The capture of a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images`` (or ``input``).
 
     Raises:
         ValueError: a model that pycolmap cannot read (such as one of another version) or without posed images, an
@@ -70,8 +74,7 @@ def read_colmap(folder: Path, name: str) -> Capture:
     unposed = len(read.images) - len(with_pose)
     if unposed:
         _log.warning("%s: %d photographs have no pose and are left out", model, unposed)
-    images = folder / "images"
-    place = images if images.is_dir() else folder
+    place = next((folder / name for name in PLACES if (folder / name).is_dir()), folder)
     have = {number: (place / image.name).is_file() for number, image in with_pose.items()}
     missing = sorted(str(place / image.name) for number, image in with_pose.items() if not have[number])
     say_missing(model, missing, len(with_pose))
@@ -87,12 +90,43 @@ def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
         import pycolmap
 
     try:
-        read = pycolmap.Reconstruction(str(folder))
+        read = _reconstruction(folder)
         return read, {number: image for number, image in read.images.items() if image.has_pose}
     except Exception as error:  # pycolmap raises whatever its C++ checks raise
+        reason = " ".join(str(error).split())
         raise ValueError(
-            f"{folder}: pycolmap {pycolmap.__version__} cannot read this model: {error}"
+            f"{folder}: pycolmap {pycolmap.__version__} cannot read this model: {reason}"
         ) from error
+
+
+def _reconstruction(folder: Path) -> Any:
+    """Read a model; a file of points, which nothing here needs, may be missing."""
+    import pycolmap
+
+    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    if (folder / f"points3D{suffix}").is_file():
+        read = pycolmap.Reconstruction(str(folder))
+    else:
+        with TemporaryDirectory() as made:
+            for file in folder.glob(f"*{suffix}"):
+                shutil.copy(file, made)
+            (Path(made) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+            read = pycolmap.Reconstruction(made)
+    if suffix == ".txt":
+        for number, name in _names(folder / "images.txt").items():
+            read.images[number].name = name
+    return read
+
+
+def _names(path: Path) -> dict[int, str]:
+    """Return the names of a text model's images, whole: pycolmap ends them at their first space."""
+    names, lines = {}, iter(path.read_text(encoding="utf-8-sig").split("\n"))
+    for line in lines:
+        words = line.strip().split(None, 9)
+        if words and not words[0].startswith("#"):
+            names[int(words[0])] = words[9]
+            next(lines, None)  # the image's points
+    return names
 
 
 def _frame(image: Any, read: Any, folder: Path, model: Path) -> Frame:

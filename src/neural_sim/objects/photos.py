@@ -34,6 +34,7 @@ from neural_sim.objects.pictures import (
     given_mask,
     mask_beside,
     mask_of,
+    refuse_shared,
     refuse_size,
 )
 from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
@@ -144,10 +145,12 @@ class Photos:
                     check_masks(capture)
             return
         for album in self.albums.values():
+            found: dict[Path, Path] = {}
             for shot in album.shots:
                 file = mask_beside(shot.image, album.folder) if self.masks in ("auto", "files") else None
                 if file is not None:
                     refuse_size(file, read_header(file).stored, shot.image, shot.size)
+                    refuse_shared(found, file, shot.image)
 
     def _found(self) -> dict[str, Path]:
         """The captures' folders by the names of their objects: those below the root, else the root itself."""

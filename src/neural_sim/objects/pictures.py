@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,11 +131,30 @@ def given_mask(
 
 
 def check_masks(capture: Capture) -> None:
-    """Raise ``ValueError`` for a file of masks that is no picture by its header, or not of its photograph's size."""
+    """Check the files of a capture's masks by their headers.
+
+    Raises:
+        ValueError: a file that is no picture or not of its photograph's size, or one of a folder of masks that several
+            photographs would have.
+    """
+    found: dict[Path, Path] = {}
     for frame in capture.frames:
         file = mask_of(frame, capture.source)
-        if file is not None:
-            refuse_size(file, read_header(file).stored, frame.image, (frame.lens.width, frame.lens.height))
+        if file is None:
+            continue
+        refuse_size(file, read_header(file).stored, frame.image, (frame.lens.width, frame.lens.height))
+        if frame.mask is None:
+            refuse_shared(found, file, frame.image)
+
+
+def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
+    """Note whose mask a file is in ``found``. Raises ``ValueError`` where it is another photograph's already."""
+    other = found.setdefault(file, image)
+    if other != image:
+        raise ValueError(
+            f"{file}: is by its name the mask of {other} and of {image}; want one in {FOLDER!r} for each, below the "
+            f"same folders as the photographs, such as {image.parent.name}/{image.name}.png"
+        )
 
 
 def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
@@ -149,13 +169,21 @@ def mask_of(frame: Frame, source: Path) -> Path | None:
 
 
 def mask_beside(image: Path, source: Path) -> Path | None:
-    """The file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``."""
-    root = source if source.is_dir() else source.parent
-    folders = dict.fromkeys([image.parent / FOLDER, image.parent.parent / FOLDER, root / FOLDER])
-    for folder in folders:
-        for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
-            if (folder / name).is_file():
-                return folder / name
+    """The file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``.
+
+    The folder lies beside the image or beside one of the folders about it, up to the one that holds ``source`` too. In
+    it, a mask may lie below the same folders as its image.
+    """
+    whole = os.path.abspath(image.parent)
+    home = os.path.commonpath([whole, os.path.abspath(source if source.is_dir() else source.parent)])
+    levels = len(Path(whole).parts) - len(Path(home).parts) + 1
+    for folder in [image.parent, *image.parent.parents][: max(2, levels)]:
+        below = image.parent.relative_to(folder)
+        inner = [below, Path(*below.parts[1:]), Path()]  # without the folder of images, and by the name alone
+        for part in dict.fromkeys(inner):
+            for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
+                if (folder / FOLDER / part / name).is_file():
+                    return folder / FOLDER / part / name
     return None
 
 

@@ -19,6 +19,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
 PARTS = ("train", "val", "test")
 HELD_OUT = "held out"
 """Key under which the files of frames that score are kept beside what the file says."""
+POSE = "transform_matrix"
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
@@ -33,7 +34,7 @@ def read_transforms(folder: Path, name: str) -> Capture:
 
     It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` beside it, whose
     frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
-    image is missing are left out with a warning.
+    image is missing or whose pose is null are left out with a warning.
 
     Raises:
         ValueError: a file that is not readable or has no frames, a frame without a pose or with a matrix that is no
@@ -54,9 +55,14 @@ def read_transforms(folder: Path, name: str) -> Capture:
             _frame(entry, number, document, source, held_out)
             for number, entry in enumerate(document["frames"])
         ]
+        unposed = [frame for frame in read if frame is None]
+        if unposed:
+            _log.warning("%s: %d photographs have no pose and are left out", source, len(unposed))
         missing = [frame for frame in read if isinstance(frame, str)]
-        say_missing(source, missing, len(read))
+        say_missing(source, missing, len(read) - len(unposed))
         frames += [frame for frame in read if isinstance(frame, Frame)]
+    if not frames:
+        raise ValueError(f"{sources[0]}: holds no photograph with a pose")
     files = [*sources, *(path for frame in frames for path in (frame.image, frame.mask) if path is not None)]
     return Capture(name, tuple(frames), sources[0], tuple(files), up)
 
@@ -90,7 +96,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
     for entry in document["frames"]:
         own = entry
         if isinstance(entry, dict):
-            own = {key: value for key, value in entry.items() if value is not None}
+            own = {key: value for key, value in entry.items() if value is not None or key == POSE}
             own = own if any(key in own for key in FOCAL) else {**focal, **own}
         frames.append(own)
     return {**common, "frames": frames}
@@ -137,15 +143,19 @@ def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] |
     return float(up[0]), float(up[1]), float(up[2])
 
 
-def _frame(entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool) -> Frame | str:
-    """Return an entry's frame, or where its image is missing, that path as it is written."""
+def _frame(
+    entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool
+) -> Frame | str | None:
+    """Return an entry's frame; where its image is missing, that path as it is written; None where its pose is null."""
     where = f"{source}: frames[{number}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError(f"{where}: want a file_path, got {entry!r}")
     where = f"{where} ({entry['file_path']})"
-    if "transform_matrix" not in entry:
-        raise ValueError(f"{where}: has no pose; want a transform_matrix")
-    pose = checked_pose(entry["transform_matrix"], f"{where}: transform_matrix")
+    if POSE not in entry:
+        raise ValueError(f"{where}: has no pose; want a {POSE}, null where none was found")
+    if entry[POSE] is None:
+        return None
+    pose = checked_pose(entry[POSE], f"{where}: {POSE}")
     image = _image(source.parent / entry["file_path"])
     if image is None:
         return entry["file_path"]
