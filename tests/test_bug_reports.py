@@ -136,7 +136,9 @@ def seen_colours(path: Path, name: str) -> list[list[int]]:
 def test_12_models_and_masks_of_colmaps_layouts_are_found_by_their_whole_names(tmp_path):
     """Masks of another photograph would show: the spheres' outlines differ from camera to camera."""
     out = laid_out("12", tmp_path)
-    with pytest.raises(ValueError, match=r"halved/sparse/0: image .*has 120 x 90 pixels, its camera 1 240 x 180"):
+    with pytest.raises(
+        ValueError, match=r"halved/sparse/0: image .*has 120 x 90 pixels, its camera 1 240 x 180"
+    ):
         Photos(out, ["halved"])
     kinds = ("spaces", "spaces_binary", "folders", "no_points", "comments", "upper", "input")
     plain = Photos(out, ["comments"]).placement("comments")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import posixpath
 import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from neural_sim.target.bin_matching import matching
 from neural_sim.target.camera import camera_of_entry
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.coco_file import COCO_KIND, CocoFile, Entry, listed_size, name_of, refuse_size
+from neural_sim.target.other_formats import missing_file
 from neural_sim.target.photographs import Photograph
 from neural_sim.target.split import groups_of
 from neural_sim.types import LabelledImages, PinholeCamera
@@ -69,7 +71,7 @@ class CocoTarget(AnnotatedPhotographs):
     def __post_init__(self) -> None:
         if not self.source.is_file():
             raise ValueError(
-                f"target.annotations: no such file: {self.source}; put a COCO file of labelled photographs there, "
+                f"target.annotations: {missing_file(self.source)}; put a COCO file of labelled photographs there, "
                 "or set target.annotations"
             )
         if self.match_bins and self.bin_attribute is None:
@@ -121,36 +123,64 @@ class CocoTarget(AnnotatedPhotographs):
     def files(self) -> dict[str, Path]:
         return {"": self.source, **{name_of(entry): self._path(entry) for entry in self._coco.images}}
 
+    @cached_property
+    def _roots(self) -> list[Path]:
+        """Folders that file names may start from: the one that is set, else the file's and those named ``images``."""
+        here = self._folder
+        return [here] if self.images is not None else [here, here / "images", here.parent / "images"]
+
+    @cached_property
+    def _last_names(self) -> Counter[str]:
+        return Counter(_last(entry) for entry in self._coco.images)
+
     def _path(self, entry: Entry) -> Path:
         """Return an image's file: of the name as it is written, with ``/``, or in Unicode's other form.
+
+        Where there is none, as where a name has other folders or is an address, it is the file of the last part of the
+        name, if no other image has that.
 
         Raises:
             ValueError: a name that leaves the folder.
         """
-        names = [entry["file_name"], name_of(entry)]
-        names += [unicodedata.normalize(form, names[1]) for form in ("NFC", "NFD")]
+        names = _spellings(entry)
         folder = os.path.abspath(self._folder)
         for name in names:
             if os.path.commonpath([folder, os.path.abspath(self._folder / name)]) != folder:
                 raise ValueError(
-                    f"{self.source}: file_name {entry['file_name']!r} of image {entry['id']!r} leads out of {folder}"
+                    f"{self.source}: file_name {entry['file_name']!r} of image {entry['id']!r} leads out of {folder}; "
+                    "want names that start from target.images, or from the file's folder where that is null"
                 )
-        paths = [self._folder / name for name in names]
-        return next((path for path in paths if path.is_file()), paths[1])
+        if self._last_names[_last(entry)] == 1:
+            names.append(_last(entry))
+        paths = [root / name for name in names for root in self._roots]
+        return next((path for path in paths if path.is_file()), paths[len(self._roots)])
 
     def _where(self, entry: Entry) -> str:
         return f"{self._path(entry)} (named in {self.source})"
 
     def _check_pictures(self) -> None:
         """Raise ``ValueError`` for pictures that by their headers cannot be read or have another size than listed."""
-        unsized = []
+        unsized, moved, sizes = [], [], {}
         for entry in self._entries:
             path, where = self._path(entry), self._where(entry)
+            if not path.is_file():
+                raise ValueError(
+                    f"{where}: not a readable image (no such file; target.images is the folder that file names start "
+                    "from)"
+                )
             header = read_header(path, where)
             refuse_mode(header.mode, header.format, where)
             refuse_size(entry, header, where)
+            sizes[entry["id"]] = header.shown
+            if path not in [self._folder / name for name in _spellings(entry)]:
+                moved.append(f"{path} for {entry['file_name']!r}")
             if header.orientation > 1 and listed_size(entry) is None:
                 unsized.append(path)
+        self._coco.check_boxes(sizes)
+        if moved:
+            _log.warning(
+                "%s: %d file names are found elsewhere, such as %s", self.source, len(moved), moved[0]
+            )
         if unsized:
             _log.warning(
                 "%s: %d photographs without width and height are turned by EXIF, such as %s; their boxes are taken to "
@@ -186,6 +216,8 @@ class CocoTarget(AnnotatedPhotographs):
         self._coco.refuse_strange(self._classes, objects)
         labels = self._coco.by_id(self._classes.labels(names, objects))
         rows = self._coco.rows_by_image(labels)
+        if not self._coco.usable:
+            raise ValueError(f"{self.source}: holds no box of anything")
         self._log_left_out(names, objects)
         return [
             self._photograph(entry, group, rows.get(entry["id"], []), labels)
@@ -249,6 +281,16 @@ class CocoTarget(AnnotatedPhotographs):
         counts = ", ".join(f"{len(own)} of {part}" for part, own in chosen.items())
         _log.info("%s takes %s", where, counts)
         return chosen
+
+
+def _spellings(entry: Entry) -> list[str]:
+    """Return an image's name as it is written, with ``/``, and in both of Unicode's forms."""
+    name = name_of(entry)
+    return [entry["file_name"], name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
+
+
+def _last(entry: Entry) -> str:
+    return posixpath.basename(name_of(entry))
 
 
 def _order(entry: Entry) -> tuple[bool, Any]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import posixpath
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neural_sim.documents import read_json
 from neural_sim.pictures import Header, by
 from neural_sim.target.classes import ClassMap
+from neural_sim.target.other_formats import read_sections
 
 _log = logging.getLogger(__name__)
 
@@ -82,6 +84,16 @@ def name_of(entry: Entry) -> str:
     return posixpath.normpath(entry["file_name"].replace("\\", "/"))
 
 
+def has_size(item: Entry) -> bool:
+    """Whether an annotation's box has a width and a height."""
+    return item["bbox"][2] > 0 and item["bbox"][3] > 0
+
+
+def is_crowd(item: Entry) -> bool:
+    """Whether an annotation is of several objects at once, which are no object's box."""
+    return bool(item.get("iscrowd", 0))
+
+
 def listed_size(entry: Entry) -> tuple[int | float, int | float] | None:
     """Return the width and height of an image entry, None where it does not say both."""
     width, height = entry.get("width"), entry.get("height")
@@ -97,6 +109,19 @@ def refuse_size(entry: Entry, header: Header, where: str) -> None:
         )
 
 
+def _upright(item: Entry) -> Entry:
+    """Return an annotation with the box about its box, where that is turned as CVAT writes it."""
+    attributes = item.get("attributes")
+    angle = attributes.get("rotation") if isinstance(attributes, dict) else None
+    if not is_number(angle) or not angle or item.get("segmentation"):  # a polygon's box is upright
+        return item
+    (x, y, width, height), turn = item["bbox"], math.radians(angle)
+    across = abs(width * math.cos(turn)) + abs(height * math.sin(turn))
+    down = abs(width * math.sin(turn)) + abs(height * math.cos(turn))
+    box = [x + 0.5 * (width - across), y + 0.5 * (height - down), across, down]
+    return {**item, "bbox": box}
+
+
 @dataclass(frozen=True)
 class CocoFile:
     """The sections of a file, with the keys of ``REQUIRED``; ``document`` is all that it holds."""
@@ -108,18 +133,16 @@ class CocoFile:
     def read(cls, path: Path) -> CocoFile:
         """Read and check a file.
 
-        Annotations of images that the file does not list, and boxes without a side, are counted in the log.
+        Counted in the log are annotations of images that the file does not list, crowds, boxes without a side, those
+        that come twice, and those that are turned, which stand for the upright boxes about them.
 
         Raises:
             ValueError: not JSON; a section or a key that is missing; an id, a name or a box that is none; an id or a
                 file of several images; or annotations of which no image is listed.
         """
-        document = read_json(path)
+        document = read_sections(path, tuple(REQUIRED))
         for section, keys in REQUIRED.items():
-            entries = document.get(section) if isinstance(document, dict) else None
-            if not isinstance(entries, list):
-                raise ValueError(f"{path}: want a list {section!r}, as COCO has it")
-            for number, entry in enumerate(entries):
+            for number, entry in enumerate(document[section]):
                 where = f"{path}: {section}[{number}]"
                 missing = [key for key in keys if not isinstance(entry, dict) or key not in entry]
                 if missing:
@@ -127,15 +150,75 @@ class CocoFile:
                 for key, check in CHECKS.items():
                     if key in entry and key in (*keys, *OPTIONAL):
                         check(entry[key], f"{where}.{key}")
-        file = cls(path, document)
+        upright = [_upright(item) for item in document["annotations"]]
+        file = cls(path, {**document, "annotations": upright})
         file._check_unique("images", "id", "file_name")
         file._check_unique("images", "file_name", "id")
         file._check_unique("categories", "id", "name")
         file._check_orphans()
-        empty = sum(not file._has_size(item) for item in file.annotations)
-        if empty:
-            _log.warning("%s: %d boxes without a width or a height are left out", path, empty)
+        counts = {
+            "crowds are left out (iscrowd=1, which CVAT also writes for masks)": sum(map(is_crowd, upright)),
+            "boxes without a width or a height are left out": sum(not has_size(item) for item in upright),
+            "boxes come twice and are left out once": len(file._repeated),
+            "boxes are turned (attributes.rotation); the upright ones about them are taken":
+                sum(a is not b for a, b in zip(upright, document["annotations"], strict=True)),
+        }  # fmt: skip
+        for what, count in counts.items():
+            if count:
+                _log.warning("%s: %d %s", path, count, what)
         return file
+
+    @cached_property
+    def _repeated(self) -> set[int]:
+        """The places of annotations that say what one before says."""
+        seen, repeated = set(), set()
+        for row, item in enumerate(self.annotations):
+            said = (item["image_id"], item["category_id"], tuple(item["bbox"]))
+            if said in seen and has_size(item) and not is_crowd(item):
+                repeated.add(row)
+            seen.add(said)
+        return repeated
+
+    def check_boxes(self, sizes: Mapping[Any, tuple[int, int]]) -> None:
+        """Check that boxes lie on their pictures; those that reach beyond by more than a pixel are counted in the log.
+
+        Args:
+            sizes: width and height of the pictures by image id; others are not looked at.
+
+        Raises:
+            ValueError: boxes that are fractions of the picture or corners, or of which none is on its picture.
+        """
+        rows = [
+            row for row, item in enumerate(self.annotations) if item["image_id"] in sizes and has_size(item)
+        ]
+        if not rows:
+            return
+        boxes = self.boxes(rows)
+        limits = torch.tensor([sizes[self.annotations[row]["image_id"]] for row in rows], dtype=torch.float32)
+        beyond = ((boxes[:, :2] < -1.0) | (boxes[:, 2:] > limits + 1.0)).any(-1)
+        first = rows[int(beyond.int().argmax())]
+        example = f"such as annotations[{first}], {self.annotations[first]['bbox']}"
+        wanted = "want x, y, width, height in pixels"
+        if (boxes.abs() <= 1.0).all():
+            raise ValueError(
+                f"{self.path}: all boxes lie in the first pixel, {example}: {wanted}, not fractions"
+            )
+        if ((boxes[:, 2:] <= 0.0) | (boxes[:, :2] >= limits)).any(-1).all():
+            raise ValueError(f"{self.path}: no box lies on its picture, {example}: {wanted}")
+        corners = torch.cat(
+            [boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1
+        )  # what it would be if they were corners
+        fits = ((corners[:, 2:] > corners[:, :2]) & (corners[:, 2:] <= limits + 1.0)).all()
+        if fits and 2 * int(beyond.sum()) > len(rows):
+            raise ValueError(
+                f"{self.path}: {int(beyond.sum())} of {len(rows)} boxes reach beyond their pictures and none would as "
+                f"two corners, {example}: {wanted}"
+            )
+        if beyond.any():
+            _log.warning(
+                "%s: %d of %d boxes reach beyond their pictures and are clipped, %s",
+                self.path, int(beyond.sum()), len(rows), example,
+            )  # fmt: skip
 
     def _check_unique(self, section: str, key: str, other: str) -> None:
         """Raise ``ValueError`` for two entries with one value of ``key``."""
@@ -178,10 +261,6 @@ class CocoFile:
                 f"{self.images[0]['id']!r}"
             )
 
-    @staticmethod
-    def _has_size(item: Entry) -> bool:
-        return item["bbox"][2] > 0 and item["bbox"][3] > 0
-
     @property
     def images(self) -> list[Entry]:
         """The entries of images."""
@@ -218,28 +297,28 @@ class CocoFile:
                 "%s: categories %s are no objects and have no annotation: left out", self.path, strange
             )
 
-    @property
-    def crowds(self) -> int:
-        """How many annotations are of crowds, which are no objects' boxes."""
-        return sum(bool(item.get("iscrowd", 0)) for item in self.annotations)
-
     def by_id(self, labels: Mapping[str, int | None]) -> dict[Any, int | None]:
         """Return the labels of categories by their ids; ``labels`` are by their names."""
         return {entry["id"]: labels.get(str(entry["name"])) for entry in self.document["categories"]}
 
+    @cached_property
+    def usable(self) -> list[int]:
+        """The places of annotations that are boxes of one thing, each once: no crowds and no empty ones."""
+        return [
+            row for row, item in enumerate(self.annotations)
+            if has_size(item) and not is_crowd(item) and row not in self._repeated
+        ]  # fmt: skip
+
     def rows_by_image(self, labels: Mapping[Any, int | None]) -> dict[Any, list[int]]:
-        """Return the places of annotations by image id: those of objects, without crowds and empty boxes.
+        """Return the places of :attr:`usable` annotations of objects by image id.
 
         Args:
             labels: label by category id, None for a category that is no object.
         """
         rows: dict[Any, list[int]] = {}
-        for row, item in enumerate(self.annotations):
-            if (
-                self._has_size(item)
-                and not item.get("iscrowd", 0)
-                and labels[item["category_id"]] is not None
-            ):
+        for row in self.usable:
+            item = self.annotations[row]
+            if labels[item["category_id"]] is not None:
                 rows.setdefault(item["image_id"], []).append(row)
         return rows
 

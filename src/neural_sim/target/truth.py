@@ -16,6 +16,7 @@ from torch import Tensor
 from neural_sim.pictures import read_header
 from neural_sim.target.classes import ClassMap
 from neural_sim.target.coco_file import COCO_KIND, CocoFile, name_of, refuse_size
+from neural_sim.target.other_formats import missing_file
 from neural_sim.target.photographs import Boxes, PhotoFiles, padded
 from neural_sim.types import LabelledImages
 
@@ -41,7 +42,7 @@ class Truth:
 
     def __post_init__(self) -> None:
         if not self.path.is_file():
-            raise ValueError(f"predict.annotations: no such file: {self.path}")
+            raise ValueError(f"predict.annotations: {missing_file(self.path)}")
         _ = self.labels
         self._file.check_declared()
         found, total = len(self.entries), len(self.photos.paths)
@@ -50,8 +51,15 @@ class Truth:
                 f"predict.annotations: {self.path} has no entry for any of the {total} pictures of "
                 f"predict.images, such as {self.photos.name(self.photos.paths[0])}"
             )
+        sizes = {}
         for path, entry in self.entries.items():
-            refuse_size(entry, read_header(path), f"predict.annotations: {self.path}: {path}")
+            header = read_header(path)
+            refuse_size(entry, header, f"predict.annotations: {self.path}: {path}")
+            sizes[entry["id"]] = header.shown
+        try:
+            self._file.check_boxes(sizes)
+        except ValueError as error:
+            raise ValueError(f"predict.annotations: {error}") from error
         if found < total:
             _log.warning(
                 "%s: no entry for %d of %d pictures; they are not scored", self.path, total - found, total
@@ -109,8 +117,6 @@ class Truth:
     @cached_property
     def _rows(self) -> dict[Any, list[int]]:
         """The places of annotations by image id."""
-        if self._file.crowds:
-            _log.warning("%s: %d crowds are left out", self.path, self._file.crowds)
         return self._file.rows_by_image(self.labels)
 
     def boxes(self, path: Path) -> tuple[Float[Tensor, "b 4"], Int[Tensor, "b"]]:

@@ -1,0 +1,73 @@
+"""Label files that are not COCO's, named as what they are, so that a message can say what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neural_sim.documents import read_json
+
+_SUFFIXES = {
+    ".yaml": "YOLO",
+    ".yml": "YOLO",
+    ".xml": "Pascal VOC's or CVAT's",
+    ".csv": "a table's",
+}
+_CONVERT = (
+    "want COCO's JSON: export it as COCO, or convert it (supervision: DetectionDataset.from_yolo(...) or "
+    "from_pascal_voc(...), then as_coco(...))"
+)
+_KINDS = {
+    "Label Studio's own format: export as COCO": {"data"},
+    "a list of detections": {"image_id", "score"},
+    "VIA's own format: export annotations as COCO": {"regions"},
+    "VIA's project: export annotations as COCO": {"_via_settings"},
+    "labelme's format: convert it to COCO": {"shapes"},
+    "CreateML's format: convert it to COCO": {"image"},
+}
+"""What a document is, by keys that it or its first entry has."""
+
+
+def missing_file(path: Path) -> str:
+    """Say that a path is no file; of a folder, which files in it may be meant."""
+    if not path.is_dir():
+        return f"no such file: {path}"
+    found = sorted(file.relative_to(path).as_posix() for file in path.glob("**/*.json"))
+    if found:
+        return f"{path} is a folder, want its COCO file: {', '.join(found[:6])}"
+    other = next((file for end in _SUFFIXES for file in sorted(path.glob(f"**/*{end}"))), None)
+    return f"{path} is a folder without a COCO file" if other is None else _of_another_kind(other)
+
+
+def _of_another_kind(path: Path) -> str:
+    return f"{path} is of a data set in {_SUFFIXES[path.suffix.lower()]} format; {_CONVERT}"
+
+
+def read_sections(path: Path, sections: Sequence[str]) -> Mapping[str, Any]:
+    """Read a JSON file that has a list by each of these names.
+
+    Raises:
+        ValueError: no JSON, or a list that is missing; as far as it can be told, with what the file is instead.
+    """
+    if path.suffix.lower() in _SUFFIXES:
+        raise ValueError(_of_another_kind(path))
+    document = read_json(path)
+    for section in sections:
+        if not isinstance(document.get(section) if isinstance(document, dict) else None, list):
+            kind = _kind_of(document)
+            raise ValueError(
+                f"{path}: want a list {section!r}, as COCO has it" + (f"; this is {kind}" if kind else "")
+            )
+    return document
+
+
+def _kind_of(document: object) -> str:
+    """Say which program's own format a document is in; empty where that is not known."""
+    first = document[0] if isinstance(document, list) and document else document
+    if not isinstance(first, dict):
+        return ""
+    keys = set(first)
+    if any(isinstance(value, dict) and "regions" in value for value in first.values()):
+        keys.add("regions")
+    return next((kind for kind, marks in _KINDS.items() if marks <= keys), "")
