@@ -2,7 +2,8 @@
 
 Two embedded objects and, with `--root ../shared/ycb`, a scanned one; `--noise` is the deviation of the cameras' written
 positions in distances. Overlap is the intersection over union of masks above a half; PSNR is that of fields from these
-masks and from the true ones on held-out photographs, each on the foreground by its own masks.
+masks and from the true ones on held-out photographs, each on the foreground by its own masks. `--capture` is a folder
+of real photographs with their cameras, whose masks are compared with `--polygons`, a COCO file of some of them.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from captures import Made, on_a_table
+from captures import on_a_table
 from training_views import quick_psnr
 
 from neural_sim.field.scene.recipe import SceneMasks
@@ -34,14 +35,43 @@ from neural_sim.report.provenance import machine
 HELD_OUT = 4
 
 
-def overlaps(truth: Made, pictures: Pictures) -> list[float]:
-    """Of each photograph."""
-    values = []
+def overlaps(truth: dict[str, np.ndarray], pictures: Pictures) -> dict[str, float]:
+    """Of each photograph that has a true mask, by name."""
+    values = {}
     for frame in pictures.capture.frames:
-        mask = pictures.rgba(frame)[..., 3].numpy() > 0.5
-        true = np.asarray(Image.open(truth.folder / "truth" / f"{frame.image.stem}.png")) > 127
-        values.append(float((mask & true).sum() / max(1, (mask | true).sum())))
+        true = truth.get(frame.image.name)
+        if true is not None:
+            mask = pictures.rgba(frame)[..., 3].numpy() > 0.5
+            values[frame.image.name] = float((mask & true).sum() / max(1, (mask | true).sum()))
     return values
+
+
+def polygons(file: Path) -> dict[str, np.ndarray]:
+    """Masks of a COCO file's polygons, by photograph."""
+    coco = json.loads(file.read_text())
+    drawn = {image["id"]: Image.new("L", (image["width"], image["height"])) for image in coco["images"]}
+    for annotation in coco["annotations"]:
+        for outline in annotation["segmentation"]:
+            ImageDraw.Draw(drawn[annotation["image_id"]]).polygon(outline, fill=255)
+    return {image["file_name"]: np.asarray(drawn[image["id"]]) > 127 for image in coco["images"]}
+
+
+def measure_real(options: argparse.Namespace) -> dict[str, float | str]:
+    """Compare a real capture's masks with polygons."""
+    source = Photos(options.capture, masks="scene", scene=SceneMasks())
+    (name,) = source.names()
+    spent = time.process_time()
+    pictures = source.pictures(name)
+    cpu = time.process_time() - spent
+    values = overlaps(polygons(options.polygons), pictures)
+    print({photo: round(value, 3) for photo, value in values.items()})
+    worst = min(values.values())
+    return {
+        "object": name,
+        "overlap": float(np.median([*values.values()])),
+        "worst": worst,
+        "cpu_seconds": cpu,
+    }
 
 
 def psnr(source: Photos, name: str, pictures: Pictures, size: int) -> float:
@@ -50,8 +80,14 @@ def psnr(source: Photos, name: str, pictures: Pictures, size: int) -> float:
     return quick_psnr(views, len(source.split(name, 1000, HELD_OUT)[1]))
 
 
-def measure(item: ObjectMesh, folder: Path, options: argparse.Namespace) -> dict[str, float | str]:
+def measure(item: ObjectMesh, options: argparse.Namespace) -> dict[str, float | str]:
     """One object's row."""
+    with tempfile.TemporaryDirectory() as folder:
+        return measure_in(Path(folder), item, options)
+
+
+def measure_in(folder: Path, item: ObjectMesh, options: argparse.Namespace) -> dict[str, float | str]:
+    """One object's row, of photographs in a folder."""
     truth = on_a_table(
         folder, item, count=options.photos, width=options.size[0], height=options.size[1],
         exposure=0.05, pose_noise=options.noise, suffix=".jpg",
@@ -60,7 +96,11 @@ def measure(item: ObjectMesh, folder: Path, options: argparse.Namespace) -> dict
     began, spent = time.perf_counter(), time.process_time()
     pictures = source.pictures(item.name)
     seconds, cpu = time.perf_counter() - began, time.process_time() - spent
-    values = overlaps(truth, pictures)
+    true_masks = {
+        frame.image.name: np.asarray(Image.open(truth.folder / "truth" / f"{frame.image.stem}.png")) > 127
+        for frame in pictures.capture.frames
+    }
+    values = [*overlaps(true_masks, pictures).values()]
     (truth.folder / "truth").rename(truth.folder / "masks")
     true = Photos(folder, [item.name], masks="files")
     fields = [psnr(source, item.name, pictures, 96), psnr(true, item.name, true.pictures(item.name), 96)]
@@ -78,14 +118,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(200, 150), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--objects", nargs="*", default=["can", "mug"], help="embedded ones")
+    parser.add_argument("--capture", type=Path, help="a folder of real photographs instead of all these")
+    parser.add_argument("--polygons", type=Path, help="of --capture: a COCO file")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     items = Procedural(options.objects).load() if options.objects else []
     items += YCB(options.root, ["035"]).load() if options.root else []
     rows = []
-    for item in items:
-        with tempfile.TemporaryDirectory() as folder:
-            rows.append(measure(item, Path(folder), options))
+    for row in [measure_real(options)] if options.capture else (measure(item, options) for item in items):
+        rows.append(row)
         print({key: round(x, 3) if isinstance(x, float) else x for key, x in rows[-1].items()}, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f"largest memory: {peak:.0f} MB")

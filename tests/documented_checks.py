@@ -20,7 +20,7 @@ def check_of(config):
         "repeat": _repeat,
         "viewer": _viewer,
     }
-    alone = stages.get(config["stages"][0])
+    alone = stages.get(config["stages"][-1])
     whole = _run if "report" in config["stages"] else _stored
     return alone or KINDS.get(next((key for key in KINDS if key in config), ""), whole)
 

@@ -221,6 +221,7 @@ def page(path: Path) -> Path:
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "/data/ycb": ycb,
     "../shared/ycb": ycb,
+    "../shared/captures": rooms,
     "/data/models": bop,
     "/data/meshes": meshes,
     "/data/captures": captures,
@@ -285,6 +286,15 @@ class MadeData:
         if value.startswith(("/", "~", "../")):
             raise AssertionError(f"{word}: say in {Path(__file__).name} what {value} stands for")
         return word
+
+
+def with_given_cameras(job: Sequence[str]) -> list[str]:
+    """The words of a job, with the cameras of photographs given: made ones are too small for COLMAP."""
+    finds = "+experiment=photographs" in job or "objects/poses=colmap" in job
+    return [
+        *(word for word in job if word != "objects/poses=colmap"),
+        *(["objects/poses=given"] if finds else []),
+    ]
 
 
 def _coloured(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:

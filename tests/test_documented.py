@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from documented import FLAGS, PAGES, ROOT, commands, commands_in, nox_sessions, spans
-from documented_data import MadeData
+from documented_data import MadeData, with_given_cameras
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -41,7 +41,9 @@ def test_a_documented_run_composes_and_builds(command, data):
     """All jobs of a sweep with its first seed, and one with its last."""
     assert command.flags <= FLAGS
     for job in [*command.jobs(seeds=1), command.jobs()[-1]]:
-        compose_and_build((*(data.localise(word) for word in job), f"paths.data={data.shared}"))
+        compose_and_build(
+            (*(data.localise(word) for word in with_given_cameras(job)), f"paths.data={data.shared}")
+        )
 
 
 class _Parsed(Exception):

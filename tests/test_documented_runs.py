@@ -10,7 +10,7 @@ import pytest
 import torch
 from documented import ROOT, commands
 from documented_checks import check_of
-from documented_data import MadeData
+from documented_data import MadeData, with_given_cameras
 from filelock import FileLock
 from hydra import compose, initialize_config_dir
 
@@ -29,11 +29,11 @@ def _compares(command):
 
 
 def _exports(command):
-    return "stages=[export]" in command.overrides
+    return bool({"stages=[export]", "+experiment=photographs"} & set(command.overrides))
 
 
 def _reads_psi(command):
-    return _exports(command) or "viewer.psi=learned" in command.overrides
+    return bool({"stages=[export]", "viewer.psi=learned"} & set(command.overrides))
 
 
 class Runs:
@@ -46,7 +46,9 @@ class Runs:
     def words(self, command):
         """The overrides at smoke scale, with the first of the seeds and made data for paths."""
         written = command.cut(1) if command.multirun else command.overrides
-        kept = [self.data.localise(word) for word in written if not word.startswith("scale=")]
+        kept = [
+            self.data.localise(word) for word in with_given_cameras(written) if not word.startswith("scale=")
+        ]
         few = ["export.count=3", "export.width=64", "export.height=48"] if _exports(command) else []
         if "stages=[viewer]" in command.overrides:
             kept.append("viewer.seconds=1")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from documented import Command
-from documented_data import MadeData
+from documented_data import MadeData, captures
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -30,6 +30,9 @@ def labels(name, shared):
         "detection_gallery": f"target.annotations={shared / 'ycb_in_the_wild' / 'annotations.json'}",
         "objectnet": f"target.root={shared / 'objectnet'}",
     }
+    if name == "photographs":  # made ones are too small for COLMAP
+        root = shared / "captures"
+        return [f"objects.root={root if root.is_dir() else captures(root)}", "objects/poses=given"]
     return [given[name]] if name in given else []
 
 
@@ -79,7 +82,7 @@ def test_jobs_of_a_study_are_settings_of_their_own_and_the_last_builds(name, sha
     assert made(*jobs[-1], f"paths.data={shared}").experiment.run.name == settings[-1][0]
 
 
-@pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
+@pytest.mark.parametrize("name", [n for n in OWN if n not in (*STUDIES, "photographs")])
 def test_experiments_name_objects_that_exist(name, shared_data, shared):
     context = made(f"+experiment={name}", f"objects.root={shared_data / 'ycb'}", *labels(name, shared))
     assert set(context.experiment.imaging.distribution.biased) <= set(context.graph.names)
@@ -93,7 +96,7 @@ def test_experiments_on_other_data_begin_with_what_they_need_and_how_long_they_t
     assert "Needs " in text and re.search(r"scale=quick on two cores: about [\d.]+ (minutes|hours)", text)
 
 
-@pytest.mark.parametrize("name", [n for n in OWN if n not in STUDIES])
+@pytest.mark.parametrize("name", [n for n in OWN if n not in (*STUDIES, "photographs")])
 def test_without_its_data_an_experiment_says_in_one_line_what_to_get_and_where(name, shared, tmp_path):
     with pytest.raises(UserError) as caught:
         made(f"+experiment={name}", f"paths.data={tmp_path}", *labels(name, shared))
@@ -107,6 +110,12 @@ def test_without_photographs_the_line_names_the_file_and_its_key(shared, tmp_pat
         UserError, match=rf"target.annotations: no such file: {tmp_path}.*; put a COCO file"
     ) as caught:
         made("+experiment=ycb_in_the_wild", f"paths.data={shared}", missing)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_photographs_of_objects_the_line_names_the_folder(tmp_path):
+    with pytest.raises(UserError, match=rf"objects.root: {tmp_path}/captures is not a folder") as caught:
+        made("+experiment=photographs", f"paths.data={tmp_path}")
     assert "\n" not in str(caught.value)
 
 

@@ -36,6 +36,15 @@ def job_folder(number: int | str, overrides: str) -> str:
     return f"{number}_{overrides}".replace("/", "-")[:LONGEST]
 
 
+PHOTOGRAPHED = ("neural_sim.objects.photos.Photos", "neural_sim.objects.co3d.Co3d")
+"""Classes of objects whose views are photographs."""
+
+
+def view_size(source: str, of_meshes: int, of_photographs: int) -> int:
+    """Choose the size of views by the class of the objects' source."""
+    return of_photographs if source in PHOTOGRAPHED else of_meshes
+
+
 def own_folder(wanted: Path) -> Path:
     """Make a new folder: ``wanted``, or where there is one already, ``wanted``_2, _3, ..."""
     folder, number = wanted, 1

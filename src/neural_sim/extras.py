@@ -9,6 +9,7 @@ PACKAGES = {
     "bop": ("h5py",),
     "onnx": ("onnx", "onnxscript", "onnxruntime"),
     "viewer": ("viser",),
+    "video": ("av",),
 }
 """The modules that each extra installs."""
 

@@ -33,6 +33,7 @@ from neural_sim.configuration import (
     job_folder,
     own_folder,
     updated,
+    view_size,
 )
 from neural_sim.interruption import interruptible
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, check
@@ -50,6 +51,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 _log = logging.getLogger(__name__)
 
 OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+OmegaConf.register_new_resolver("view_size", view_size, replace=True)
 
 # Top-level nodes that an experiment is built from, each with a ``_target_``; `parameter` holds one for each parameter.
 _PARTS = (

@@ -3,12 +3,14 @@
 import pytest
 import torch
 from captures import capture
-from documented_data import coco
+from documented_data import coco, meshes
 from hydra import compose, initialize_config_dir
 
 from neural_sim.field.scores import compare
 from neural_sim.main import UserError, conf_directory, context_of
-from neural_sim.synthesis.subjects import PhotographedField
+from neural_sim.objects.procedural import Procedural
+from neural_sim.synthesis.subjects import MeshSubject, PhotographedField
+from neural_sim.tasks.export import models_of
 from neural_sim.tasks.walk import walk
 
 SMALL = (
@@ -75,6 +77,31 @@ def test_a_target_of_photographs_needs_no_field(root, tmp_path):
     assert sets.test.images.shape[-2:] == (45, 60)
     with pytest.raises(ValueError, match="nothing to render"):
         graph.objects.subject("can").maps(graph.camera, torch.eye(4)[None])
+
+
+def test_meshes_beside_photographs_are_further_classes(root, tmp_path):
+    scans = meshes(tmp_path / "meshes")
+    beside = ["objects/beside=folder", f"objects.beside.root={scans}", "objects.beside.names=[ball,block]"]
+    context, _ = started(root, tmp_path, *beside, "objects.names=[mug]")
+    graph, results = context.graph, context.results
+    assert graph.names == ("mug", "ball", "block")
+    # Each is what it is alone, and found in the store by either run.
+    alone, _ = started(root, tmp_path, "objects.names=[mug]")
+    assert graph.fields[0].key == alone.graph.fields[0].key
+    assert graph.objects.digests.keys() == set(graph.names)
+    subjects = [graph.objects.subject(stage.views.object, results(stage).field) for stage in graph.fields]
+    assert [type(subject) for subject in subjects] == [PhotographedField, MeshSubject, MeshSubject]
+    assert [stage.held_out for stage in graph.views] == [1, 4, 4]
+    assert [model.mesh is None for model in models_of(graph.objects)] == [True, False, False]
+    # Photographs say which bins are left out for their own object alone.
+    assert context.experiment.imaging.coverage.keys() == {"mug"}
+    images = (
+        results(graph.scene).training_set(graph.psi("initial"), 2, torch.Generator().manual_seed(0)).images
+    )
+    assert {int(label) for label in images.labels[images.present]} == {0, 1, 2}
+    with pytest.raises(UserError, match=r"objects\.beside: 'ball' names an object of photographs, too"):
+        capture(tmp_path / "twice", "ball", count=4, item=Procedural(["can"]).load()[0])
+        started(tmp_path / "twice", tmp_path, *beside)
 
 
 def test_metres_want_a_size(root, tmp_path):

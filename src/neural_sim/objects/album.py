@@ -26,7 +26,6 @@ _log = logging.getLogger(__name__)
 FOLDER = "images"
 OTHER_FORMATS = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw")
 """Formats of telephones and cameras that are not read."""
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FILM_DIAGONAL = 43.27
 """Millimetres of the 36 x 24 mm film that EXIF's equivalent focal length is of."""
 UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
@@ -94,7 +93,7 @@ def read_album(folder: Path, name: str) -> Album:
         )  # fmt: skip
     pictures = pictures_of(folder)
     if not pictures:
-        raise ValueError(f"{folder}: {_without_pictures(folder, strange)}")
+        raise ValueError(f"{folder}: {_without_pictures(strange)}")
     return Album(name, folder, tuple(_shot(path) for path in pictures))
 
 
@@ -103,13 +102,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(path for path in (inner if inner.is_dir() else folder).iterdir() if path.is_file())
 
 
-def _without_pictures(folder: Path, strange: Sequence[str]) -> str:
-    videos = [path.name for path in _files(folder) if path.suffix.lower() in VIDEOS]
-    if videos:
-        return (
-            "holds a video and no photographs; take some 60 frames of it, such as two a second, with "
-            f"ffmpeg -i {videos[0]} -vf fps=2 -q:v 2 images/%04d.jpg"
-        )
+def _without_pictures(strange: Sequence[str]) -> str:
     return f"holds no photographs ({', '.join(PHOTO_SUFFIXES)})" + (
         "; convert them to JPEG" if strange else ""
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
 import trimesh
@@ -30,6 +31,28 @@ class ObjectMesh:
     def radius(self) -> float:
         """Radius of the object's bounding sphere, in metres."""
         return float(abs(np.linalg.det(self.transform[:3, :3])) ** (1.0 / 3.0))
+
+
+class Source(Protocol):
+    """A source of objects, such as a folder."""
+
+    def names(self) -> list[str]:
+        """Return the objects' names."""
+        ...
+
+    def digests(self) -> dict[str, str]:
+        """Return the SHA-256 of each object's content, by name."""
+        ...
+
+
+class MeshSource(Source, Protocol):
+    """A source of meshes; ``metric``: they are in metres, otherwise they have no unit of length."""
+
+    metric: ClassVar[bool]
+
+    def load(self) -> list[ObjectMesh]:
+        """Read the objects."""
+        ...
 
 
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:

@@ -34,6 +34,8 @@ ALL_PAIRS = 40
 """Photographs of which every pair is compared. Of more, those near in time, and of the whole a coarse selection."""
 SKELETON = 5
 """Every so many photographs, one is compared with all others of the kind: where a walk round ends, it has begun."""
+LARGE = 800
+"""Longer side in pixels from which photographs are searched for features at their own size alone."""
 BATCH = 8
 SEED = 0
 """Of COLMAP's random samples; not the run's, so that runs share poses."""
@@ -166,6 +168,9 @@ class _Search:
         options.use_gpu, options.num_threads = False, _threads()
         options.max_image_size = self.settings.picture_size
         options.sift.max_num_features = self.settings.features
+        # Of small photographs, twice the size is searched too: four times the work, and there is little else to find.
+        largest = max(max(self._reduced(shot)) for shot in self.album.shots)
+        options.sift.first_octave = -1 if largest < LARGE else 0
         groups: dict[object, list[int]] = {}
         for number, shot in enumerate(self.album.shots):
             groups.setdefault(shot.camera, []).append(number)

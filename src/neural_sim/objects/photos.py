@@ -19,6 +19,7 @@ from neural_sim.objects.colmap import model_folders, read_colmap
 from neural_sim.objects.files import Names, choose, content_digest, folder_of
 from neural_sim.objects.found import FoundCapture
 from neural_sim.objects.mask_command import MaskCommand
+from neural_sim.objects.mesh import MeshSource
 from neural_sim.objects.pictures import (
     FOLDER as MASKS_FOLDER,
 )
@@ -40,8 +41,9 @@ from neural_sim.objects.pictures import (
 from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
 from neural_sim.objects.resampling import pixels_per_pixel, resample
 from neural_sim.objects.transforms_json import has_transforms, read_transforms
+from neural_sim.objects.video import take_frames, videos_of
 from neural_sim.pictures import read_header, read_picture
-from neural_sim.ranges import Matching, NonNegativeInt, Positive, validated
+from neural_sim.ranges import Matching, NonNegativeInt, Positive, PositiveInt, validated
 from neural_sim.types import PosedViews
 
 _log = logging.getLogger(__name__)
@@ -98,11 +100,13 @@ class Photos:
             COLMAP's.
         mask_command: with ``masks="command"``: see :class:`MaskCommand`.
         mask_value: the object's value in masks that are images of labels, or a mapping by object's name.
+        beside: meshes that are further objects of the run, with other names; null: none.
+        frames: where cameras are found and a folder holds a video and no photographs, how many frames of it are taken.
 
     Raises:
         ValueError: a missing folder, one without captures, an unknown name, ``masks="scene"`` without ``scene``,
-            ``box`` without ``masks="scene"``, ``masks="command"`` without a command, or a capture that its reader
-            refuses.
+            ``box`` without ``masks="scene"``, ``masks="command"`` without a command, a capture that its reader
+            refuses, or a name that is also one of ``beside``.
     """
 
     def __init__(
@@ -119,13 +123,15 @@ class Photos:
         poses: PoseFinder | None = None,
         mask_command: str | None = None,
         mask_value: NonNegativeInt | Mapping[str, NonNegativeInt | None] | None = None,
+        beside: MeshSource | None = None,
+        frames: PositiveInt = 60,
     ) -> None:
-        self.root, self.poses = folder_of(root), poses
+        self.root, self.poses, self.beside = folder_of(root), poses, beside
         captures = self._found()
         self._folders = {name: captures[name] for name in choose(captures, names, {}, str(self.root))}
         self.masks: Masks = masks
         self.up, self.size, self.box, self.scene, self.poor = up, size, box, scene, poor
-        self.refinement, self.mask_value = refinement, mask_value
+        self.refinement, self.mask_value, self.frames = refinement, mask_value, frames
         if masks == "scene" and scene is None:
             raise ValueError("objects.masks=scene: want objects.scene, which computes masks, got none")
         if masks != "scene" and box is not None:
@@ -135,6 +141,10 @@ class Photos:
                 f"objects.mask_command goes with objects.masks=command, got objects.masks={masks} and {mask_command!r}"
             )
         self.command = None if mask_command is None else MaskCommand(mask_command)
+        if twice := self._folders.keys() & (() if beside is None else beside.names()):
+            raise ValueError(
+                f"objects.beside: {min(twice)!r} names an object of photographs, too; rename its folder"
+            )
         self._check()
 
     def _check(self) -> None:
@@ -154,7 +164,7 @@ class Photos:
 
     def _found(self) -> dict[str, Path]:
         """The captures' folders by the names of their objects: those below the root, else the root itself."""
-        usable = is_capture if self.poses is None else has_photographs
+        usable = is_capture if self.poses is None else can_be_captured
         below = [
             p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
         ]
@@ -163,8 +173,10 @@ class Photos:
             return {self.root.resolve().name: self.root}
         if not captures:
             if self.poses is not None:
-                raise ValueError(f"objects.root: {self.root} holds no photographs, nor a folder with any")
-            bare = any(has_photographs(p) for p in (self.root, *below))
+                raise ValueError(
+                    f"objects.root: {self.root} holds no photographs or video, nor a folder with any"
+                )
+            bare = any(can_be_captured(p) for p in (self.root, *below))
             raise ValueError(
                 f"objects.root: {self.root} holds no folder with a transforms.json or a COLMAP model"
                 + ("; objects/poses=colmap finds the cameras of photographs alone" if bare else "")
@@ -187,7 +199,9 @@ class Photos:
 
     @cached_property
     def albums(self) -> dict[str, Album]:
-        """Photographs whose cameras are to be found, by object."""
+        """Photographs whose cameras are to be found, by object; frames of a video are taken first."""
+        for name, folder in self._folders.items():
+            take_frames(folder, name, self.frames)
         return {name: read_album(folder, name) for name, folder in self._folders.items()}
 
     def find(
@@ -356,9 +370,9 @@ def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
     }
 
 
-def has_photographs(folder: Path) -> bool:
-    """Whether a folder holds pictures of its own, or in a folder ``images``."""
-    return bool(pictures_of(folder))
+def can_be_captured(folder: Path) -> bool:
+    """Whether a folder holds pictures of its own, or in a folder ``images``, or a video."""
+    return bool(pictures_of(folder) or videos_of(folder))
 
 
 def is_capture(folder: Path) -> bool:

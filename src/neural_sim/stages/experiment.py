@@ -15,6 +15,7 @@ from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
 from neural_sim.field.recipe import FieldRecipe
 from neural_sim.gradient.estimators import Estimator
+from neural_sim.objects.mesh import MeshSource
 from neural_sim.objects.photos import Photos
 from neural_sim.outer.objective import Loss
 from neural_sim.outer.settings import Outer
@@ -25,7 +26,6 @@ from neural_sim.renderer.views import Views
 from neural_sim.report.model_files import ModelFiles
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.psi import Method
-from neural_sim.stages.views import ObjectSource
 from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.target.base import Target
 from neural_sim.types import PinholeCamera
@@ -64,7 +64,7 @@ class Imaging:
         ValueError: fields that the renderer cannot draw.
     """
 
-    objects: ObjectSource | Photos
+    objects: MeshSource | Photos
     views: Views
     field: FieldRecipe
     renderer: NerfRenderer

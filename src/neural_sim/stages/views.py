@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from typing_extensions import override
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
 from neural_sim.field.quality import Placed
-from neural_sim.objects.mesh import ObjectMesh
+from neural_sim.objects.mesh import MeshSource, ObjectMesh, Source
 from neural_sim.objects.photos import Photos, PoseCorrector
 from neural_sim.objects.placing import upright
 from neural_sim.renderer.base import MeshRenderer
@@ -101,28 +101,6 @@ class ViewsStage(Stage[PosedViews]):
         return PosedViews(images, stored["camera_to_world"], camera, stored["light_weights"], stored["known"])
 
 
-class Source(Protocol):
-    """A source of objects, such as a folder."""
-
-    def names(self) -> list[str]:
-        """Return the objects' names."""
-        ...
-
-    def digests(self) -> dict[str, str]:
-        """Return the SHA-256 of each object's content, by name."""
-        ...
-
-
-class ObjectSource(Source, Protocol):
-    """A source of meshes; ``metric``: they are in metres, otherwise they have no unit of length."""
-
-    metric: ClassVar[bool]
-
-    def load(self) -> list[ObjectMesh]:
-        """Read the objects."""
-        ...
-
-
 @dataclass(frozen=True)
 class Objects(ABC):
     """The objects of a run by name. What they are made of is known here alone."""
@@ -132,11 +110,14 @@ class Objects(ABC):
     """Whether objects can be rendered without their fields."""
 
     @staticmethod
-    def of(source: ObjectSource | Photos, views: Views) -> Objects:
+    def of(source: MeshSource | Photos, views: Views) -> Objects:
         """Return the objects of a configured source; meshes are rendered as ``views`` says."""
-        if isinstance(source, Photos):
-            return Captures(source)
-        return Meshes(source, views.backend, views.supersample)
+        if not isinstance(source, Photos):
+            return Meshes(source, views.backend, views.supersample)
+        captures = Captures(source)
+        if source.beside is None:
+            return captures
+        return Mixed(source, captures, Meshes(source.beside, views.backend, views.supersample))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -173,6 +154,10 @@ class Objects(ABC):
         """Return how many of an object's views are held out."""
         return settings.held_out
 
+    def part(self, name: str) -> Objects:
+        """Return the objects of the same kind that ``name`` is one of."""
+        return self
+
     @property
     def refuses_poor(self) -> bool:
         """Whether nothing may train on fields that do not show their objects."""
@@ -199,7 +184,7 @@ class Meshes(Objects):
 
     has_meshes: ClassVar[bool] = True
 
-    source: ObjectSource
+    source: MeshSource
     backend: Literal["auto", "pyrender", "raycast"] = "auto"
     supersample: int = 2
 
@@ -293,6 +278,50 @@ class Captures(Objects):
         if source.masks == "scene" and source.scene is not None:
             masks = MasksStage(name, content, source.scene, source)
         return ViewsStage(name, content, settings, self, masks, source.refinement)
+
+
+@dataclass(frozen=True)
+class Mixed(Objects):
+    """Objects of photographs, then those of meshes: classes of one detector."""
+
+    has_meshes: ClassVar[bool] = False
+
+    source: Photos
+    captures: Captures
+    meshes: Meshes
+
+    @override
+    def part(self, name: str) -> Objects:
+        return self.captures if name in self.captures.names else self.meshes
+
+    @cached_property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return *self.captures.names, *self.meshes.names
+
+    @cached_property
+    @override
+    def digests(self) -> dict[str, str]:
+        return {**self.captures.digests, **self.meshes.digests}
+
+    @cached_property
+    @override
+    def radii(self) -> dict[str, float | None]:
+        return {**self.captures.radii, **self.meshes.radii}
+
+    @override
+    def subject(
+        self, name: str, field: RadianceField | None = None, *, rig: LightRig | None = None
+    ) -> RenderedSubject:
+        return self.part(name).subject(name, field, rig=rig)
+
+    @override
+    def views(self, name: str, settings: Views, masks: MasksOfFrames = ()) -> PosedViews:
+        return self.part(name).views(name, settings, masks)
+
+    @override
+    def stage(self, name: str, settings: Views) -> ViewsStage:
+        return self.part(name).stage(name, settings)
 
 
 def dimmed(rgba: Float[Tensor, "h w 4"]) -> Float[Tensor, "_ _ 3"]:

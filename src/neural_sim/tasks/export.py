@@ -190,8 +190,8 @@ def models_of(objects: Objects) -> list[Model]:
     for name in objects.names:
         radius = radii[name]
         millimetres = UNKNOWN_RADIUS if unknown or radius is None else 1000.0 * radius
-        if isinstance(objects, Meshes):
-            item = objects.items[name]
+        if isinstance(own := objects.part(name), Meshes):
+            item = own.items[name]
             to_model = np.diag([millimetres / item.radius] * 3 + [1.0]) @ item.transform
             made.append(Model(name, millimetres, to_model, item.mesh.copy().apply_transform(to_model)))
         else:

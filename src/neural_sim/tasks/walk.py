@@ -64,7 +64,7 @@ class FieldPhase(Phase):
             ShownObject(
                 stage.object,
                 context.results(stage),
-                not graph.objects.has_meshes,
+                not graph.objects.part(stage.object).has_meshes,
                 graph.experiment.imaging.coverage.get(stage.object, {}),
             )
             for stage in graph.qualities

@@ -1,0 +1,96 @@
+"""Frames of a video as photographs of an object."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import laplace
+
+from neural_sim.extras import require
+from neural_sim.objects.album import FOLDER, pictures_of
+from neural_sim.pictures import without_leftovers
+
+_log = logging.getLogger(__name__)
+
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+JUDGED_AT = 640
+"""Longer side in pixels of the frames whose sharpness is compared: finer detail is noise."""
+
+
+def videos_of(folder: Path) -> list[Path]:
+    """Return the videos in a folder."""
+    own = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file())
+    return without_leftovers(own, folder)
+
+
+def take_frames(folder: Path, name: str, count: int) -> None:
+    """Write frames of a folder's video into its folder ``images``, unless it has photographs.
+
+    The video is cut into ``count`` equal parts, and the sharpest frame of each is taken, upright.
+
+    Raises:
+        ValueError: several videos, one that cannot be read, or a folder that cannot be written.
+    """
+    videos = videos_of(folder)
+    if not videos or pictures_of(folder):
+        return
+    if len(videos) > 1:
+        raise ValueError(
+            f"{folder}: want one video, got {len(videos)}: {', '.join(video.name for video in videos)}; an object has "
+            "a folder and a video of its own"
+        )
+    require("video", f"objects.root: {videos[0]}")
+    images = folder / FOLDER
+    try:
+        place = Path(tempfile.mkdtemp(prefix=f"._{FOLDER}-", dir=folder))  # a leftover where a run is killed
+    except OSError as error:
+        raise ValueError(
+            f"{folder}: frames of {videos[0].name} cannot be written into it ({error.strerror}); copy the video to a "
+            "folder that can be written"
+        ) from error
+    try:
+        for number, picture in _sharpest(videos[0], count):
+            picture.save(place / f"{number:06d}.jpg", quality=95)
+        taken = len(list(place.iterdir()))
+        place.chmod(0o755)
+        place.replace(images)  # whole or not at all
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    _log.info(
+        "%s: %d frames of %s are taken, the sharpest of as many equal parts; they are in %s, objects.frames takes "
+        "others once that is deleted", name, taken, videos[0].name, images,
+    )  # fmt: skip
+
+
+def _sharpest(video: Path, count: int) -> Iterator[tuple[int, Image.Image]]:
+    """Yield the number and the picture of the sharpest frame in each of at most ``count`` equal parts of a video."""
+    import av  # ffmpeg's libraries; loaded for videos alone
+
+    try:
+        with av.open(video) as container:
+            if not container.streams.video:
+                raise ValueError(f"{video}: holds no pictures")
+            total = sum(packet.size > 0 for packet in container.demux(video=0))
+        with av.open(video) as container:
+            frames = enumerate(container.decode(video=0))
+            for _, part in groupby(frames, lambda numbered: numbered[0] * count // max(count, total)):
+                number, frame = max(part, key=lambda numbered: _sharpness(numbered[1]))
+                # Telephones store what the sensor saw, and by how much a player is to turn it.
+                yield number, frame.to_image().rotate(frame.rotation, expand=True)
+    except av.FFmpegError as error:
+        raise ValueError(f"{video}: cannot be read as a video: {error.strerror}") from error
+
+
+def _sharpness(frame: Any) -> float:
+    """Return the mean square of a frame's second derivatives."""
+    part = min(1.0, JUDGED_AT / max(frame.width, frame.height))
+    grey = frame.reformat(round(part * frame.width), round(part * frame.height), "gray").to_ndarray()
+    return float(np.square(laplace(grey.astype(np.float32))).mean())
