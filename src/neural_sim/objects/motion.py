@@ -60,7 +60,7 @@ class Colmap:
     """
 
     picture_size: Annotated[int, Ge(200)] = 1000
-    features: Annotated[int, Ge(200)] = 4096
+    features: Annotated[int, Ge(200)] = 1500
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     overlap: PositiveInt = 10
     region: Literal["auto", "all", "object"] = "auto"
