@@ -40,7 +40,7 @@ PHOTOGRAPHED = ("neural_sim.objects.photos.Photos", "neural_sim.objects.co3d.Co3
 """Classes of objects whose views are photographs."""
 
 
-def view_size(source: str, of_meshes: int, of_photographs: int) -> int:
+def view_size(source: str | None, of_meshes: int, of_photographs: int) -> int:
     """Choose the size of views by the class of the objects' source."""
     return of_photographs if source in PHOTOGRAPHED else of_meshes
 

@@ -86,7 +86,7 @@ def overlap(made, context):
 
 
 def debris(made, context):
-    """What draws from p_psi show outside of the mesh, grown by some pixels, and inside of it, in parts of what it shows."""
+    """How much draws from p_psi show outside of the grown mesh, and inside of it, in parts of what the mesh shows."""
     graph, distribution = context.graph, context.experiment.imaging.distribution
     stage = graph.views[0]
     source = context.experiment.imaging.objects
