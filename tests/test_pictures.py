@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps, PngImagePlugin
 
+from neural_sim.masks import read_mask
 from neural_sim.pictures import (
     alpha_of,
     check_headers,
@@ -16,7 +17,6 @@ from neural_sim.pictures import (
     picture_files,
     read_grid,
     read_header,
-    read_mask,
     read_picture,
 )  # fmt: skip
 
@@ -318,3 +318,58 @@ def test_grids_have_one_channel_and_the_photographs_size(tmp_path):
         read_grid(path, (6, 8))
     depth = (1000 * RAMP).astype(np.uint16)
     assert np.array_equal(read_grid(saved(path, Image.fromarray(depth)), (8, 6)), depth)
+
+
+# --- what the table of bug reports does not have ---
+
+
+def test_the_first_of_several_pictures_in_a_file_is_taken_with_a_word(tmp_path, caplog):
+    first, second = Image.fromarray(PIXELS), Image.new("RGB", (8, 6))
+    for name, more in (("pages.tif", {}), ("moving.webp", {"lossless": True}), ("moving.png", {})):
+        path = saved(tmp_path / name, first, save_all=True, append_images=[second], **more)
+        assert read_header(path).shown == (8, 6)
+        assert np.array_equal(read_picture(path).convert("RGB"), PIXELS), name
+        assert f"{path}: holds 2 pictures, the first is taken" in caplog.text
+
+
+def test_pictures_of_other_formats_are_left_out_with_a_count(tmp_path, caplog):
+    saved(tmp_path / "a.jfif", Image.fromarray(PIXELS), format="JPEG")
+    for name in ("b.HEIC", "c.gif", "._d.heic"):
+        (tmp_path / name).write_bytes(b"?")
+    assert [path.name for path in picture_files(tmp_path)] == ["a.jfif"]
+    assert f"{tmp_path}: 2 files such as b.HEIC are of a format that is not read, and left out" in caplog.text
+
+
+def shades(*values, dtype=np.uint8):
+    """A picture of areas in these greys, on black."""
+    grid = np.zeros((60, 80), dtype)
+    for number, value in enumerate(values):
+        grid[10:50, 5 + 25 * number : 25 + 25 * number] = value
+    return Image.fromarray(grid)
+
+
+@pytest.mark.parametrize(
+    ("name", "picture"),
+    [
+        ("labels.png", shades(100, 200)),
+        ("white_too.png", shades(90, 180, 255)),
+        ("labels16.png", shades(700, 1400, dtype=np.uint16)),
+        ("colours.jpg", Image.merge("RGB", [shades(255, 0), shades(0, 0), shades(0, 255)])),
+    ],
+)
+def test_labels_in_greys_are_no_opacities(tmp_path, name, picture):
+    with pytest.raises(ValueError, match=rf"{name}: holds \d+ shades; .*objects\.mask_value"):
+        read_mask(saved(tmp_path / name, picture))
+
+
+def test_soft_edges_and_narrow_uncertain_ones_are_opacities(tmp_path):
+    grid = np.zeros((60, 80), np.uint8)
+    grid[10:50, 10:60] = 128  # a trimap
+    grid[14:46, 14:56] = 255
+    assert set(np.unique(read_mask(saved(tmp_path / "trimap.png", Image.fromarray(grid))))) == {
+        0.0,
+        np.float32(128 / 255),
+        1.0,
+    }
+    small = Image.fromarray(grid).resize((13, 10), Image.Resampling.BILINEAR)
+    assert read_mask(saved(tmp_path / "small.png", small)).max() == 1.0

@@ -1,4 +1,4 @@
-"""The one reader of pictures and masks: targets, predictions, backgrounds, cut-outs, captures and textures.
+"""The one reader of pictures: targets, predictions, backgrounds, cut-outs, captures and textures.
 
 Pictures become 8-bit RGB or RGBA as a viewer shows them, upright by their EXIF orientation. White is 65535 in grey of
 16 bits and 1 in floats. What cannot be read is a ``ValueError`` of one line that names the file.
@@ -15,14 +15,15 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from PIL import ExifTags, Image
 
 _log = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 """Width and height in pixels."""
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".png", ".bmp", ".webp", ".tif", ".tiff")
+OTHER_FORMATS = (".heic", ".heif", ".avif", ".gif", ".jxl", ".exr", ".dng", ".cr2", ".nef", ".arw", ".raw")
+"""Pictures that are not read: those of telephones, cameras, the web and renderers."""
 CUTOUT_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
 """Formats with an alpha channel."""
 LEFTOVERS = frozenset({"__MACOSX", "@eaDir", ".ipynb_checkpoints", ".thumbnails", ".Trashes", "$RECYCLE.BIN"})
@@ -40,13 +41,8 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 """What turns a picture upright, by its EXIF orientation."""
-_LOSSY = ("JPEG", "MPO", "WEBP")
-_WHITE = 65535.0
+WHITE = 65535.0
 """White of 16 bits."""
-_MOST_LABELS = 32
-"""A mask whose largest value is below it holds labels, if there are more than two values."""
-_SPREAD = 32
-"""How far the channels of a grey pixel may differ, in a mask that has been compressed once."""
 
 
 # --- files ---
@@ -54,8 +50,24 @@ _SPREAD = 32
 
 def picture_files(root: Path, suffixes: Collection[str] = PHOTO_SUFFIXES) -> list[Path]:
     """List the pictures under a folder, at any depth, by name; leftovers of other programs are counted in the log."""
-    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
-    return without_leftovers(found, root)
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    say_strange(root, files, OTHER_FORMATS)
+    return without_leftovers([path for path in files if path.suffix.lower() in suffixes], root)
+
+
+def say_strange(root: Path, files: Iterable[Path], suffixes: Collection[str]) -> list[str]:
+    """Count the files of formats that are not read in the log, and return their names."""
+    strange = [
+        path.name for path in files if path.suffix.lower() in suffixes and not _left_over(Path(path.name))
+    ]
+    if strange:
+        _say_once(
+            "%s: %d files such as %s are of a format that is not read, and left out",
+            root,
+            len(strange),
+            strange[0],
+        )
+    return strange
 
 
 def without_leftovers(paths: Sequence[Path], root: Path) -> list[Path]:
@@ -63,7 +75,8 @@ def without_leftovers(paths: Sequence[Path], root: Path) -> list[Path]:
     kept = [path for path in paths if not _left_over(path.relative_to(root))]
     if len(kept) < len(paths):
         example = next(path for path in paths if _left_over(path.relative_to(root)))
-        _say_left_out(root, len(paths) - len(kept), example)
+        left_out = len(paths) - len(kept)
+        _say_once("%s: %d leftovers of other programs are left out, such as %s", root, left_out, example)
     return kept
 
 
@@ -71,9 +84,9 @@ def _left_over(path: Path) -> bool:
     return any(part in LEFTOVERS or part.startswith(APPLE_DOUBLE) for part in path.parts)
 
 
-@lru_cache(maxsize=1024)  # once, however often a folder is listed
-def _say_left_out(root: Path, count: int, example: Path) -> None:
-    _log.warning("%s: %d leftovers of other programs are left out, such as %s", root, count, example)
+@lru_cache(maxsize=1024)  # once, however often a folder is listed or a picture is read
+def _say_once(message: str, *about: object) -> None:
+    _log.warning(message, *about)
 
 
 # --- headers ---
@@ -121,6 +134,11 @@ def read_header(path: Path, where: str = "") -> Header:
         ValueError: no such file, or one whose head is not a picture's.
     """
     with _named(where or str(path)), Image.open(path) as image:
+        count = (
+            1 if image.format == "MPO" else getattr(image, "n_frames", 1)
+        )  # telephones keep a depth map there
+        if count > 1:
+            _say_once("%s: holds %d pictures, the first is taken", path, count)
         return Header(image.size, _orientation(image), image.mode, image.format, image.has_transparency_data)
 
 
@@ -194,7 +212,7 @@ def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) ->
         ValueError: no such file, one that cannot be read to its end, or a mode that has no known black and white.
     """
     where = where or str(path)
-    image, orientation = _loaded(path, where)
+    image, orientation = load(path, where)
     image = eight_bits(image, where)
     if upright and orientation in _UPRIGHT:
         image = image.transpose(_UPRIGHT[orientation])
@@ -202,7 +220,8 @@ def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) ->
     return image
 
 
-def _loaded(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
+def load(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
+    """Read a picture as it is stored, and its EXIF orientation. Raises ``ValueError`` where it cannot be read."""
     with _named(where), Image.open(path) as image:
         orientation = _orientation(image)
         image.load()
@@ -238,7 +257,7 @@ def refuse_mode(mode: str, format: str | None, where: str) -> None:
 
 def _scaled(image: Image.Image, where: str) -> Image.Image:
     """Scale grey of 16 bits, or of floats in [0, 1], to 8 bits."""
-    values, white = np.asarray(image), 1.0 if image.mode == "F" else _WHITE
+    values, white = np.asarray(image), 1.0 if image.mode == "F" else WHITE
     if not (values.size and values.min() >= 0 and values.max() <= white):  # NaN is refused too
         raise ValueError(
             f"{where}: pictures of mode {image.mode} want values from 0 to {white:g}, got "
@@ -261,7 +280,7 @@ def alpha_of(picture: Image.Image) -> Image.Image | None:
     return None if alpha.getextrema() == (255, 255) else alpha
 
 
-# --- masks and grids ---
+# --- grids ---
 
 
 def read_grid(path: Path, size: Size | None = None) -> np.ndarray:
@@ -276,103 +295,7 @@ def read_grid(path: Path, size: Size | None = None) -> np.ndarray:
     """
     if size is not None and (got := read_header(path).stored) != size:
         raise ValueError(f"{path}: is {by(got)} pixels, its photograph {by(size)}")
-    grid = np.asarray(_loaded(path, str(path))[0])
+    grid = np.asarray(load(path, str(path))[0])
     if grid.ndim != 2:
         raise ValueError(f"{path}: want one channel, got {grid.shape[2]}")
     return grid
-
-
-def read_mask(path: Path, value: int | None = None) -> Float[np.ndarray, "height width"]:
-    """Read a mask's opacity in [0, 1].
-
-    Args:
-        path: the file.
-        value: the object's, in an image of labels (grey values, or indices of a palette); None: as follows.
-
-    Two values, whichever they are, are the background and the object, the darker or smaller being the background; one
-    value other than 0 is the object. More values of grey are opacities by the format's white. Of a coloured palette the
-    index counts. A picture with an alpha channel is a mask by its alpha where that says something, else by its colours.
-
-    Raises:
-        ValueError: a file that cannot be read, or several labels or colours, of which none is known to be the object's;
-            colours where ``value`` is given.
-    """
-    image, where = _loaded(path, str(path))[0], str(path)
-    if value is not None:
-        labels = np.asarray(image)
-        if labels.ndim != 2:
-            raise ValueError(
-                f"{where}: want labels in one channel for objects.mask_value={value}, got {image.mode}"
-            )
-        return (labels == value).astype(np.float32)
-    lossy = image.format in _LOSSY
-    if image.has_transparency_data:
-        picture = eight_bits(image, where)
-        alpha = alpha_of(picture)
-        if alpha is not None and alpha.getextrema()[0] != alpha.getextrema()[1]:
-            return np.asarray(alpha, dtype=np.float32) / 255.0
-        return _coloured(picture.convert("RGB"), where, lossy)
-    if image.mode == "P":
-        colours = image.convert("RGB")
-        return _coloured(colours, where, lossy) if _is_grey(colours) else _labels(np.asarray(image), where)
-    if image.mode in ("1", "L", "F") or image.mode.startswith("I"):
-        return _grey(np.asarray(image), where, lossy)
-    return _coloured(eight_bits(image, where).convert("RGB"), where, lossy)
-
-
-def _grey(values: np.ndarray, where: str, lossy: bool = False) -> Float[np.ndarray, "height width"]:
-    """Return the opacity that numbers of one channel say."""
-    if values.dtype == bool:
-        return values.astype(np.float32)
-    levels = np.unique(values)
-    if not lossy and len(levels) <= 2:
-        return _two(values, levels)
-    whole = values.dtype != np.float32
-    if whole and not lossy and levels[-1] < _MOST_LABELS:
-        raise ValueError(_several(where, "labels", len(levels)))
-    white = 255.0 if values.dtype == np.uint8 else _WHITE if whole else 1.0
-    if not (levels[0] >= 0 and levels[-1] <= white):
-        raise ValueError(
-            f"{where}: a mask wants values from 0 to {white:g}, got {levels[0]:g} to {levels[-1]:g}"
-        )
-    return values.astype(np.float32) / np.float32(white)
-
-
-def _coloured(picture: Image.Image, where: str, lossy: bool) -> Float[np.ndarray, "height width"]:
-    """Return the opacity that colours say."""
-    light = np.asarray(picture.convert("L"))
-    if lossy or _is_grey(picture):
-        return _grey(light, where, lossy)
-    colours, places = np.unique(np.asarray(picture).reshape(-1, 3), axis=0, return_inverse=True)
-    if len(colours) > 2:
-        raise ValueError(_several(where, "colours", len(colours)))
-    if len(colours) == 1:
-        return np.full(light.shape, float(colours.any()), dtype=np.float32)
-    darker = int(colours.sum(1).argmin())
-    return (places.reshape(light.shape) != darker).astype(np.float32)
-
-
-def _labels(values: np.ndarray, where: str) -> Float[np.ndarray, "height width"]:
-    levels = np.unique(values)
-    if len(levels) > 2:
-        raise ValueError(_several(where, "labels", len(levels)))
-    return _two(values, levels)
-
-
-def _two(values: np.ndarray, levels: np.ndarray) -> Float[np.ndarray, "height width"]:
-    """Return 1 where the larger of two values stands; a single one other than 0 is the object."""
-    if len(levels) == 1:
-        return np.full(values.shape, float(levels[0] > 0), dtype=np.float32)
-    return (values == levels[-1]).astype(np.float32)
-
-
-def _several(where: str, what: str, count: int) -> str:
-    return (
-        f"{where}: holds {count} {what}; want a mask of one object, with two values or with opacities in grey; of "
-        "labels, objects.mask_value says which is the object's"
-    )
-
-
-def _is_grey(picture: Image.Image) -> bool:
-    values = np.asarray(picture).astype(np.int16)
-    return bool((values.max(-1) - values.min(-1)).max(initial=0) <= _SPREAD)

@@ -148,3 +148,19 @@ def test_real_scans_load_with_mended_normals(shared_data, caplog):
         assert item.mesh.visual.material.image.size[0] >= 1024
     assert pitcher.transform[0, 0] == pytest.approx(0.136, abs=0.002)  # 24 cm tall
     assert "007_tuna_fish_can" in caplog.text
+
+
+def test_meshes_of_other_formats_are_left_out_with_a_count(tmp_path, caplog):
+    trimesh.creation.box().export(tmp_path / "a.ply")
+    (tmp_path / "b").mkdir()
+    for name in ("c.fbx", "b/d.USDZ"):
+        (tmp_path / name).write_bytes(b"?")
+    assert MeshFolder(tmp_path).names() == ["a"]
+    assert f"{tmp_path}: 2 files such as d.USDZ are of a format that is not read, and left out" in caplog.text
+
+
+def test_the_home_folder_is_written_short(tmp_path, ycb_root, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    assert MeshFolder("~", ["box"]).names() == ["box"]
+    assert YCB("~/ycb").names() == ["001_red_thing", "002_blue_thing"]

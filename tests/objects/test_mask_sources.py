@@ -9,9 +9,9 @@ import torch
 from captures import capture
 from PIL import Image
 
+from neural_sim.masks import read_mask
 from neural_sim.objects.mask_command import MaskCommand
 from neural_sim.objects.photos import Photos
-from neural_sim.pictures import read_mask
 
 BRIGHT = """
 import sys

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +11,18 @@ from jaxtyping import Float
 from PIL import ExifTags
 
 from neural_sim.pictures import (
+    OTHER_FORMATS,
     PHOTO_SUFFIXES,
     Header,
     Size,
     picture_files,
     read_exif,
     read_header,
+    say_strange,
     without_leftovers,
 )
 
-_log = logging.getLogger(__name__)
-
 FOLDER = "images"
-OTHER_FORMATS = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw", ".raw")
-"""Formats of telephones and cameras that are not read."""
 FILM_DIAGONAL = 43.27
 """Millimetres of the 36 x 24 mm film that EXIF's equivalent focal length is of."""
 UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
@@ -85,21 +82,19 @@ def read_album(folder: Path, name: str) -> Album:
     Raises:
         ValueError: a photograph that cannot be read, or a folder without any.
     """
-    strange = [path.name for path in _files(folder) if path.suffix.lower() in OTHER_FORMATS]
-    if strange:
-        _log.warning(
-            "%s: %d files such as %s are of a format that is not read, and left out; convert them to JPEG",
-            folder, len(strange), strange[0],
-        )  # fmt: skip
+    strange = say_strange(folder, _files(folder), OTHER_FORMATS)
     pictures = pictures_of(folder)
     if not pictures:
         raise ValueError(f"{folder}: {_without_pictures(strange)}")
     return Album(name, folder, tuple(_shot(path) for path in pictures))
 
 
+def _home(folder: Path) -> Path:
+    return folder / FOLDER if (folder / FOLDER).is_dir() else folder
+
+
 def _files(folder: Path) -> list[Path]:
-    inner = folder / FOLDER
-    return sorted(path for path in (inner if inner.is_dir() else folder).iterdir() if path.is_file())
+    return sorted(path for path in _home(folder).iterdir() if path.is_file())
 
 
 def _without_pictures(strange: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ WIDEST = 3.0
 """Tangent of the largest angle off the axis at which a perspective lens's distortion is examined."""
 FARTHEST = 1e3
 """Tangent of the largest angle off the axis that a pixel of a perspective lens is taken to have."""
+FOCAL_LENGTHS = (0.05, 1000.0)
+"""Least and largest focal length in the longer side of the image: 170 degrees, and a telescope."""
 BISECTIONS = 64
 REPETITIONS = 12
 
@@ -34,7 +37,8 @@ class Lens:
     p2. ``fisheye``: r is the angle off the axis, and there is no tangential term.
 
     Raises:
-        ValueError: a size or a focal length that is not positive, or a number that is not finite.
+        ValueError: a size or a focal length that is not positive, a number that is not finite, or one that is in
+            another unit than pixels.
     """
 
     width: int
@@ -54,6 +58,14 @@ class Lens:
             raise ValueError(f"want a size of pixels and finite numbers, got {self}")
         if not (self.fx > 0.0 and self.fy > 0.0):
             raise ValueError(f"want positive focal lengths, got {self.fx} and {self.fy}")
+        low, high = (factor * max(self.width, self.height) for factor in FOCAL_LENGTHS)
+        if not (low <= self.fx <= high and low <= self.fy <= high):
+            raise ValueError(
+                f"want focal lengths in pixels, {low:g} to {high:g} for {self.width} x {self.height}, got {self.fx:g} "
+                f"and {self.fy:g}"
+            )
+        if max(self.width, self.height) > 2 and 0.0 < self.cx <= 1.0 and 0.0 < self.cy <= 1.0:
+            raise ValueError(f"want cx and cy in pixels, got the fractions {self.cx:g} and {self.cy:g}")
 
     def resized(self, width: int, height: int) -> Lens:
         """The lens for the same photograph in another size."""
@@ -152,6 +164,9 @@ class Frame:
 class Capture:
     """The photographs of an object. ``source`` is the file or folder with their cameras, ``files`` are all files that
     were read, ``up`` is the world's up direction in the capture's frame, None if the source does not give it.
+
+    Raises:
+        ValueError: a photograph that comes twice, or cameras that all stand at one place.
     """
 
     name: str
@@ -159,6 +174,20 @@ class Capture:
     source: Path
     files: tuple[Path, ...]
     up: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        first: dict[str, int] = {}
+        for number, frame in enumerate(self.frames):
+            before = first.setdefault(os.path.abspath(frame.image), number)
+            if before != number:
+                raise ValueError(
+                    f"{self.source}: two of its poses are of {frame.image}: which one holds is not known"
+                )
+        places = np.array([frame.camera_to_world[:3, 3] for frame in self.frames])
+        if len(places) > 1 and (places == places[0]).all():
+            raise ValueError(
+                f"{self.source}: its {len(places)} cameras all stand at {places[0].tolist()}, want them round it"
+            )
 
 
 def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
@@ -198,6 +227,10 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
         raise ValueError(
             f"{where}: its first three rows and columns are no rotation (R R^T is {error:.2g} from the identity, "
             f"determinant {np.linalg.det(rotation):.3g})"
+        )
+    if len(pose) == 4 and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=ROTATION_TOLERANCE):
+        raise ValueError(
+            f"{where}: want 0, 0, 0, 1 as its last row, got {pose[3].tolist()}; is it transposed?"
         )
     whole = np.eye(4)
     whole[:3] = pose[:3]

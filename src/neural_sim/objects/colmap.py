@@ -13,7 +13,14 @@ from jaxtyping import Float
 
 from neural_sim.extras import require
 from neural_sim.interruption import signals_kept
-from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose, say_missing
+from neural_sim.objects.capture import (
+    ROTATION_TOLERANCE,
+    Capture,
+    Frame,
+    Lens,
+    checked_pose,
+    say_missing,
+)
 from neural_sim.pictures import by, read_header
 
 _log = logging.getLogger(__name__)
@@ -119,13 +126,22 @@ def _reconstruction(folder: Path) -> Any:
 
 
 def _names(path: Path) -> dict[int, str]:
-    """Return the names of a text model's images, whole: pycolmap ends them at their first space."""
+    """Return the names of a text model's images, whole: pycolmap ends them at their first space.
+
+    Raises:
+        ValueError: images without a line of points after their own, of which pycolmap would read every second one.
+    """
     names, lines = {}, iter(path.read_text(encoding="utf-8-sig").split("\n"))
     for line in lines:
         words = line.strip().split(None, 9)
         if words and not words[0].startswith("#"):
             names[int(words[0])] = words[9]
-            next(lines, None)  # the image's points
+            points = next(lines, "").split()
+            if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
+                raise ValueError(
+                    f"{path.name}: want two lines an image, the second with its points, or empty; after the one of "
+                    f"{words[9]} comes {' '.join(points):.60}"
+                )
     return names
 
 
@@ -147,8 +163,12 @@ def posed(image: Any, read: Any, where: str) -> tuple[Float[np.ndarray, "4 4"], 
     Raises:
         ValueError: a pose that is no rotation, or an unknown camera model.
     """
+    moved = image.cam_from_world()
+    length = float(np.linalg.norm(moved.rotation.quat))
+    if not abs(length - 1.0) < ROTATION_TOLERANCE:
+        raise ValueError(f"{where}: want a quaternion of length 1, got {length:g}")
     world_to_camera = np.eye(4)
-    world_to_camera[:3] = image.cam_from_world().matrix()
+    world_to_camera[:3] = moved.matrix()
     pose = checked_pose(np.linalg.inv(world_to_camera) @ OPENCV_TO_OPENGL, where)
     return pose, _lens(read.cameras[image.camera_id], where)
 

@@ -198,7 +198,7 @@ class MeshFiles:
 
 def folder_of(root: str | Path) -> Path:
     """The folder; raises ``ValueError`` if it does not exist."""
-    path = Path(root)
+    path = Path(root).expanduser()
     if not path.is_dir():
         raise ValueError(f"objects.root: {path} is not a folder")
     return path

@@ -6,13 +6,15 @@ import logging
 from pathlib import Path
 
 from neural_sim.objects.files import MeshFiles, Names, folder_of
-from neural_sim.pictures import without_leftovers
+from neural_sim.pictures import say_strange, without_leftovers
 from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
 
 # In order of preference, for a sub-folder with one object in several formats.
 FORMATS = (".glb", ".obj", ".ply", ".stl", ".gltf")
+OTHER_FORMATS = (".fbx", ".dae", ".off", ".3ds", ".3mf", ".blend", ".usd", ".usdz", ".usdc", ".stp", ".drc")
+"""Meshes that are not read."""
 
 
 @validated
@@ -33,6 +35,7 @@ class MeshFolder(MeshFiles):
 
 def _find(root: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
+    say_strange(root, sorted(path for path in root.rglob("*") if path.is_file()), OTHER_FORMATS)
     for entry in without_leftovers(sorted(root.iterdir()), root):
         if entry.is_dir():
             meshes = without_leftovers(sorted(path for path in entry.rglob("*") if _is_mesh(path)), entry)

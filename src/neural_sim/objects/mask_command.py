@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.masks import read_mask
 from neural_sim.objects.pictures import refuse_size
-from neural_sim.pictures import picture_files, read_mask, read_picture
+from neural_sim.pictures import picture_files, read_picture
 
 PLACES = ("{images}", "{masks}")
 KEY = "objects.mask_command"

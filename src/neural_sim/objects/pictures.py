@@ -15,8 +15,9 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
+from neural_sim.masks import read_mask
 from neural_sim.objects.capture import Capture, Frame
-from neural_sim.pictures import Size, alpha_of, by, read_header, read_mask, read_picture
+from neural_sim.pictures import Size, alpha_of, by, read_header, read_picture
 from neural_sim.ranges import Matching, validated
 
 Masks = Literal["auto", "alpha", "files", "scene", "command"]

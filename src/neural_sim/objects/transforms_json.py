@@ -21,6 +21,8 @@ HELD_OUT = "held out"
 """Key under which the files of frames that score are kept beside what the file says."""
 POSE = "transform_matrix"
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "k5", "k6")
+"""Keys of lenses that are not read: instant-ngp's, and the divisor of OpenCV's full model."""
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -199,6 +201,9 @@ def _lens(values: Mapping[str, Any], header: Header, where: str) -> Lens:
         raise ValueError(
             f"{where}: camera_model: want one of {', '.join((*PERSPECTIVE, 'OPENCV_FISHEYE'))}, got {model!r}"
         )
+    strange = [key for key in OTHER_LENSES if values.get(key)]
+    if strange:
+        raise ValueError(f"{where}: {strange[0]}: lenses with it are not read; undistort the photographs")
     if "fl_x" not in values and "camera_angle_x" not in values:
         raise ValueError(f"{where}: want intrinsics fl_x or camera_angle_x, of the frame or of the file")
     fx = number("fl_x", 0.0) if "fl_x" in values else focal("camera_angle_x", width)

@@ -27,7 +27,7 @@ class YCB(MeshFiles):
     """
 
     def __init__(self, root: str | Path, names: Names = None) -> None:
-        folder = Path(root)
+        folder = Path(root).expanduser()
         files = {path.parts[-3]: path for path in folder.glob("*/google_16k/textured.obj")}
         if not files:
             raise ValueError(f"objects.root: {folder} holds no {LAYOUT}; {ORIGIN}")
