@@ -223,9 +223,19 @@ def read_picture(path: Path | BytesIO, where: str = "", upright: bool = True) ->
 def load(path: Path | BytesIO, where: str) -> tuple[Image.Image, int]:
     """Read a picture as it is stored, and its EXIF orientation. Raises ``ValueError`` where it cannot be read."""
     with _named(where), Image.open(path) as image:
-        orientation = _orientation(image)
-        image.load()
-        return image, orientation
+        if image.format != "PNG":
+            return _whole(image)
+        image.verify()  # checksums, which decoding does not look at
+    if isinstance(path, BytesIO):
+        path.seek(0)
+    with _named(where), Image.open(path) as image:
+        return _whole(image)
+
+
+def _whole(image: Image.Image) -> tuple[Image.Image, int]:
+    orientation = _orientation(image)
+    image.load()
+    return image, orientation
 
 
 def eight_bits(image: Image.Image, where: str = "picture") -> Image.Image:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from damage import damaged
 from PIL import Image
 
 from neural_sim.objects.files import load_file, references
@@ -41,23 +42,6 @@ def sound(tmp_path_factory):
         corners.export(root / f"{name}.ply", encoding=encoding)
     corners.export(root / "m.stl")
     return {path: path.read_bytes() for path in sorted(root.iterdir()) if path.suffix != ".png"}
-
-
-def damaged(data: bytes, generator: np.random.Generator) -> bytes:
-    """Cut off, with flipped bits, with a block of zeros, or with bytes taken out."""
-    changed = bytearray(data)
-    place = int(generator.integers(len(data)))
-    match generator.integers(4):
-        case 0:
-            return data[:place]
-        case 1:
-            for at in generator.integers(len(data), size=generator.integers(1, 6)):
-                changed[at] ^= 1 << int(generator.integers(8))
-        case 2:
-            changed[place : place + 16] = bytes(min(16, len(data) - place))
-        case _:
-            del changed[place : place + int(generator.integers(1, 9))]
-    return bytes(changed)
 
 
 @pytest.mark.parametrize("name", ["m.obj", "m.mtl", "m.glb", "binary.ply", "text.ply", "m.stl"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import MinLen
 
+from neural_sim.documents import read_json
 from neural_sim.objects.files import MeshFiles, folder_of, load_file
 from neural_sim.objects.mesh import ObjectMesh
 from neural_sim.ranges import validated
@@ -65,7 +65,7 @@ class BOP(MeshFiles):
             log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
             return {}
         try:
-            info = json.loads(self._info.read_text())
+            info = read_json(self._info)
             return {str(int(number)): float(entry["diameter"]) for number, entry in info.items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{self._info}: want {{number: {{'diameter': mm}}}}: {error}") from error

@@ -98,7 +98,10 @@ def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
 
     try:
         read = _reconstruction(folder)
-        return read, {number: image for number, image in read.images.items() if image.has_pose}
+        named = {
+            number: image for number, image in read.images.items() if image.name is not None
+        }  # all decoded
+        return read, {number: image for number, image in named.items() if image.has_pose}
     except Exception as error:  # pycolmap raises whatever its C++ checks raise
         reason = " ".join(str(error).split())
         raise ValueError(
@@ -111,6 +114,10 @@ def _reconstruction(folder: Path) -> Any:
     import pycolmap
 
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    if suffix == ".bin":
+        for name in ("cameras", "rigs", "frames", "images", "points3D"):
+            if (folder / f"{name}.bin").is_file():
+                _check_counts(folder / f"{name}.bin", name)
     if (folder / f"points3D{suffix}").is_file():
         read = pycolmap.Reconstruction(str(folder))
     else:
@@ -123,6 +130,43 @@ def _reconstruction(folder: Path) -> Any:
         for number, name in _names(folder / "images.txt").items():
             read.images[number].name = name
     return read
+
+
+def _check_counts(path: Path, kind: str) -> None:
+    """Refuse a binary file whose counts lead beyond its end: pycolmap would go on reading for hours.
+
+    Raises:
+        ValueError: such a file.
+    """
+    data, at = path.read_bytes(), 0
+
+    def take(size: int) -> int:
+        """Pass over some bytes, and return the number that they are."""
+        nonlocal at
+        at += size
+        if at > len(data):
+            raise ValueError(f"{path.name} ends too early: it is damaged, or a count in it is")
+        return int.from_bytes(data[at - size : at], "little")
+
+    for _ in range(take(8)):
+        if kind == "cameras":
+            take(24)  # its parameters differ from model to model
+        elif kind == "rigs":
+            sensors = take(8) >> 32
+            for number in range(sensors):
+                take(8)
+                if number and take(1):
+                    take(56)
+        elif kind == "frames":
+            take(64)
+            take(16 * take(4))
+        elif kind == "images":
+            take(64)
+            take(data.find(b"\0", at) + 1 - at if b"\0" in data[at:] else len(data))
+            take(24 * take(8))
+        else:
+            take(43)
+            take(8 * take(8))
 
 
 def _names(path: Path) -> dict[int, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.documents import read_json
 from neural_sim.parameter.product import SceneDistribution
 
 
@@ -31,7 +31,7 @@ def psi_of_file(
             f"{file}, which does not exist"
         )
     try:
-        stored = json.loads(file.read_text(encoding="utf-8"))["psi"]
+        stored = read_json(file)["psi"]
         rows = [[_numbers(stored, name, factor.name) for factor in distribution.factors] for name in names]
     except KeyError as error:
         raise ValueError(

@@ -7,6 +7,8 @@ line <scene>/<frame> for each frame.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import scipy.io
-from scipy.io.matlab import MatReadError
 from typing_extensions import override
 
 from neural_sim.extras import require
@@ -42,6 +43,8 @@ CLASSES = (
 )  # fmt: skip
 """The data set's classes 1 to 21, whose names are those of the objects' folders."""
 Box = tuple[float, float, float, float]
+_ELEMENTS, _MATRIX, _COMPRESSED = frozenset({*range(1, 8), 9, *range(12, 19)}), 14, 15
+"""Types of the elements of a MATLAB file, version 5."""
 
 
 @validated
@@ -97,7 +100,7 @@ class YcbVideoTarget(PosedTarget):
                 return None
             raise ValueError(f"target.{key}: no such file: {path}")
         names = []
-        for number, line in enumerate(path.read_text(encoding="utf-8").split(), 1):
+        for number, line in enumerate(_text(path).split(), 1):
             scene, _, frame = line.removeprefix("data/").rpartition("/")
             if scene == "data_syn":  # rendered images, which are no target
                 continue
@@ -206,10 +209,7 @@ def _poses(poses: np.ndarray, classes: Sequence[int], meta: Path) -> list[np.nda
 
 def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
     """Read the boxes of whole projections by class, along pixel edges and clipped to the image; None: outside of it."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise ValueError(f"{path}: not readable ({error})") from error
+    lines = _text(path).splitlines()
     boxes: dict[str, Box | None] = {}
     for number, words in enumerate(map(str.split, lines), 1):
         if len(words) != 5:
@@ -220,6 +220,13 @@ def _boxes(path: Path, size: tuple[int, int]) -> dict[str, Box | None]:
     return boxes
 
 
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not readable ({error})") from error
+
+
 def _visibility(visible: Box | None, whole: Box | None) -> float:
     if visible is None:
         return 0.0
@@ -227,6 +234,38 @@ def _visibility(visible: Box | None, whole: Box | None) -> float:
         return 1.0
     areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (visible, whole)]
     return min(1.0, areas[0] / areas[1])
+
+
+def _check_elements(data: bytes, order: str) -> None:
+    """Check the tags of a MATLAB file's elements, and of those in them: scipy crashes on types that there are not.
+
+    Args:
+        data: elements one after the other: type and size, or both in four bytes for those of up to four, then content.
+        order: of bytes, ``<`` or ``>``.
+
+    Raises:
+        ValueError: a type that is unknown, or an element beyond the end.
+    """
+    at = 0
+    while at < len(data):
+        if at + 8 > len(data):
+            raise ValueError("ends within an element")
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        short = kind >> 16
+        if short:
+            kind, size, start = kind & 0xFFFF, short, at + 4
+        else:
+            start = at + 8
+        if kind not in _ELEMENTS or start + size > len(data) or (short and size > 4):
+            raise ValueError(f"an element has the type {kind} and {size} bytes")
+        content = data[start : start + size]
+        if kind == _COMPRESSED:
+            _check_elements(zlib.decompress(content), order)
+        elif kind == _MATRIX:
+            _check_elements(content, order)
+        at = start + (4 if short else size)
+        if kind != _COMPRESSED:
+            at += -at % 8
 
 
 def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -250,9 +289,12 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
                     if isinstance(file.get(name), h5py.Dataset)
                 }
         else:
+            data = path.read_bytes()
+            _check_elements(data[128:], "<" if data[126:128] == b"IM" else ">")
             found = scipy.io.loadmat(path, variable_names=list(names))
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
-        raise ValueError(f"{path}: not a readable MATLAB file ({error})") from error
+    except Exception as error:  # both readers raise whatever damaged numbers lead to
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: not a readable MATLAB file ({reason})") from error
     lacking = [name for name in names if name not in found]
     if lacking:
         raise ValueError(f"{path}: lacks {lacking}")
