@@ -8,7 +8,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from neural_sim.configuration import GONE, MOVED, UserError, conf_directory, updated
+from neural_sim.configuration import GONE, MOVED, UserError, updated
+from neural_sim.main import conf_directory
 
 ROOT = Path(__file__).parents[1]
 MOVES = {
@@ -91,3 +92,17 @@ def test_the_command_line_refuses_what_is_gone():
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and not done.stdout
     assert done.stderr.strip() == f"neural-sim: baseline=none is gone: {GONE['baseline=none']}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "size"),
+    [
+        ((), 96),
+        (("objects=photos", "objects.root=x"), 160),
+        (("objects=co3d", "objects.root=x"), 160),
+        (("objects=photos", "objects.root=x", "views.image_size=128"), 128),
+    ],
+)
+def test_views_of_photographs_are_larger_unless_told(overrides, size):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        assert compose("config", ["scale=quick", *overrides]).views.image_size == size

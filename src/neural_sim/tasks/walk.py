@@ -138,7 +138,9 @@ def walk(context: Context, tasks: Mapping[str, Task]) -> float | None:
             "to make: %s", ", ".join(f"{phase} {count}" for phase, count in missing.items()) or "nothing"
         )
     if phases:
-        context.account.left_out += omitted(context.graph)
+        context.account.left_out += omitted(
+            context.graph, learns=bool({"psi", "evaluate", "report"} & phases)
+        )
     with context.tracked():
         for name, task in tasks.items():
             with context.running(name):
@@ -166,8 +168,13 @@ def warn_of_uncovered(graph: Graph) -> None:
                 )  # fmt: skip
 
 
-def omitted(graph: Graph) -> list[Omission]:
-    """Return the work that a run leaves out because its scene does not need it; the log says so too."""
+def omitted(graph: Graph, learns: bool) -> list[Omission]:
+    """Return the work that a run leaves out because its scene does not need it; the log says so too.
+
+    Args:
+        graph: of the run.
+        learns: whether it comes to psi at all.
+    """
     x, draws = graph.experiment, graph.learned.draws
     method, outer, distribution = x.loop.method, x.loop.outer, x.imaging.distribution
     loops, follows = not isinstance(method, (Fixed, LabelShift)), isinstance(method, HypergradientLoop)
@@ -185,7 +192,11 @@ def omitted(graph: Graph) -> list[Omission]:
         (loops and outer.epochs > 1, "psi", "passes of the backbone's frozen stages in the loop's training",
          "their features are kept", 1.0 - 1.0 / outer.epochs),
     ]  # fmt: skip
-    found = [Omission(phase, what, why, fraction) for applies, phase, what, why, fraction in rows if applies]
+    found = [
+        Omission(phase, what, why, fraction)
+        for applies, phase, what, why, fraction in rows
+        if applies and (learns or phase != "psi")
+    ]
     for each in found:
         _log.info("left out: %s: %s", each.what, each.why)
     return found
