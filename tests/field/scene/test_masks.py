@@ -10,6 +10,7 @@ from captures import on_a_table
 from PIL import Image
 
 from neural_sim.field.scene.recipe import SceneMasks
+from neural_sim.field.scene.rendering import without_pinholes
 from neural_sim.objects.photos import Photos
 from neural_sim.objects.procedural import Procedural
 from neural_sim.renderer.raycast import RaycastRenderer
@@ -86,6 +87,19 @@ def test_masks_place_and_crop_the_object(made, masked):
     views = photos.views("mug", 10, 2, 32, pictures)
     assert views.images.shape == (12, 32, 32, 4)
     assert 0.1 < float((views.images[..., 3] > 0.5).float().mean()) < 0.9
+
+
+def test_pinholes_are_filled_and_other_holes_are_not():
+    mask = torch.zeros(60, 80)
+    mask[10:50, 0:60] = 0.9  # cut by the photograph's edge
+    mask[12:16, 20:24] = 0.1  # 16 of 2,400 pixels
+    mask[30:40, 30:45] = 0.2  # a handle's
+    mask[30:34, 0:3] = 0.0  # open to the edge: it is not enclosed
+    filled = without_pinholes(mask)
+    expected = mask.clone()
+    expected[12:16, 20:24] = 1.0
+    torch.testing.assert_close(filled, expected)
+    torch.testing.assert_close(without_pinholes(torch.zeros(4, 5)), torch.zeros(4, 5))
 
 
 def test_a_seed_gives_the_same_masks(made):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import scipy.ndimage
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,6 +20,8 @@ from neural_sim.types import Rays
 PHASES = (0.25, 0.75)
 """Shifts of the samples' lattice that a pixel averages: with one alone a surface shows the lattice's steps."""
 
+PINHOLE = 0.01
+"""Area of a hole, relative to that of the mask, below which it is filled."""
 FOG = 4.0
 """What lets one part in so many of the light pass hides nothing; what is solid lets less pass than a hundredth."""
 
@@ -45,7 +49,18 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
             weights = render_weights(sigma.masked_fill(~inside, 0.0), seen.samples)
             weights = weights * (FOG * before).clamp_max(1.0)
             mask[part] += sum_rays(weights[:, None], seen.samples)[:, 0] / len(PHASES)
-    return mask.view(height, width).clamp(0.0, 1.0)
+    return without_pinholes(mask.view(height, width).clamp(0.0, 1.0))
+
+
+def without_pinholes(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Fill holes small beside the object: where few photographs look, walls have some, but a handle's is larger."""
+    solid = (mask > 0.5).numpy()
+    holes, count = scipy.ndimage.label(~solid)  # pyright: ignore[reportGeneralTypeIssues]
+    sizes = np.bincount(holes.ravel(), minlength=count + 1)
+    edge = np.unique(np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]]))
+    small = sizes < PINHOLE * solid.sum()
+    small[[0, *edge]] = False
+    return torch.where(torch.from_numpy(small[holes]), 1.0, mask)
 
 
 def _meets(
