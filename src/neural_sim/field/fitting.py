@@ -30,6 +30,9 @@ LARGE = 0.05
 and where few look a field has pictures of its own in the air."""
 BRIDGED = 2
 """Cells by which parts are grown before they connect: a surface may have holes about pieces of itself."""
+SPREAD = 0.25
+"""Of photographs, the part of ``prune_weight`` that counts: cameras and focus that are not exact spread a surface over
+several cells, of which none shows as much, and walls had holes."""
 BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 
@@ -40,8 +43,8 @@ class GridFitting(Fitting):
 
     ``resolution`` is the final number of cells along the unit sphere's diameter; with n refinements the first is
     ``resolution`` / 2^n. ``prune_steps`` drop cells without halving. A cell stays when it or a neighbour holds a sample
-    that contributes more than ``prune_weight`` to some of ``prune_rays`` pixels. Samples behind a
-    transmittance of ``termination`` are dropped.
+    that contributes more than ``prune_weight`` (of photographs, ``SPREAD`` of it) to some of ``prune_rays`` pixels.
+    Samples behind a transmittance of ``termination`` are dropped.
     """
 
     field: GridField
@@ -133,7 +136,7 @@ class GridFitting(Fitting):
                 positions, _ = sample_points(rays.rays, samples)
                 weights = render_weights(self.field.density(self.field.raw(positions, cells)), samples)
                 largest.scatter_reduce_(0, cells.long(), weights, "amax")
-        return largest > self.prune_weight
+        return largest > (SPREAD if self._photographs else 1.0) * self.prune_weight
 
     @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
