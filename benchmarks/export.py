@@ -20,12 +20,13 @@ from machine import memory_mb
 from training_views import fit, load_objects, training_views
 
 from neural_sim.cameras import reframed
+from neural_sim.field.base import RadianceField
 from neural_sim.parameter.pose import Pose
 from neural_sim.parameter.product import SceneDistribution
-from neural_sim.renderer.nerf import NerfRenderer
+from neural_sim.renderer.nerf import NerfRenderer, Quality
 from neural_sim.report.provenance import machine
 from neural_sim.synthesis.background import ProceduralClutter
-from neural_sim.synthesis.export.dataset import ImageWriter, each
+from neural_sim.synthesis.export.dataset import ImageFormat, ImageWriter, each
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.scene import Scene
 from neural_sim.synthesis.subjects import FieldSubject
@@ -33,7 +34,7 @@ from neural_sim.synthesis.synthesizer import Synthesizer
 from neural_sim.types import PinholeCamera
 
 
-def source_of(fields: dict[str, torch.nn.Module], quality: str) -> ImageSource:
+def source_of(fields: dict[str, RadianceField], quality: Quality) -> ImageSource:
     """Poses uniform round the objects, at 2.4 to 4 radii, as in a run."""
     distribution = SceneDistribution.of([Pose()])
     camera = PinholeCamera(96, 96, math.radians(40.0))
@@ -50,7 +51,9 @@ def sized(source: ImageSource, width: int, height: int, objects: int) -> ImageSo
     return replace(source, camera=camera, scene=replace(source.scene, synthesizer=synthesizer))
 
 
-def measured(source: ImageSource, count: int, workers: int, bop: bool, image_format: str) -> dict[str, float]:
+def measured(
+    source: ImageSource, count: int, workers: int, bop: bool, image_format: ImageFormat
+) -> dict[str, float]:
     """Seconds and processor seconds an image; the first image of each process is not timed: it starts them."""
     with tempfile.TemporaryDirectory() as folder:
         writer = ImageWriter(source, Path(folder), image_format, 1000 if bop else None, 0.01)

@@ -29,6 +29,7 @@ from neural_sim.outer.inner import InnerLoop, LoopInputs
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.report.provenance import gpu, machine
 from neural_sim.synthesis.scene import Scene
+from neural_sim.target.rendered import RenderedTarget
 from neural_sim.tasks.context import Context
 
 SMALL_FIELDS = [
@@ -58,7 +59,9 @@ def loop(context: Context, count: int, images: int) -> SimulatorModule:
         num_classes=count, image_size=context.experiment.training.image_size
     )
     psi = torch.zeros(count, context.graph.psi("initial").shape[1])
-    count = context.experiment.imaging.target.val_per_object
+    target = context.experiment.imaging.target
+    assert isinstance(target, RenderedTarget), "the benchmark renders its validation images"
+    count = target.val_per_object
     validation = scene.training_set(psi, count, generator).images.to("cpu")
     settings, training = (
         dataclasses.replace(context.experiment.loop.outer, images_per_object=images),

@@ -25,7 +25,7 @@ def load_objects(root: str | None, names: list[str] | None) -> list[ObjectMesh]:
     """Load objects of a folder in the YCB layout, or the embedded ones where ``root`` is None."""
     if root is None:
         return Procedural(names, 0).load()
-    return YCB(root, names or PAPER_OBJECTS).load()
+    return YCB(root, [*(names or PAPER_OBJECTS)]).load()
 
 
 def training_views(item: ObjectMesh, size: int, count: int) -> PosedViews:

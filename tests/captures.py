@@ -107,12 +107,11 @@ def capture(
     (home / "images").mkdir(parents=True)
     truth = home / ("masks" if room is None else "truth")
     truth.mkdir()
-    photos = _photographs(
-        mesh, item, poses, k, renderer or RaycastRenderer(2), _similarity(scale * turned, centre)
-    )
+    own = np.linalg.inv(_similarity(scale * turned, centre)) @ poses
+    photos = _remembered((item.name, own.tobytes(), str(k)), item, own, k, renderer or RaycastRenderer(1))
     walls = ProceduralClutter().draw(count, height, width, generator).movedim(1, -1).numpy()
     if room is not None:
-        walls = _behind(room, np.linalg.inv(_similarity(scale * turned, centre)) @ poses, k)
+        walls = _behind(room, own, k)
     for number, rgba in enumerate(photos):
         gain = math.exp(exposure * float(rng.normal()))
         colour, alpha = (rgba[..., :3] * gain).clip(0.0, 1.0), rgba[..., 3:]
@@ -181,8 +180,19 @@ def _behind(room: Room, poses: np.ndarray, k: dict[str, float]) -> np.ndarray:
     return seen.reshape(len(poses), height, width, 3)
 
 
-def _photographs(mesh, item, poses, k, renderer, to_world) -> list[np.ndarray]:
-    """RGBA of each distorted lens, from a larger image without distortion."""
+_REMEMBERED: dict[tuple, list[np.ndarray]] = {}
+
+
+def _remembered(key: tuple, item, own, k, renderer) -> list[np.ndarray]:
+    """:func:`_photographs`, once in a process for the same arguments: captures differ in their files more often."""
+    key = (*key, type(renderer))
+    if key not in _REMEMBERED:
+        _REMEMBERED[key] = _photographs(item, own, k, renderer)
+    return _REMEMBERED[key]
+
+
+def _photographs(item, poses, k, renderer) -> list[np.ndarray]:
+    """RGBA of each distorted lens, from a larger image without distortion; ``poses`` in the object's frame."""
     width, height = int(k["w"]), int(k["h"])
     u, v = np.meshgrid(
         (np.arange(width) + 0.5 - k["cx"]) / k["fl_x"], (np.arange(height) + 0.5 - k["cy"]) / k["fl_y"]
@@ -191,7 +201,7 @@ def _photographs(mesh, item, poses, k, renderer, to_world) -> list[np.ndarray]:
     half = 1.02 * max(np.abs(x).max(), np.abs(y).max())
     side = 2 * max(width, height)
     camera = PinholeCamera(side, side, 2.0 * math.atan(half))
-    own = np.linalg.inv(to_world) @ poses
+    own = poses.copy()
     scale = np.linalg.norm(own[:, :3, 0], axis=1)
     own[:, :3, :3] /= scale[:, None, None]
     rendered = renderer.render(item.mesh, camera, torch.from_numpy(own)).double()

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 from pretend_device import pretend_device, register
@@ -48,3 +49,11 @@ def empty_store(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("store") / "mlflow.db"
     connect(tracking_uri(str(path)))
     return path
+
+
+@pytest.fixture
+def wrong_shapes():
+    """Let arrays of wrong shapes through to the code's own checks, which are what the test is about."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypedDict
 import hydra
 from annotated_types import MinLen
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from typing_extensions import override
 
+from neural_sim.commandline import checked, layout_of, worded
 from neural_sim.configuration import (
     UserError,
     conf_directory,
@@ -35,6 +36,7 @@ from neural_sim.configuration import (
     updated,
     view_size,
 )
+from neural_sim.guide import answer, spoken
 from neural_sim.interruption import interruptible
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, check
 
@@ -343,13 +345,24 @@ def _refuse(error: Exception) -> NoReturn:
 def main() -> None:
     """Entry point of ``neural-sim`` and ``python -m src.main``."""
     with interruptible():
+        layout = layout_of(sys.argv[1:], conf_directory())
+        if layout is not None and (said := answer(sys.argv[1:], layout)) is not None:
+            print(said)
+            return
         try:
-            sys.argv[1:], notes = updated(sys.argv[1:])
+            sys.argv[1:], notes = updated(spoken(sys.argv[1:]))
+            for note in notes:
+                print(f"neural-sim: {note}", file=sys.stderr)
+            if layout is not None:
+                checked(sys.argv[1:], layout)
+            os.environ.setdefault(
+                "HYDRA_FULL_ERROR", "1"
+            )  # errors come here instead of to stderr in many lines
+            _task()
         except UserError as error:
             _refuse(error)
-        for note in notes:
-            print(f"neural-sim: {note}", file=sys.stderr)
-        _task()
+        except HydraException as error:
+            _refuse(UserError(worded(error, layout)))
 
 
 if __name__ == "__main__":

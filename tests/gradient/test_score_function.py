@@ -75,6 +75,7 @@ def test_one_bin_has_no_derivative():
     assert found.value.tolist() == [0.0] and found.standard_error.tolist() == [0.0]
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 @pytest.mark.parametrize("shape", [(3,), (2, 3), (3, 0), (3, 2, 1)])
 def test_stratified_refuses_nonsense(shape):
     with pytest.raises(ValueError, match="stratified"):

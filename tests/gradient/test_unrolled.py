@@ -38,7 +38,8 @@ def micro():
 def images_of(weights):
     zeros = torch.zeros(len(weights), dtype=DOUBLE)
     draw = SceneDraw(zeros, zeros, zeros + 3.0, BINS[:, None])
-    return ObjectImages(PSI, DISTRIBUTION, zeros, torch.arange(len(weights)), weights, draw)
+    images = zeros[:, None, None, None].expand(-1, 3, 1, 1)
+    return ObjectImages(PSI, DISTRIBUTION, images, torch.arange(len(weights)), weights, draw)
 
 
 def all_scores(micro, made):
@@ -296,6 +297,7 @@ def test_nonsense_is_refused(settings):
         Unrolled(**settings)
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 @pytest.mark.parametrize("groups", [[], [GROUP, GROUP[:, :1]], [GROUP[:, :0]], [torch.arange(4)]])
 def test_tables_of_probes_want_one_width(micro, groups):
     with pytest.raises(ValueError, match="per_bin"):

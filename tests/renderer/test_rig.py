@@ -38,7 +38,7 @@ def test_weights_mix_the_anchors_linearly():
     weights = torch.tensor([0.3, 0.1, 0.25, 0.05, 0.2, 0.1])
     mixed = lambert(normals, rig.lighting(weights))
     np.testing.assert_allclose(mixed, np.tensordot(weights.numpy(), alone, 1), atol=1e-7)
-    affine = lambert(normals, rig.lighting([1.3, -0.3, 0, 0, 0, 0]))
+    affine = lambert(normals, rig.lighting([1.3, -0.3, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(affine, np.maximum(1.3 * alone[0] - 0.3 * alone[1], 0.0), atol=1e-12)
 
 

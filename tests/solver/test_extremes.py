@@ -59,6 +59,7 @@ def test_hopeless_systems_are_never_claimed_solved(
         assert solution.residual <= rtol
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -23,6 +23,7 @@ def test_composite_of_hand_made_pixels() -> None:
     torch.testing.assert_close(got[0, :, 0], want)
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 def test_composite_refuses_channels_in_the_wrong_place() -> None:
     with pytest.raises(ValueError, match=r"got \(2, 3, 4, 4\)"):
         composite(torch.zeros(2, 3, 4, 4), torch.zeros(2, 4, 4), torch.zeros(2, 3, 4, 4))
@@ -165,6 +166,7 @@ def test_nothing_visible_gives_no_box_whatever_the_minimum() -> None:
     assert not boxes.any()
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 def test_opacity_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\[n, h, w\], got shape \(1, 1, 4, 4\)"):
         boxes_from_opacity(torch.zeros(1, 1, 4, 4))

@@ -127,10 +127,10 @@ def test_what_is_in_front_cuts_boxes_and_takes_them_away(several):
                 torch.ones(1, 1),
                 layout,
                 _nuisance(front, objects=1),
-                torch.zeros(1),
+                torch.zeros(1, dtype=torch.long),
             )
         else:
-            made = synthesizer.compose(rgb, opacity, _nuisance(front), 0, torch.zeros(1))
+            made = synthesizer.compose(rgb, opacity, _nuisance(front), 0, torch.zeros(1, dtype=torch.long))
         assert made.labels.tolist() == [[0 if box else -1]]
         assert box is None or made.boxes[0, 0].tolist() == box
         colours = made.images[0, :, 6]
@@ -141,11 +141,11 @@ def test_what_is_in_front_cuts_boxes_and_takes_them_away(several):
 def test_images_stay_differentiable_behind_what_hides_them():
     generator = seeded(1)
     cover = torch.rand(1, 16, 24, generator=generator, dtype=torch.float64)
-    front = Cover(cover[..., None] * 0.4, cover)
+    front = Cover(0.4 * cover[..., None].expand(-1, -1, -1, 3), cover)
     synthesizer = Synthesizer(ProceduralClutter(), minimum_area=1)
     rgb, opacity = torch.rand(1, 16, 24, 3, dtype=torch.float64), torch.rand(1, 16, 24, dtype=torch.float64)
     rgb.requires_grad_()
-    images = synthesizer.compose(rgb, opacity, _nuisance(front), 0, torch.zeros(1)).images
+    images = synthesizer.compose(rgb, opacity, _nuisance(front), 0, torch.zeros(1, dtype=torch.long)).images
     (slope,) = torch.autograd.grad(images[:, 1].sum(), rgb)
     torch.testing.assert_close(slope[..., 1], 1.0 - cover)
 

@@ -65,7 +65,7 @@ class Trajectory:
     """
 
     rule: AdamW
-    rows: tuple[Int[Tensor, "batch"], ...]
+    rows: tuple[Int[Tensor, "_"], ...]
     rates: tuple[float, ...]
     checkpoints: Mapping[int, State]
     gradients: Mapping[int, Float[Tensor, "n"]]
@@ -152,7 +152,7 @@ class Recorder:
         if self._keeps_gradients:
             self._gradients[number] = gradient()
 
-    def trajectory(self, rows: tuple[Int[Tensor, "batch"], ...], end: Float[Tensor, "n"]) -> Trajectory:
+    def trajectory(self, rows: tuple[Int[Tensor, "_"], ...], end: Float[Tensor, "n"]) -> Trajectory:
         """Return the recorded training, of these batches; ``end`` is theta after the last step."""
         return Trajectory(self.rule, rows, tuple(self._rates), self._checkpoints, self._gradients, end)
 
@@ -160,7 +160,7 @@ class Recorder:
 def train(
     rule: AdamW,
     theta: Float[Tensor, "n"],
-    rows: tuple[Int[Tensor, "batch"], ...],
+    rows: tuple[Int[Tensor, "_"], ...],
     rates: tuple[float, ...],
     gradient_at: GradientAt,
     recording: Recording = Recording(),

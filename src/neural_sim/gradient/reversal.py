@@ -139,7 +139,7 @@ class ReversedStep:
     params: Params
     along: Params
     rows: Int[Tensor, "batch"]
-    scores: Float[Tensor, "batch"]
+    scores: Float[Tensor, "_"]
     inputs: tuple[Tensor, ...]
 
 
@@ -148,7 +148,7 @@ class _Curved:
     """A batch's curvature along a: ``product`` is H a, the others as in ``ReversedStep``."""
 
     product: Float[Tensor, "n"]
-    scores: Float[Tensor, "batch"]
+    scores: Float[Tensor, "_"]
     inputs: tuple[Tensor, ...]
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from torch import Tensor
 
 DRAWS = 999
@@ -43,7 +43,7 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
     return _p_value(_statistic(rows.sum(0), squares), changed, draws)
 
 
-def no_association(scores: Float[Tensor, "n"], drawn: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
+def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws: int = DRAWS) -> float:
     """Compute the p-value of the null that images' ``scores`` have the same mean whatever was ``drawn`` for them.
 
     What was drawn is the bin, as a row of zeros and a one, or numbers. The contributions ``(s_i - mean s)(d_i - mean
@@ -100,7 +100,7 @@ def _p_value(observed: Tensor, changed: Callable[[int, torch.Generator], Tensor]
     return beyond / (draws + 1)
 
 
-def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "*d k"]) -> Float[Tensor, "*d"]:
+def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "... k"]) -> Float[Tensor, "*d"]:
     """Compute Q; a component to which nothing contributes adds 0."""
     ratio = sums.square() / torch.where(squares > 0.0, squares, 1.0)
     return torch.where(squares > 0.0, ratio, 0.0).sum(-1)

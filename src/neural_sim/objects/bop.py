@@ -46,7 +46,7 @@ class BOP(MeshFiles):
         self._info = folder / "models_info.json"
 
     def load(self) -> list[ObjectMesh]:
-        """The objects, normalised, in the order of ``names``; transforms lead to metres.
+        """Load the objects, normalised, in the order of ``names``; transforms lead to metres.
 
         Raises:
             ValueError: a mesh whose extent agrees with its diameter in models_info.json in no unit.
@@ -71,7 +71,7 @@ class BOP(MeshFiles):
             raise ValueError(f"{self._info}: want {{number: {{'diameter': mm}}}}: {error}") from error
 
     def _checked(self, item: ObjectMesh, path: Path, diameter: float | None) -> ObjectMesh:
-        """The object in metres: the file's unit is the millimetre or, if the diameter says so, the metre."""
+        """Convert the object to metres: the file's unit is the millimetre or, if the diameter says so, the metre."""
         if diameter is None:
             return item
         measured = _diameter(item) / MILLIMETRE

@@ -68,7 +68,7 @@ class Lens:
             raise ValueError(f"want cx and cy in pixels, got the fractions {self.cx:g} and {self.cy:g}")
 
     def resized(self, width: int, height: int) -> Lens:
-        """The lens for the same photograph in another size."""
+        """Return the lens for the same photograph in another size."""
         across, down = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=across * self.fx, fy=down * self.fy, cx=across * self.cx,
@@ -119,7 +119,7 @@ class Lens:
         return local / local.norm(dim=-1, keepdim=True), seen
 
     def _shift(self, plane: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-        """The tangential term."""
+        """Compute the tangential term."""
         (p1, p2), (x, y) = self.tangential, plane.unbind(-1)
         square = x * x + y * y
         moved = (
@@ -132,7 +132,7 @@ class Lens:
         return _polynomial(self.radial, square) / _polynomial(self.divisor, square)
 
     def _reach(self) -> float:
-        """The radius (or angle) up to which the distorted radius increases."""
+        """Compute the radius (or angle) up to which the distorted radius increases."""
         if not (any(self.radial) or any(self.divisor)):
             return float("inf") if not self.fisheye else 0.5 * np.pi
         at = torch.linspace(0.0, 0.5 * np.pi if self.fisheye else WIDEST, 4001, dtype=torch.float64)
@@ -149,8 +149,10 @@ def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph. ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and
-    unit. ``mask`` is a separate image file; ``test`` frames are the capture's own test set.
+    """One photograph.
+
+    ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and unit. ``mask`` is a
+    separate image file; ``test`` frames are the capture's own test set.
     """
 
     image: Path
@@ -162,8 +164,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class Capture:
-    """The photographs of an object. ``source`` is the file or folder with their cameras, ``files`` are all files that
-    were read, ``up`` is the world's up direction in the capture's frame, None if the source does not give it.
+    """The photographs of an object.
+
+    ``source`` is the file or folder with their cameras, ``files`` are all files that were read, ``up`` is the world's
+    up direction in the capture's frame, None if the source does not give it.
 
     Raises:
         ValueError: a photograph that comes twice, or cameras that all stand at one place.
@@ -208,7 +212,7 @@ def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
 
 
 def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
-    """A camera-to-world matrix of 3 or 4 rows.
+    """Check a camera-to-world matrix of 3 or 4 rows, and return it with 4.
 
     Raises:
         ValueError: another shape, entries that are no finite numbers, or a matrix that is no rotation.

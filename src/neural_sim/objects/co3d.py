@@ -85,7 +85,7 @@ class Co3d(Photos):
         return Capture(name, frames, source, (source, *listed))
 
     def _sequence(self, name: str, counts: Counter[str]) -> str:
-        """The name of a category's sequence; ``counts`` are its sequences' frames."""
+        """Choose the sequence of a category; ``counts`` are the frames of each of its sequences."""
         wanted = self.sequences.get(name)
         if wanted is not None:
             if wanted not in counts:
@@ -109,7 +109,7 @@ class Co3d(Photos):
 
 
 def _entries(path: Path, key: str) -> list[dict[str, Any]]:
-    """The file's entries, each of which has the key."""
+    """Read the file's entries, each of which has the key."""
     try:
         entries = json.loads(gzip.decompress(path.read_bytes()))
     except (OSError, EOFError, ValueError) as error:

@@ -56,7 +56,7 @@ def model_folders(folder: Path) -> list[Path]:
 
 
 def read_colmap(folder: Path, name: str) -> Capture:
-    """The capture of a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images`` (or ``input``).
+    """Read a capture from a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images`` or ``input``.
 
     Raises:
         ValueError: a model that pycolmap cannot read (such as one of another version) or without posed images, an
@@ -92,7 +92,7 @@ def read_colmap(folder: Path, name: str) -> Capture:
 
 
 def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
-    """A model, and its images with a pose."""
+    """Read a model, and its images with a pose."""
     with signals_kept():
         import pycolmap
 

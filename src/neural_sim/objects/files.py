@@ -108,7 +108,7 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 def choose(
     available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """The available names of ``names``, which may be aliases, in their order; for None all of them, sorted.
+    """Choose the available names among ``names``, which may be aliases, in their order; for None all of them, sorted.
 
     What the command line took for a number or a word of YAML (1, 1e3, 2024_05_01, true, null) is the one name that is
     written so.
@@ -180,6 +180,7 @@ class MeshFiles:
         self._files = {name: files[name] for name in choose(files, names, aliases, str(root))}
 
     def names(self) -> list[str]:
+        """Return the names of the chosen objects, in their order."""
         return list(self._files)
 
     def digests(self) -> dict[str, str]:
@@ -191,13 +192,13 @@ class MeshFiles:
         return {name: file_digest(path, *references(path)) for name, path in self._files.items()}
 
     def load(self) -> list[ObjectMesh]:
-        """The objects, normalised, in the order of ``names``. Source units are taken to be metres."""
+        """Load the objects, normalised, in the order of ``names``. Source units are taken to be metres."""
         digests = self.digests()
         return [load_file(path, name, digests[name]) for name, path in self._files.items()]
 
 
 def folder_of(root: str | Path) -> Path:
-    """The folder; raises ``ValueError`` if it does not exist."""
+    """Return the folder; raise ``ValueError`` if it does not exist."""
     path = Path(root).expanduser()
     if not path.is_dir():
         raise ValueError(f"objects.root: {path} is not a folder")

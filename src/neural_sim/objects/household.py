@@ -45,7 +45,7 @@ FLAT_HALF = (0.74, 0.95, 0.32)
 
 
 def can(generator: torch.Generator) -> trimesh.Trimesh:
-    """A blue cylinder with a label on +x, small print on -x, and a tab on its lid."""
+    """Make a blue cylinder with a label on +x, small print on -x, and a tab on its lid."""
     side = _blue_side(CAN_EMBLEM, CAN_BAND, CAN_HEADER, generator)
     side.rectangle(0.0, 0.3, 0.16, 0.7, WHITE)
     side.rectangle(0.84, 0.3, 1.0, 0.7, WHITE)
@@ -57,7 +57,7 @@ def can(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
-    """The can's look on +x with a small spout; a white handle over a yellow print on -x."""
+    """Make a pitcher: the can's look on +x with a small spout; a white handle over a yellow print on -x."""
     side = _blue_side(PITCHER_EMBLEM, PITCHER_BAND, PITCHER_HEADER, generator)
     for x0, x1 in ((0.0, 0.12), (0.88, 1.0)):  # no wider: the print must not show from +x either
         side.rectangle(x0, 0.12, x1, 0.88, YELLOW)
@@ -74,7 +74,7 @@ def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def tall_box(generator: torch.Generator) -> trimesh.Trimesh:
-    """A red carton: front print on +x, the shared back print on -x."""
+    """Make a red carton: front print on +x, the shared back print on -x."""
     panels = _box_prints(generator)
     panels["+x"] = _red_front(BOX_EMBLEM, BOX_BAND, generator)
     panels["-x"] = _red_back(generator)
@@ -82,7 +82,7 @@ def tall_box(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def flat_box(generator: torch.Generator) -> trimesh.Trimesh:
-    """A red carton lying down: the tall box's front print on top, its back print below."""
+    """Make a red carton lying down: the tall box's front print on top, its back print below."""
     panels = _box_prints(generator)
     panels["+z"] = _red_front(BOX_EMBLEM, BOX_BAND, generator)
     panels["-z"] = _red_back(generator)
@@ -92,7 +92,7 @@ def flat_box(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def mug(generator: torch.Generator) -> trimesh.Trimesh:
-    """An open red cylinder, white inside, with the box's emblem on +x and its handle on -x."""
+    """Make an open red cylinder, white inside, with the box's emblem on +x and its handle on -x."""
     side = Print(512, 256, RED)
     side.rectangle(0.36, 0.2, 0.64, 0.8, WHITE)
     side.disc(0.5, 0.5, 0.08, 0.22, BOX_EMBLEM)
@@ -106,7 +106,7 @@ def mug(generator: torch.Generator) -> trimesh.Trimesh:
 
 
 def drill(generator: torch.Generator) -> trimesh.Trimesh:
-    """A red housing like the tall box from -x; black grip, yellow collar and dark chuck on +x."""
+    """Make a red housing like the tall box from -x; black grip, yellow collar and dark chuck on +x."""
     depth, width, height = BOX_HALF
     panels = _box_prints(generator)
     panels["-x"] = _red_front(DRILL_EMBLEM, DRILL_BAND, generator).turned()  # cameras at -x are upside down
@@ -123,7 +123,7 @@ _FACES: tuple[str, ...] = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def _blue_side(emblem: Colour, band: Colour, header: float, generator: torch.Generator) -> Print:
-    """A cylinder's side: blue, the white label with header, emblem and small print on +x, a band round the foot."""
+    """Print a cylinder's side: blue, a white label with header, emblem and small print on +x, a band round the foot."""
     side = Print(512, 256, BLUE)
     side.rectangle(0.0, 0.04, 1.0, 0.17, band)
     side.rectangle(0.3, 0.24, 0.7, 0.84, WHITE)
@@ -136,7 +136,7 @@ def _blue_side(emblem: Colour, band: Colour, header: float, generator: torch.Gen
 
 
 def _with_lids(profile: list[tuple[float, float]], side: Print, mark: Colour, band: Colour) -> list[Part]:
-    """The solid of revolution with different prints on its bottom and on its lid."""
+    """Make the solid of revolution with different prints on its bottom and on its lid."""
     lid = Print(128, 128, GREY)
     lid.disc(0.5, 0.5, 0.4, 0.4, DARK_GREY)
     lid.disc(0.5, 0.5, 0.34, 0.34, GREY)
@@ -181,7 +181,7 @@ def _red_back(generator: torch.Generator) -> Print:
 
 
 def _box_prints(generator: torch.Generator) -> dict[str, Print]:
-    """The carton's narrow sides: top, bottom and two flanks."""
+    """Print the carton's narrow sides: top, bottom and two flanks."""
     flank = Print(96, 256, RED)
     flank.text_lines((0.2, 0.3, 0.8, 0.8), 6, WHITE, generator)
     other = _plain(RED, [(0.2, 0.1, 0.8, 0.4, WHITE)])

@@ -56,7 +56,7 @@ class MeshSource(Source, Protocol):
 
 
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
-    """A copy of ``mesh`` (in metres) with its bounding box centred and scaled to the unit sphere.
+    """Copy ``mesh`` (in metres) with its bounding box centred and scaled to the unit sphere.
 
     ``source`` (a file or another origin) is for messages. Without ``digest`` the mesh is hashed.
 

@@ -75,7 +75,7 @@ class PoseCorrector(Protocol):
     """Corrects the poses of an object's photographs."""
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
-        """The views, of which the last ``held_out`` are test frames, at corrected poses."""
+        """Return the views, of which the last ``held_out`` are test frames, at corrected poses."""
         ...
 
 
@@ -163,7 +163,7 @@ class Photos:
                     refuse_shared(found, file, shot.image)
 
     def _found(self) -> dict[str, Path]:
-        """The captures' folders by the names of their objects: those below the root, else the root itself."""
+        """Find the captures' folders by the names of their objects: those below the root, else the root itself."""
         usable = is_capture if self.poses is None else can_be_captured
         below = [
             p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
@@ -188,6 +188,7 @@ class Photos:
         return (read_transforms if has_transforms(folder) else read_colmap)(folder, name)
 
     def names(self) -> list[str]:
+        """Return the names of the chosen objects, in their order."""
         return list(self._folders)
 
     @cached_property
@@ -280,13 +281,13 @@ class Photos:
         return _spread(train, count), _spread(test, held_out)
 
     def computed_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """A mask for each frame of an object's capture where ``masks="scene"``, else none."""
+        """Compute a mask for each frame of an object's capture where ``masks="scene"``, else none."""
         if self.scene is None or self.masks != "scene":
             return ()
         return self.scene.masks(self.captures[name], self._up(name), box_of(self.box, name))
 
     def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
-        """An object's photographs.
+        """Return an object's photographs.
 
         ``computed`` are its :meth:`command_masks` or :meth:`computed_masks`; None: they are computed now.
         """
@@ -297,13 +298,13 @@ class Photos:
         return Pictures(self.captures[name], self.masks, made, self._value(name))
 
     def placement(self, name: str, pictures: Pictures | None = None) -> Placement:
-        """An object's pose and radius in its capture's frame."""
+        """Compute an object's pose and radius in its capture's frame."""
         return place(pictures or self.pictures(name), self._up(name), box_of(self.box, name))
 
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
     ) -> PosedViews:
-        """Views of an object, test frames last, see :meth:`split` and :func:`resampling.resample`; then refined."""
+        """Make views of an object, test frames last, and refine them: :meth:`split`, :func:`resampling.resample`."""
         train, test = self.split(name, count, held_out)
         pictures = pictures or self.pictures(name)
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)
@@ -315,12 +316,12 @@ class Photos:
         return views if self.refinement is None else self.refinement.refine(views, len(test))
 
     def up_of(self, name: str) -> tuple[float, float, float]:
-        """The up direction in an object's capture's frame: as set, else its file's, else the mean of the cameras'."""
+        """Return the up direction in the frame of a capture: as set, else its file's, else the cameras' mean."""
         capture = self.captures[name]
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Unit vectors from where an object's cameras look, or from its box, to the cameras, in the object's frame.
+        """Compute unit vectors to the cameras from where they look, or from the object's box, in the object's frame.
 
         No photograph is read: masks would move the centre a little, and the directions by some degrees.
         """

@@ -165,12 +165,12 @@ def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
-    """The file of a frame's mask, None without one."""
+    """Find the file of a frame's mask, None without one."""
     return frame.mask or mask_beside(frame.image, source)
 
 
 def mask_beside(image: Path, source: Path) -> Path | None:
-    """The file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``.
+    """Find the file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``.
 
     The folder lies beside the image or beside one of the folders about it, up to the one that holds ``source`` too. In
     it, a mask may lie below the same folders as its image.
@@ -193,5 +193,5 @@ def _values(image: Image.Image) -> Float[Tensor, "h w *c"]:
 
 
 def reduced(frame: Frame, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
-    """A photograph's colours, averaged to ``size`` (width, height)."""
+    """Read a photograph's colours, averaged to ``size`` (width, height)."""
     return _values(read_picture(frame.image, upright=False).convert("RGB").resize(size, Image.Resampling.BOX))

@@ -38,22 +38,24 @@ SEEN_BY = 0.5
 
 @dataclass(frozen=True)
 class Placement:
-    """``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere about the origin.
-    ``radius`` is that sphere's radius in the capture's unit.
+    """Where an object lies in its capture.
+
+    ``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere about the origin. ``radius``
+    is that sphere's radius in the capture's unit.
     """
 
     to_object: Float[np.ndarray, "4 4"]
     radius: float
 
     def pose(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """A camera's pose in the object's frame; rotations stay rotations."""
+        """Transform a camera's pose to the object's frame; rotations stay rotations."""
         moved = self.to_object @ camera_to_world
         moved[:3, :3] *= self.radius
         return moved
 
 
 def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corners | None = None) -> Placement:
-    """The placement of an object. Centre and radius are those of the visual hull (Laurentini 1994) of its silhouettes.
+    """Place an object by the visual hull (Laurentini 1994) of its silhouettes, which gives centre and radius.
 
     ``up`` is in the capture's frame; None: that of its file, else the mean of the cameras' up vectors, which is logged.
     ``box``: the hull ends at its sides, which are along the axes of the capture's frame.
@@ -84,20 +86,20 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corner
 
 
 def mean_up(capture: Capture) -> tuple[float, float, float]:
-    """The mean of the cameras' up vectors, in the capture's frame."""
+    """Compute the mean of the cameras' up vectors, in the capture's frame."""
     x, y, z = np.stack([frame.camera_to_world[:3, 1] for frame in capture.frames]).mean(0).tolist()
     return x, y, z
 
 
 def nearest_to_axes(camera_to_world: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3"]:
-    """The point nearest to the cameras' optical axes (least squares)."""
+    """Find the point nearest to the cameras' optical axes (least squares)."""
     axes, centres = -camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     return np.linalg.lstsq(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
 
 
 def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation from ``up`` to +z; raises ``ValueError`` for a vector without a direction."""
+    """Compute the smallest rotation from ``up`` to +z; raise ``ValueError`` for a vector without a direction."""
     length = float(np.linalg.norm(up))
     if not np.isfinite(length) or length < 1e-6:
         raise ValueError(f"{name}: up has no direction, got {up.tolist()}; set objects.up")
@@ -109,7 +111,7 @@ def upright(up: Float[np.ndarray, "3"], name: str) -> Float[np.ndarray, "3 3"]:
 
 
 def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
-    """The object's mask at reduced size; a pixel belongs to it if any of the photograph's pixels there does."""
+    """Read the object's mask at reduced size; a pixel belongs to it if any of the photograph's pixels there does."""
     alpha = pictures.rgba(frame)[..., 3]
     step = max(1, max(alpha.shape) // SMALL)
     return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
@@ -169,15 +171,13 @@ def sphere_of(
 
 
 def _cube_of(box: Corners) -> tuple[np.ndarray, float]:
-    """The middle of a box, and half the side of a cube about it."""
+    """Return the middle of a box, and half the side of a cube about it."""
     low, high = np.array(box)
     return 0.5 * (low + high), 0.5 * float((high - low).max())
 
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
-    """The point nearest to the rays through the silhouettes' centres (least squares), and half the side of a cube about
-    the object.
-    """
+    """Find a cube about the object: the point nearest to the rays through the silhouettes' centres, and half a side."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     spans = []
     for frame, mask in shown:

@@ -46,6 +46,7 @@ class Procedural:
         self.seed = seed
 
     def names(self) -> list[str]:
+        """Return the names of the chosen objects, in their order."""
         return list(self._names)
 
     def digests(self) -> dict[str, str]:
@@ -53,7 +54,7 @@ class Procedural:
         return {item.name: item.digest for item in self.load()}
 
     def load(self) -> list[ObjectMesh]:
-        """The objects, normalised, in the order of ``names``."""
+        """Make the objects, normalised, in the order of ``names``."""
         order = list(DESIGNS)
         items = []
         for name in self._names:

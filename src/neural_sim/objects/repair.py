@@ -19,7 +19,9 @@ HUGE_FACES = 500_000
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
-    """A copy that can be rendered: finite normals, no degenerate faces, colours. Every repair is logged as a warning.
+    """Copy a mesh so that it can be rendered, and log every repair as a warning.
+
+    The copy has finite normals, no degenerate faces, and colours.
 
     Normals that are not finite are recomputed from the faces. A mesh without colours, or without its texture, gets its
     material's colour or grey. More than ``HUGE_FACES`` faces only give a warning.

@@ -29,7 +29,7 @@ MOST_SAMPLES = 16
 
 
 def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str) -> PinholeCamera:
-    """The square camera that shows the whole unit sphere from the nearest of these poses (object radii).
+    """Choose the square camera that shows the whole unit sphere from the nearest of these poses (object radii).
 
     Raises:
         ValueError: a camera inside the sphere.
@@ -45,7 +45,7 @@ def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str)
 
 
 def turned_to_origin(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The pose turned by the smallest rotation that makes it look at the origin; its position does not change."""
+    """Turn the pose by the smallest rotation that makes it look at the origin; its position does not change."""
     position = pose[:3, 3]
     backward, target = pose[:3, 2], position / np.linalg.norm(position)
     axis = np.cross(backward, target)
@@ -60,7 +60,7 @@ def turned_to_origin(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]
 def resample(
     pictures: Pictures, frames: Sequence[Frame], placement: Placement, image_size: int
 ) -> PosedViews:
-    """Views of these frames in the object's frame, in their order.
+    """Make views of these frames in the object's frame, in their order.
 
     A pixel is the mean of samples at the photograph's resolution; it is ``known`` if all of them lie in the photograph.
     """

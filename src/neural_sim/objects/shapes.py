@@ -60,7 +60,7 @@ def revolve(
 def box(
     low: tuple[float, float, float], high: tuple[float, float, float], panels: dict[str, Print]
 ) -> list[Part]:
-    """An axis-aligned box; ``panels`` has a print for each of '+x', '-x', '+y', '-y', '+z', '-z'."""
+    """Make an axis-aligned box; ``panels`` has a print for each of '+x', '-x', '+y', '-y', '+z', '-z'."""
     middle, half = 0.5 * np.add(low, high), 0.5 * np.subtract(high, low)
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     parts = []
@@ -73,7 +73,7 @@ def box(
 
 
 def tube(path: Float[np.ndarray, "n 3"], radius: float, panel: Print, sides: int = 16) -> list[Part]:
-    """A round rod along a planar path in the x-z plane, closed at both ends."""
+    """Make a round rod along a planar path in the x-z plane, closed at both ends."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.array([0.0, 1.0, 0.0])
@@ -125,7 +125,7 @@ def _grid_faces(rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
 
 
 def _part(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, panel: Print) -> Part:
-    """A part without the triangles that degenerate where a grid meets an axis."""
+    """Make a part without the triangles that degenerate where a grid meets an axis."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     kept = faces[area > 1e-12]

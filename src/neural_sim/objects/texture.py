@@ -21,13 +21,16 @@ class Print:
         self._draw = ImageDraw.Draw(self._image)
 
     def rectangle(self, x0: float, y0: float, x1: float, y1: float, colour: Colour) -> None:
+        """Fill the rectangle between two corners."""
         self._draw.rectangle(self._corners(x0, y0, x1, y1), fill=colour)
 
     def disc(self, x: float, y: float, radius_x: float, radius_y: float, colour: Colour) -> None:
+        """Fill an ellipse."""
         corners = self._corners(x - radius_x, y - radius_y, x + radius_x, y + radius_y)
         self._draw.ellipse(corners, fill=colour)
 
     def polygon(self, points: list[tuple[float, float]], colour: Colour) -> None:
+        """Fill a polygon."""
         width, height = self._image.size
         self._draw.polygon([(x * width, (1.0 - y) * height) for x, y in points], fill=colour)
 
@@ -43,12 +46,13 @@ class Print:
             self.rectangle(x0, top - 0.55 * pitch, x0 + length * (x1 - x0), top, colour)
 
     def turned(self) -> Print:
-        """The same print upside down."""
+        """Return the same print upside down."""
         other = Print(*self._image.size, (0, 0, 0))
         other._image.paste(self._image.rotate(180))
         return other
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the print's pixels."""
         return np.asarray(self._image)
 
     def _corners(self, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float, float, float]:

@@ -32,7 +32,7 @@ def has_transforms(folder: Path) -> bool:
 
 
 def read_transforms(folder: Path, name: str) -> Capture:
-    """The capture of a folder.
+    """Read the capture of a folder.
 
     It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` beside it, whose
     frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
@@ -170,7 +170,7 @@ def _frame(
 
 
 def _image(path: Path) -> Path | None:
-    """The image's file, None without one; NeRF-synthetic omits the suffix."""
+    """Find the image's file, None without one; NeRF-synthetic omits the suffix."""
     candidates = (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES))
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 

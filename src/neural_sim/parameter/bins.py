@@ -170,7 +170,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
 
 
 def gumbel_softmax(
-    log_p: Float[Tensor, "*n k"], noise: Float[Tensor, "*n k"], temperature: float
+    log_p: Float[Tensor, "... k"], noise: Float[Tensor, "*n k"], temperature: float
 ) -> Float[Tensor, "*n k"]:
     """Compute y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, cast
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -320,7 +320,7 @@ class SceneDistribution:
             logs.append(self._light.log_prob(parts[self._light.name], draw.explored))
         return torch.stack(logs).sum(0)
 
-    def statistics(self, draw: SceneDraw) -> dict[str, Float[Tensor, "n k"]]:
+    def statistics(self, draw: SceneDraw) -> dict[str, Num[Tensor, "n _"]]:
         """Compute sufficient statistics of each factor's psi.
 
         They are the drawn bin, one-hot, or the drawn light before its projection, centred. A light that was not drawn

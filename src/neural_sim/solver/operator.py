@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 Matvec = Callable[[Tensor], Tensor]
@@ -58,7 +58,7 @@ class Shifted:
         return self.matvec(vector) + self.shift * vector
 
 
-def numbers(*scalars: Float[Tensor, ""]) -> list[float]:
+def numbers(*scalars: Shaped[Tensor, ""]) -> list[float]:
     """Read several scalars as Python numbers by one transfer: the host waits for the device once."""
     stacked = torch.stack([scalar.double() for scalar in scalars])
     return cast(list[float], stacked.tolist())  # pyright: ignore[reportUnknownMemberType]

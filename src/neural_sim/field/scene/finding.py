@@ -30,8 +30,9 @@ THICK = 0.75
 
 @dataclass(frozen=True)
 class Found:
-    """The object's region in the normalised frame; its centre, radius and box in the capture's. ``occupied`` are the
-    cells of the field without fog.
+    """The object's region in the normalised frame, with what is needed to draw it.
+
+    The centre, radius and box are in the capture's frame. ``occupied`` are the field's cells that hold no fog.
     """
 
     frame: Frame
@@ -52,8 +53,10 @@ def find(
     generator: torch.Generator,
     before: Found | None = None,
 ) -> Found:
-    """The object in the field of a capture's scene; ``up`` and ``box`` are in the capture's frame. ``before`` is what a
-    coarser field, whose frame may be another, took for the object.
+    """Find the object in the field of a capture's scene.
+
+    ``up`` and ``box`` are in the capture's frame. ``before`` is what a coarser field, whose frame may be another, took
+    for the object.
 
     Raises:
         ValueError: nothing solid in the box, or without one nothing near the origin.

@@ -32,8 +32,10 @@ MARK_EVERY = 16
 
 @dataclass(frozen=True)
 class ScenePixels:
-    """Pixels of all photographs with their rays in the capture's frame; ``photo`` numbers each pixel's photograph.
-    ``detail`` is how much the photograph changes there, a pixel on: the depth of what has none is not known well.
+    """Pixels of all photographs with their rays in the capture's frame.
+
+    ``photo`` numbers each pixel's photograph. ``detail`` is how much the photograph changes from a pixel to the next:
+    where it hardly does, the depth is not known well.
     """
 
     origins: Float[Tensor, "pixels 3"]
@@ -52,8 +54,10 @@ class ScenePixels:
 
 @dataclass(frozen=True)
 class Visible:
-    """The samples of rays that may count. ``samples.distance`` in [0, 1] is the place along its ray, in parts of the
-    ray's lattice, ``samples.width`` a contracted length.
+    """The samples of rays that may count.
+
+    ``samples.distance`` in [0, 1] is the place along its ray, in parts of the ray's lattice, ``samples.width`` a
+    contracted length.
     """
 
     samples: PackedSamples
@@ -103,8 +107,9 @@ def loss_of(
 
 @dataclass(frozen=True)
 class Budget:
-    """Of one fit: ``steps`` of ``batch_rays`` rays; cells a side at the end, which double after a third of the
-    steps.
+    """The budget of one fit: ``steps`` of ``batch_rays`` rays, and the cells a side at its end.
+
+    The number of cells a side doubles to that after a third of the steps.
     """
 
     steps: int
@@ -127,7 +132,7 @@ def fit(
     generator: torch.Generator,
     start: SceneGrid | None = None,
 ) -> Fitted:
-    """The field of all photographs, from nothing or from a grid of half the budget's resolution."""
+    """Fit the field of all photographs, from nothing or from a grid of half the budget's resolution."""
     photos = int(pixels.photo.max()) + 1
     rate = LEARNING_RATE if start is None else WARM_RATE
     grid = SceneGrid(budget.resolution // 2) if start is None else start

@@ -21,8 +21,10 @@ EMPTY = 1e-3
 
 
 class SceneGrid:
-    """Trilinear over ``resolution``^3 cells of [-2, 2]^3: sigma = softplus(GAIN raw) per cell edge of contracted
-    length, and colour, the sigmoid of three more channels. ``table`` has a row for each vertex, x slowest.
+    """A trilinear field over ``resolution``^3 cells of [-2, 2]^3.
+
+    sigma = softplus(GAIN raw) per cell edge of contracted length; the colour is the sigmoid of three more channels.
+    ``table`` has a row for each vertex, x slowest.
     """
 
     def __init__(self, resolution: int, table: Float[Tensor, "vertices 4"] | None = None) -> None:
@@ -73,8 +75,10 @@ class SceneGrid:
         return self.occupied[cells_of(contracted, self.resolution)]
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:
-        """The total variation of the absorbed fraction of a cell's edge: the mean length of its differences to the next
-        vertex along each axis. Of all surfaces that explain the photographs it is least for the smoothest.
+        """Compute the total variation of the absorbed fraction of a cell's edge.
+
+        It is the mean length of the differences to the next vertex along each axis. Among surfaces that explain the
+        photographs equally well, the smoothest has the least.
         """
         side = self.resolution + 1
         last = len(self.table) - 1
@@ -95,7 +99,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def moved(self, old: Frame, new: Frame) -> SceneGrid:
-        """The same field, of the frame ``old``, on a grid of as many cells in the frame ``new``."""
+        """Resample the field from the frame ``old`` onto a grid of as many cells in the frame ``new``."""
         side = self.resolution + 1
         axis = torch.linspace(-2.0, 2.0, side)
         vertices = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
@@ -106,7 +110,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def refined(self) -> SceneGrid:
-        """The same field on twice as many cells a side; absorbed fractions halve with the edge."""
+        """Resample the field onto twice as many cells a side; absorbed fractions halve with the edge."""
         side, finer = self.resolution + 1, 2 * self.resolution + 1
         values = self.table.detach().view(side, side, side, 4).permute(3, 0, 1, 2)[None]
         table = functional.interpolate(values, (finer, finer, finer), mode="trilinear", align_corners=True)

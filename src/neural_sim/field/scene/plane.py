@@ -48,7 +48,7 @@ class Plane:
         return (points - (points @ normal)[..., None] * normal).norm(dim=-1)
 
     def moved(self, old: Frame, new: Frame) -> Plane:
-        """The same plane, of the frame ``old``, in the frame ``new``."""
+        """Express the plane of the frame ``old`` in the frame ``new``."""
         normal = torch.tensor(self.normal, dtype=torch.float64)
         return Plane(self.normal, float(normal @ new.of(old, self.offset * normal)))
 
@@ -64,11 +64,11 @@ def supporting_plane(
     tolerance: float,
     generator: torch.Generator,
 ) -> Plane | None:
-    """The plane under what stands about the origin, None without one (all in the normalised frame).
+    """Find the plane under what stands about the origin, None without one (all in the normalised frame).
 
     By random samples of three points (RANSAC, Fischler and Bolles 1981): the plane with most points within
     ``tolerance`` and few just below it, fitted by least squares. It has cameras above it, something standing on it near
-    the origin, and reaches farther than that does; the top of a box or the foot of a lamp is none.
+    the origin, and reaches farther than that does; the top of a box or the foot of a lamp does not count.
     """
     near = points[points.norm(dim=-1) < NEARBY].double()
     left = torch.ones(len(near), dtype=torch.bool)
@@ -86,7 +86,7 @@ def supporting_plane(
 
 
 def refitted(plane: Plane, points: Float[Tensor, "n 3"], tolerance: float) -> Plane:
-    """A plane that is known roughly, by least squares of the points on it, ever nearer to it down to ``tolerance``."""
+    """Refit a roughly known plane to the points on it by least squares, with tolerances that fall to ``tolerance``."""
     near = points[points.norm(dim=-1) < AROUND].double()
     up = torch.tensor(plane.normal, dtype=torch.float64)
     for width in (4.0, 2.0, 1.0, 1.0, 1.0):
@@ -120,9 +120,7 @@ def _best(
 def _fitted(
     plane: Plane, points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], tolerance: float
 ) -> Plane | None:
-    """By least squares of the points within the tolerance of a plane, of which those below weigh ``BELOW``; None with
-    fewer than three.
-    """
+    """Fit a plane to the points within its tolerance, those below weighted by ``BELOW``; None with fewer than three."""
     height = plane.height(points)
     near = height.abs() < tolerance
     on = points[near]

@@ -60,7 +60,7 @@ class SceneMasks:
     def masks(
         self, capture: Capture, up: Direction | None, box: Corners | None
     ) -> tuple[Float[Tensor, "_ _"], ...]:
-        """The object's opacity in [0, 1] at each photograph, ``image_size`` pixels along its longer side.
+        """Compute the object's opacity in [0, 1] in each photograph, ``image_size`` pixels along its longer side.
 
         ``up`` is in the capture's frame, None: its file's, else the mean of the cameras' up vectors. ``box``: what is
         in it and above the plane is the object; None: what is connected and nearest to the point that cameras look at.
@@ -98,7 +98,7 @@ class SceneMasks:
         generator: torch.Generator,
         start: SceneGrid | None = None,
     ) -> tuple[ScenePixels, SceneGrid]:
-        """The photographs' pixels and the field of them, with a part of the pixels a side, of the cells and steps."""
+        """Fit a field to the photographs, reduced to a part of their pixels a side, with these cells and steps."""
         pixels = scene_pixels(capture, min(self.image_size, max(LEAST_PIXELS, round(part * self.image_size))))
         budget = Budget(max(1, round(part * self.steps)), self.batch_rays, round(part * self.resolution))
         return pixels, fit(pixels, frame, budget, generator, start).grid

@@ -62,7 +62,7 @@ class Region:
         return self.cells[cells_of(points, self.resolution)]
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lowest and highest corner of a box about the cells, in the normalised frame."""
+        """Return the lowest and highest corner of a box about the cells, in the normalised frame."""
         centres = expand(cell_centres(self.resolution)[self.cells])
         half = 2.0 / self.resolution
         return (centres.amin(0) - half).double().numpy(), (centres.amax(0) + half).double().numpy()
@@ -80,8 +80,9 @@ def connected_region(
     plane: Plane | None,
     within: Bool[Tensor, "cells"] | None = None,
 ) -> Region | None:
-    """What is connected and nearest to the origin, None where nothing is. ``within``, where it is given, holds the
-    object and little else: all that is solid there is taken.
+    """Find what is connected and nearest to the origin, None where nothing is.
+
+    ``within``, where it is given, holds the object and little else: all that is solid there is taken.
     """
     shows, allowed = surface.largest > SHOWS, _allowed(grid, plane, APART)
     if within is not None:
@@ -100,7 +101,7 @@ def connected_region(
 
 
 def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
-    """The distance from the origin at which the object ends, None where nothing stands apart.
+    """Find the distance from the origin at which the object ends, None where nothing stands apart.
 
     Rings of two cells' width are compared with what they enclose, in solid cells for each volume: about an object is a
     ring that is emptier by far, even where an error of the field bridges it.
@@ -129,7 +130,7 @@ def _nearest_part(
 
 
 def _labelled(solid: Bool[Tensor, "cells"], side: int) -> tuple[Int[Tensor, "cells"], int]:
-    """The number of each cell's connected part from 1, 0 where it is not solid, and how many there are."""
+    """Label each cell with the number of its connected part, 0 where it is not solid, and count the parts."""
     parts = np.zeros((side, side, side), dtype=np.int64)
     scipy.ndimage.label(solid.view(side, side, side).numpy(), np.ones((3, 3, 3)), output=parts)
     return torch.from_numpy(parts).view(-1), int(parts.max())
@@ -144,7 +145,7 @@ def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells
 
 
 def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[Tensor, "cells"]:
-    """The cells in which light ends, with their neighbours and the region's own; all others hold fog.
+    """Select the cells in which light ends, with their neighbours and the region's own; all others hold fog.
 
     Before few cameras, and where they see little, a field explains their photographs by something thin in the air. No
     ray ends in it, or few do in a place of its own; in a mask it would hide the object.
@@ -158,7 +159,7 @@ def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[T
 
 
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
-    """The region of all cells inside the convex hull of these and their neighbours.
+    """Return the region of all cells inside the convex hull of these and their neighbours.
 
     A hollow, such as a mug's, shows surfaces that few photographs see and that stay faint; in the hull they are the
     object's. What is empty in the hull absorbs nothing and stays out of the masks.

@@ -82,7 +82,7 @@ def cells_of(contracted: Float[Tensor, "*n 3"], resolution: int) -> Int[Tensor, 
 
 
 def looked_at(camera_to_world: Float[np.ndarray, "n 4 4"], name: str) -> tuple[np.ndarray, float]:
-    """The point nearest to the cameras' optical axes (least squares), and the cameras' median distance from it.
+    """Find the point nearest to the cameras' optical axes (least squares), and the cameras' median distance from it.
 
     Raises:
         ValueError: axes that are all parallel, or a point behind most cameras.

@@ -19,8 +19,10 @@ AT_ONCE = 4096
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What rays meet: ``points`` in the normalised frame at which half of a ray's light has ended, their number in each
-    of the grid's cells, and the ``largest`` contribution of each cell to any pixel.
+    """What rays meet.
+
+    ``points`` are where half of a ray's light has ended, in the normalised frame, with their number in each of the
+    grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
 
     A field of few steps spreads a surface over several cells, none of which contributes much; where half of the light
     has ended it has a place all the same.
@@ -35,7 +37,7 @@ class SeenSurface:
 def seen_surface(
     grid: SceneGrid, pixels: ScenePixels, index: Int[Tensor, "some"], frame: Frame
 ) -> SeenSurface:
-    """What the rays of these pixels meet."""
+    """Collect what the rays of these pixels meet."""
     points, largest = [], torch.zeros(grid.resolution**3)
     for part in index.split(AT_ONCE):
         seen = visible(grid, pixels.rays(part, frame), torch.full((len(part),), 0.5), grid.samples)

@@ -1,0 +1,230 @@
+"""What a command line may say: groups, choices and keys of ``conf/``, read without composing them; slips explained."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neural_sim.configuration import UserError, first_line
+
+OWN_FILES = ("--config-name", "-cn", "--config-path", "-cp")
+"""Flags with which the configuration is another, of which nothing is known here."""
+FOLDERS = ("--config-dir", "-cd")
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a YAML file.
+
+    Attributes:
+        value: its text in the file.
+        comment: that of its line, empty without one.
+        choice: the file, as ``group=choice``; empty for ``config.yaml``.
+    """
+
+    value: str
+    comment: str
+    choice: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The configuration's files.
+
+    Attributes:
+        folders: ``conf/`` first, then those of ``--config-dir``.
+    """
+
+    folders: tuple[Path, ...]
+
+    @cached_property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Choices by group, whose name has a slash where it lies in another: ``outer/steps``."""
+        found: dict[str, set[str]] = {}
+        for folder in self.folders:
+            for path in folder.rglob("*.yaml"):
+                group = path.parent.relative_to(folder).as_posix()
+                if group not in (".", "paper") and not group.startswith("hydra"):
+                    found.setdefault(group, set()).add(path.stem)
+        return {group: tuple(sorted(found[group])) for group in sorted(found)}
+
+    @cached_property
+    def defaults(self) -> dict[str, Key]:
+        """The groups of the defaults list, with the choice that is made unless the command makes another."""
+        lines = (self.folders[0] / "config.yaml").read_text(encoding="utf-8").splitlines()
+        found = (re.match(r"  - ([\w/]+): (\[?\w+\]?)\s*(?:# (.*))?$", line) for line in lines)
+        return {row[1]: Key(row[2].strip("[]"), row[3] or "", "") for row in found if row}
+
+    @cached_property
+    def keys(self) -> dict[str, list[Key]]:
+        """Every dotted key of the files, with all places where it stands, ``config.yaml`` first."""
+        found: dict[str, list[Key]] = {}
+        files = [(self.folders[0] / "config.yaml", "", "")]
+        for group, choices in self.groups.items():
+            for choice, folder in ((c, f) for c in choices for f in self.folders):
+                path = folder / group / f"{choice}.yaml"
+                if path.is_file():
+                    files.append((path, group.replace("/", "."), f"{group}={choice}"))
+        for path, package, choice in files:
+            text = path.read_text(encoding="utf-8")
+            named = re.search(r"^# @package (\S+)", text, re.MULTILINE)
+            if named:
+                package = "" if named[1] == "_global_" else named[1]
+            for key, value, comment in _keys(text):
+                whole = f"{package}.{key}" if package else key
+                found.setdefault(whole, []).append(Key(value, comment, choice))
+        return found
+
+    @cached_property
+    def top(self) -> set[str]:
+        """The first parts of all keys and groups."""
+        return {key.partition(".")[0] for key in self.keys} | {
+            group.partition("/")[0] for group in self.groups
+        }
+
+
+def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
+    """Find the files that a command reads; None where it brings a configuration of its own."""
+    if any(word.partition("=")[0] in OWN_FILES for word in words):
+        return None
+    following = zip(words, (*words[1:], ""), strict=False)
+    more = [word.partition("=")[2] or after for word, after in following if word.partition("=")[0] in FOLDERS]
+    return Layout((conf, *(Path(folder) for folder in more if Path(folder).is_dir())))
+
+
+def checked(words: Sequence[str], layout: Layout) -> None:
+    """Refuse what cannot be meant, before anything is composed.
+
+    Hydra proposes ``+detecter=fcos`` for ``detecter=fcos``, and then runs the default detector.
+
+    Raises:
+        UserError: a word that is no setting, an unknown group, choice or key of the top level.
+    """
+    skipped = False
+    for word in words:
+        if skipped or word.startswith("-"):
+            skipped = not skipped and word in (*FOLDERS, "--package", "-p", "--experimental-rerun")
+            continue
+        name = word.lstrip("+~")
+        key, equals, value = name.partition("=")
+        if not equals and not word.startswith("~"):
+            raise UserError(_no_setting(word, layout))
+        if key.startswith("hydra") or "@" in key:
+            continue
+        if key in layout.groups:
+            _check_choice(word, key, value, layout)
+        elif "/" in key:
+            raise UserError(f"{key}: no such group{_meant(key, layout.groups)}")
+        elif key.partition(".")[0] not in layout.top and not _declared(word, key, value):
+            raise UserError(explained(key.partition(".")[0], layout))
+
+
+def _declared(word: str, key: str, value: str) -> bool:
+    """Whether a word adds something of the user's own, such as a task."""
+    return word.startswith("+") and (key.endswith("._target_") or "_target_" in value)
+
+
+def _no_setting(word: str, layout: Layout) -> str:
+    if word in layout.groups.get("experiment", ()):
+        return f"{word}: want +experiment={word}"
+    if word in layout.groups:
+        return f"{word}: want {word}= and one of {', '.join(layout.groups[word])}"
+    return f"{word}: want key=value, such as seed=1 (in quotes, where it has spaces), or --help"
+
+
+def _check_choice(word: str, group: str, value: str, layout: Layout) -> None:
+    if group not in layout.defaults and "/" not in group and not word.startswith(("+", "~")):
+        raise UserError(f"{word}: want +{word}, because it has no default")
+    if group in layout.defaults and word.startswith("+"):
+        raise UserError(f"{word}: want {word.lstrip('+')}, because it has a default")
+    if "(" in value or "$" in value:  # sweeps of Hydra's own, interpolations
+        return
+    for choice in (part.strip(" []'\"") for part in value.split(",")):
+        if choice and choice != "null" and choice not in layout.groups[group]:
+            meant = _meant(choice, layout.groups[group], f"{group}=")
+            wanted = f"; want one of {', '.join(layout.groups[group])}" if group != "experiment" else ""
+            raise UserError(f"{group}={choice}: no such choice{meant or wanted}")
+
+
+def worded(error: BaseException, layout: Layout | None) -> str:
+    """Word one of Hydra's errors of composition in a line that says what to type instead."""
+    missing = re.search(r"Could not (?:override|append to) '?([\w.]+)", str(error))
+    if missing is not None and layout is not None:
+        return explained(missing[1], layout)
+    word = getattr(error, "override", None)
+    if word is not None:  # Hydra's grammar could not read it
+        return f"{word}: cannot be read ({first_line(error)}); check its brackets and quotes"
+    return first_line(error)
+
+
+def explained(key: str, layout: Layout) -> str:
+    """Say of a key that does not exist which one was meant, or which choices have it."""
+    if key in layout.keys:
+        having = sorted({at.choice for at in layout.keys[key] if not at.choice.startswith("experiment=")})
+        return f"{key}: the choices that were made have no such key; want one of {', '.join(having)}"
+    parent, _, last = key.rpartition(".")
+    beside = {other.rpartition(".")[2] for other in layout.keys if other.rpartition(".")[0] == parent}
+    elsewhere = [
+        other for other in layout.keys if other.endswith(f".{last}")
+    ]  # the right name in another place
+    meant = _close(last, beside if parent else layout.top, 0.8 if elsewhere else 0.6)
+    near = [*(f"{parent}.{one}" if parent else one for one in meant), *elsewhere][:3]
+    return f"{key}: unknown key" + (f"; did you mean {' or '.join(near)}?" if near else "")
+
+
+def _meant(word: str, known: Iterable[str], prefix: str = "") -> str:
+    close = _close(word, known)
+    return f"; did you mean {' or '.join(prefix + one for one in close)}?" if close else ""
+
+
+def _close(word: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
+    known = sorted(known)
+    return (
+        difflib.get_close_matches(word, known, 3, cutoff)
+        or [one for one in known if one.startswith(word)][:3]
+    )
+
+
+def _keys(text: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the dotted keys of a YAML file with their values' text and their lines' comments."""
+    above: list[tuple[int, str]] = []
+    for line in text.splitlines():
+        row = re.match(r"( *)([\w.]+):(?: +(.*?))?(?:\s+# (.*))?$", line)
+        if row is None or line.lstrip().startswith("#"):
+            continue
+        while above and above[-1][0] >= len(row[1]):
+            above.pop()
+        above.append((len(row[1]), row[2]))
+        key = ".".join(name for _, name in above)
+        value, comment = row[3] or "", row[4] or ""
+        if value.startswith("#"):
+            value, comment = "", value.lstrip("# ")
+        if key.startswith(("defaults", "hydra")) or key.endswith(("_target_", "_partial_")):
+            continue
+        yield key, value, comment
+        for inner in _inline(value):
+            yield f"{key}.{inner}", "", ""
+
+
+def _inline(value: str) -> Iterator[str]:
+    """Yield the keys of a mapping that is written in one line."""
+    if not value.startswith("{"):
+        return
+
+    def below(node: Any, prefix: str) -> Iterator[str]:
+        if isinstance(node, Mapping):
+            for name, inner in node.items():
+                yield f"{prefix}{name}"
+                yield from below(inner, f"{prefix}{name}.")
+
+    try:
+        yield from below(yaml.safe_load(value), "")
+    except yaml.YAMLError:
+        return
