@@ -164,3 +164,14 @@ def test_the_home_folder_is_written_short(tmp_path, ycb_root, monkeypatch):
     trimesh.creation.box().export(tmp_path / "box.ply")
     assert MeshFolder("~", ["box"]).names() == ["box"]
     assert YCB("~/ycb").names() == ["001_red_thing", "002_blue_thing"]
+
+
+def test_a_vertex_far_from_all_others_is_told(tmp_path, caplog):
+    ball = trimesh.creation.icosphere(2)
+    ball.export(tmp_path / "ball.ply")
+    MeshFolder(tmp_path).load()
+    assert "is a digit of it wrong" not in caplog.text
+    ball.vertices[7] *= 9.0
+    ball.export(tmp_path / "ball.ply")
+    MeshFolder(tmp_path).load()
+    assert "times as far from the middle as any other; is a digit of it wrong?" in caplog.text

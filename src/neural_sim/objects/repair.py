@@ -16,6 +16,10 @@ from neural_sim.objects.paint import GREY, Paint
 log = logging.getLogger(__name__)
 
 HUGE_FACES = 500_000
+LEAST_VERTICES = 50
+"""Fewer may have a tip far from the others by design."""
+OUTLIER = 1.5
+"""How many times as far as any other; 1.003 in the scans of YCB."""
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
@@ -32,6 +36,7 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
     mesh = _without_bad_faces(mesh, name, source)
+    _warn_of_outlier(np.asarray(mesh.vertices), name, source)
     if len(mesh.faces) > HUGE_FACES:
         log.warning(
             "%s: object %r has %d faces; more than %d draw slowly, decimate it if views take long",
@@ -61,6 +66,18 @@ def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh
         mesh.update_faces(good)
         mesh.remove_unreferenced_vertices()
     return mesh
+
+
+def _warn_of_outlier(vertices: Float[np.ndarray, "v 3"], name: str, source: str) -> None:
+    """Warn of one place far from all others, as a wrong digit of a file makes it: it would shrink the rest."""
+    away = np.linalg.norm(vertices - np.median(vertices, axis=0), axis=1)
+    farthest = int(away.argmax())
+    others = away[(vertices != vertices[farthest]).any(axis=1)]
+    if len(vertices) >= LEAST_VERTICES and len(others) and away[farthest] > OUTLIER * others.max():
+        log.warning(
+            "%s: object %r: the vertex %s is %.3g times as far from the middle as any other; is a digit of it wrong?",
+            source, name, vertices[farthest].tolist(), away[farthest] / others.max(),
+        )  # fmt: skip
 
 
 def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
