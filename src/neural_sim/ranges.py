@@ -132,7 +132,8 @@ def hints_of(make: Callable[..., Any]) -> Mapping[str, Any]:
 def misfit(value: Any, hint: Any, where: str) -> Misfit | None:
     """Find the first part of a value that does not fit a type. For the arguments see :func:`check`."""
     hint, markers = parted(hint)
-    if isinstance(value, Mapping) and "_target_" in value:
+    plain = hint in _WORDS or typing.get_origin(hint) is Literal
+    if isinstance(value, Mapping) and "_target_" in value and not plain:
         return _misfit_of_node(value, where)
     if typing.get_origin(hint) in (Union, types.UnionType):
         found = _misfit_of_union(value, typing.get_args(hint), where)
@@ -184,12 +185,13 @@ def words_of(hint: Any) -> str:
 
 def _misfit_of_node(node: Mapping[str, Any], where: str) -> Misfit | None:
     """Check the keys and values of a mapping against the arguments of the ``_target_`` that it names."""
+    name = node["_target_"]
     try:
-        make = pkgutil.resolve_name(node["_target_"])
+        make = pkgutil.resolve_name(name) if isinstance(name, str) else None
     except (ImportError, AttributeError, ValueError) as error:
-        return Misfit(
-            f"{where}._target_", "the name of a class or function", f"{node['_target_']!r} ({error})"
-        )
+        return Misfit(f"{where}._target_", "the name of a class or function", f"{name!r} ({error})")
+    if not callable(make):
+        return Misfit(f"{where}._target_", "the name of a class or function", repr(name))
     known, hints = arguments(make), hints_of(make)
     takes_any = any(argument.kind is argument.VAR_KEYWORD for argument in known.values())
     for key, value in node.items():
@@ -219,7 +221,8 @@ def _misfit_of_union(value: Any, choices: Sequence[Any], where: str) -> Misfit |
 
 def _misfit_of_mapping(value: Mapping[Any, Any], hint: Any, where: str) -> Misfit | None:
     inner = typing.get_args(hint)
-    hints = dict.fromkeys(value, inner[1] if len(inner) == 2 else Any)
+    keys = typing.get_args(inner[0]) if len(inner) == 2 and typing.get_origin(inner[0]) is Literal else value
+    hints = dict.fromkeys(keys, inner[1] if len(inner) == 2 else Any)
     if typing.is_typeddict(hint):
         hints = typing.get_type_hints(hint, include_extras=True)
         missing = sorted(key for key in hint.__required_keys__ if key not in value)

@@ -95,3 +95,22 @@ def test_azimuth_bins_the_other_angle(generator):
 def test_bad_settings_name_their_key(bad, message):
     with pytest.raises(ValueError, match=message):
         Pose(**bad)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"biased": {"mug": {"initail": "uniform"}}},
+            r"biased\.mug\.initail: unknown key, want one of initial, target",
+        ),
+        (
+            {"initial": {"dominant": 1, "peak": 2}},
+            r"parameter\.pose\.initial: want uniform, .* got \{'dominant'",
+        ),
+        ({"target": "unifrm"}, r"parameter\.pose\.target: want uniform"),
+    ],
+)
+def test_distributions_that_are_misspelt_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Pose(**settings)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 Specification = str | Mapping[str, object] | Sequence[float]
+Biased = Mapping[str, Mapping[Literal["initial", "target"], Specification]]
+"""Distributions of some objects by their names."""
 
 DOMINANT_REST = 0.02
 """Probability of a bin that is no mode. The paper (Sec. 4.2) only names the dominant bins; the number is that of its

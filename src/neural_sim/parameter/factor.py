@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neural_sim.parameter import bins as binned
 from neural_sim.parameter.bins import BinNoise
-from neural_sim.parameter.distributions import Specification, distribution
+from neural_sim.parameter.distributions import Biased, Specification, distribution
 from neural_sim.ranges import Positive, PositiveInt, validated
 from neural_sim.types import SceneDraw
 
@@ -41,15 +41,16 @@ class ConfiguredDistributions:
 
     initial: Specification = "uniform"
     target: Specification = "uniform"
-    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    biased: Biased | None = None
     gap: Gap = "disjoint"
     closed: Mapping[str, tuple[int, ...]] | None = None
 
     def of(self, which: str, object_name: str) -> Specification:
         """Look up the ``initial`` or ``target`` specification of one object."""
-        own = (self.biased or {}).get(object_name)
-        if own is None:
+        given = (self.biased or {}).get(object_name)
+        if given is None:
             return self.initial if which == "initial" else self.target
+        own = {str(key): specification for key, specification in given.items()}
         if which == "initial" and self.gap != "disjoint":
             return "uniform" if self.gap == "uniform" else own.get("target", self.target)
         return own.get(which, self.initial if which == "initial" else self.target)
@@ -176,7 +177,7 @@ class BinnedFactor:
             )
         if not self.low < self.high or (self.geometric and not self.low > 0.0):
             raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
-        for name in self.configured.biased or {}:
+        for name in (*(self.configured.biased or {}), ""):  # "": of objects that are not named
             for which in ("initial", "target"):
                 self.probabilities(which, name)
 
@@ -198,7 +199,7 @@ class BinnedFactor:
 
     def probabilities(self, which: str, object_name: str) -> Float[Tensor, "k"]:
         """Compute the configured ``initial`` or ``target`` distribution of one object."""
-        where = f"parameter.{self.name}.{which} of {object_name}"
+        where = f"parameter.{self.name}.{which}" + (f" of {object_name}" if object_name else "")
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:

@@ -13,11 +13,17 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, cast
 
 import torch
-from annotated_types import Ge
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neural_sim.parameter.distributions import Specification, distribution, project_simplex, project_sum
+from neural_sim.parameter.distributions import (
+    Biased,
+    Specification,
+    distribution,
+    project_simplex,
+    project_sum,
+)
 from neural_sim.parameter.factor import ConfiguredDistributions, Gap
 from neural_sim.ranges import Positive, validated
 from neural_sim.types import SceneDraw
@@ -51,12 +57,12 @@ class Illumination:
     """
 
     update: ClassVar[str] = "light_update"
-    anchors: Annotated[int, Ge(2)] = 6
+    anchors: Annotated[int, Ge(2), Le(1000)] = 6
     constraint: Constraint = "simplex"
     deviation: Positive = 0.1
     initial: Specification = "uniform"
     target: Specification = "uniform"
-    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    biased: Biased | None = None
     gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Gt, Le
 
-from neural_sim.parameter.distributions import Specification
+from neural_sim.parameter.distributions import Biased, Specification
 from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Floor, Gap
 from neural_sim.ranges import Ascending, Matching, Positive, PositiveInt, validated
 
@@ -55,7 +55,7 @@ class Pose:
     floor: Floor = 0.005
     initial: Specification = "uniform"
     target: Specification = "uniform"
-    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    biased: Biased | None = None
     gap: Gap = "disjoint"
     uncovered: Literal["leave_out", "render"] = "leave_out"
     covered_within_deg: Annotated[float, Gt(0), Le(180)] = 30.0

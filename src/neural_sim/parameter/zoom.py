@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from neural_sim.parameter.distributions import Specification
+from neural_sim.parameter.distributions import Biased, Specification
 from neural_sim.parameter.factor import BinnedFactor, ConfiguredDistributions, Coordinate, Floor, Gap
 from neural_sim.parameter.unlearned import NEAREST, Unit
 from neural_sim.ranges import Ascending, Positive, PositiveInt, validated
@@ -41,7 +41,7 @@ class Zoom:
     floor: Floor = 0.005
     initial: Specification = "uniform"
     target: Specification = "uniform"
-    biased: Mapping[str, Mapping[str, Specification]] | None = None
+    biased: Biased | None = None
     gap: Gap = "disjoint"
 
     def __post_init__(self) -> None:
