@@ -102,7 +102,7 @@ def _angle(configured: ConfiguredDistributions, angle: str) -> ConfiguredDistrib
             return specification.get(angle, "uniform")  # pyright: ignore[reportReturnType]
         return specification if angle == "phi" else "uniform"
 
-    biased = {
+    biased: Biased = {
         name: {which: part(specification) for which, specification in own.items()}
         for name, own in (configured.biased or {}).items()
     }
