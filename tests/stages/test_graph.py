@@ -10,6 +10,8 @@ from PIL import Image
 from neural_sim.main import build, conf_directory
 from neural_sim.outer.records import LearnedPsi
 from neural_sim.stages.graph import Graph
+from neural_sim.stages.stage import Results
+from neural_sim.stages.store import Store
 
 
 def keys(tmp_path, *overrides):
@@ -62,6 +64,20 @@ def test_a_uniform_warm_start_is_trained_on_images_of_every_bin():
     p = graph.experiment.imaging.distribution.probabilities(graph.warm_start.psi)
     assert all(torch.allclose(values, torch.full_like(values, 1 / values.shape[1])) for values in p.values())
     assert graph.warm_start.psi.shape == graph.psi("initial").shape
+
+
+def test_what_reads_psi_off_the_target_wants_no_warm_start_and_shares_the_renders_of_the_loop(tmp_path):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        common = ["+experiment=pose_gap", "scale=smoke", f"paths.store={tmp_path}"]
+        loop, reading = (
+            Graph(build(compose("config", [*common, f"baseline={name}"])))
+            for name in ("neural_sim", "label_shift")
+        )
+    made = Results(Store(tmp_path)).missing([reading.learned])
+    assert {stage.kind for stage in made if stage.phase == "psi"} == {"pool", "shown", "psi"}
+    assert reading.read_warm_start == () and not any(stage.kind == "detector" for stage in made)
+    assert loop.read_warm_start == (loop.warm_start,)
+    assert loop.shown.pool is loop.learned.pool and loop.shown.pool.key == reading.shown.pool.key
 
 
 def test_a_first_hypergradient_at_a_warm_start_of_other_images_is_refused():

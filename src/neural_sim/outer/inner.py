@@ -68,6 +68,30 @@ class Numbers:
 
 
 @dataclass(frozen=True)
+class RenderedPool:
+    """A pool and what it leaves behind.
+
+    Attributes:
+        scene: of the pooled renders.
+        state: of the generator after them: who goes on from it draws what the pool's own maker would.
+        spent: seconds.
+    """
+
+    scene: Scene
+    state: Tensor
+    spent: Cost
+
+    @staticmethod
+    def of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> RenderedPool:
+        """Render a pool (:func:`~neural_sim.synthesis.pool.pool_of`)."""
+        began, cpu_began = time.perf_counter(), time.process_time()
+        pool = pool_of(scene, per_bin, generator, lights=lights)
+        synchronise(pool.subjects[0].device)
+        spent = Cost(seconds=time.perf_counter() - began, cpu_seconds=time.process_time() - cpu_began)
+        return RenderedPool(pool, generator.get_state(), spent)
+
+
+@dataclass(frozen=True)
 class LoopInputs:
     """The inputs of a psi loop.
 
@@ -76,12 +100,14 @@ class LoopInputs:
         params: its warm start, on the device where the loop trains and the scene's fields are.
         validation: the labelled target set, on any device; the loop sees no other images of the target.
         photographs: labelled ones that train with the drawn images, as ``training.real`` says.
+        pool: that the loop's generator has rendered already; None: it is rendered where the loop has one.
     """
 
     detector: Detector
     params: Parameters
     validation: LabelledImages
     photographs: LabelledImages | None = None
+    pool: RenderedPool | None = None
 
 
 @dataclass(frozen=True)
@@ -179,19 +205,20 @@ class InnerLoop:
         photographs = None
         if inputs.photographs is not None:
             photographs = CachedSet.of(detector, backbone, inputs.photographs)
-        pool, began, cpu_began = None, time.perf_counter(), time.process_time()
-        if pooled(settings, draws, scene.distribution):
-            pool = pool_of(scene, settings.pool_per_bin, generator)
-        synchronise(validation.device)
-        spent = Cost(seconds=time.perf_counter() - began, cpu_seconds=time.process_time() - cpu_began)
+        pool = inputs.pool
+        if pool is not None:
+            generator.set_state(pool.state)
+        elif pooled(settings, draws, scene.distribution):
+            pool = RenderedPool.of(scene, settings.pool_per_bin, generator)
         start = params
         if settings.start != "warm":
             warm = {name: value for name, value in params.items() if name.startswith("backbone.")}
             start = {**placed(detector.init(generator), validation.device), **warm}
         objective = Objective(validation, inputs.validation, settings.objective)
         return InnerLoop(
-            scene, detector, params, start, objective, photographs, settings, training, draws, pool, spent
-        )
+            scene, detector, params, start, objective, photographs, settings, training, draws,
+            None if pool is None else pool.scene, Cost() if pool is None else pool.spent,
+        )  # fmt: skip
 
     @property
     def backbone(self) -> Parameters:

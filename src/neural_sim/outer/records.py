@@ -122,7 +122,7 @@ class LearnedPsi:
     reads psi off the target, which is ``shown``.
     """
 
-    trajectory: Float[Tensor, "iterations+1 objects K"]
+    trajectory: Float[Tensor, "psis objects K"]
     records: list[IterationRecord]
     before: Cost = field(default_factory=Cost)
     shown: tuple[FactorEstimate, ...] = ()

@@ -16,6 +16,7 @@ from neural_sim.outer.records import IterationRecord, LearnedPsi
 from neural_sim.stages.detector import DetectorStage, PhotographsStage, TrainedStage
 from neural_sim.stages.evaluate import ScoresStage
 from neural_sim.stages.images import Images, Psi
+from neural_sim.stages.pool import PoolStage
 from neural_sim.stages.psi import HypergradientParts, PsiStage
 from neural_sim.stages.scene import PictureSubjectStage
 from neural_sim.stages.shown import ShownStage
@@ -114,14 +115,25 @@ class Graph(Images):
         uniform = self.synthetic(self.uniform, "the fields' own views")
         return replace(uniform, scene=self.scene.showing(pictures))
 
+    @property
+    def _reading(self) -> LabelShift:
+        x = self.experiment
+        if isinstance(x.loop.method, LabelShift):
+            return x.loop.method
+        return LabelShift(per_bin=x.loop.outer.pool_per_bin or LabelShift.per_bin)
+
+    @cached_property
+    def pool(self) -> PoolStage:
+        """Renders of all bins, which the loop composes and the target's boxes are read by."""
+        x = self.experiment
+        return PoolStage(self.scene, self._reading.per_bin, x.loop.outer.quality, x.run.seed)
+
     @cached_property
     def shown(self) -> ShownStage:
         """What the target's boxes show, read as the method says where it reads them."""
-        x, settings = self.experiment, self.experiment.loop.method
-        if not isinstance(settings, LabelShift):
-            settings = LabelShift(per_bin=x.loop.outer.pool_per_bin or LabelShift.per_bin)
+        x, settings = self.experiment, self._reading
         return ShownStage(
-            self.scene, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
+            self.pool, self.targets, self._symmetries, x.imaging.distribution, settings, self.psi("initial"),
             x.score == "accuracy", x.run.seed,
         )  # fmt: skip
 
@@ -132,6 +144,11 @@ class Graph(Images):
         angles = [factor.name for factor in binned if factor.coordinate in ("phi", "rho")]
         return tuple(self.symmetry(name, angle) for name in self.names for angle in angles)
 
+    @property
+    def read_warm_start(self) -> tuple[DetectorStage, ...]:
+        """The warm start, unless the method does without."""
+        return () if isinstance(self.experiment.loop.method, LabelShift) else (self.warm_start,)
+
     @cached_property
     def learned(self) -> PsiStage:
         """The psi that the method learns."""
@@ -140,7 +157,7 @@ class Graph(Images):
         parts = HypergradientParts(x.loop.gradient, x.loop.solver) if follows else None
         reads = follows and isinstance(x.loop.outer.first_step, LabelShift)
         return PsiStage(
-            self.warm_start, self.targets, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
+            self.warm_start, self.targets, self.pool, x.imaging.distribution, x.loop.method, parts, x.loop.outer,
             self.psi("initial"), x.run.seed, self.shown if isinstance(x.loop.method, LabelShift) else None,
             self._symmetries if reads else (), x.run.progress, self.on_record,
         )  # fmt: skip

@@ -19,7 +19,7 @@ from neural_sim.detector.classifier import Classifier
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.implicit import Implicit
 from neural_sim.outer.first_step import Derivative, FirstStep, WhatTheTargetShows
-from neural_sim.outer.inner import InnerLoop, LoopInputs
+from neural_sim.outer.inner import InnerLoop, LoopInputs, pooled
 from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
 from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, record_of
@@ -29,6 +29,7 @@ from neural_sim.parameter.product import HARD, Draws, SceneDistribution
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
+from neural_sim.stages.pool import PoolStage
 from neural_sim.stages.shown import ShownStage, groups_of
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.symmetry import SymmetryStage
@@ -49,7 +50,8 @@ class HypergradientParts:
 class PsiStage(Stage[LearnedPsi]):
     """The psi loop of ``method`` from the warm start's distribution.
 
-    ``parts`` are those of a method that follows the hypergradient, ``shown`` is what the method reads off the target's
+    ``parts`` are those of a method that follows the hypergradient, ``pool`` has the renders of a loop that
+    reuses them, ``shown`` is what the method reads off the target's
     boxes; None for others. ``symmetries`` are of the bins that ``outer.first_step`` reads off them. ``on_record`` is
     called with every iteration's record as it ends.
 
@@ -63,6 +65,7 @@ class PsiStage(Stage[LearnedPsi]):
 
     warm_start: DetectorStage
     targets: TargetSetsStage
+    pool: PoolStage
     distribution: SceneDistribution
     method: Method
     parts: HypergradientParts | None
@@ -128,7 +131,9 @@ class PsiStage(Stage[LearnedPsi]):
         if self.outer.quality is not None:
             scene = scene.with_quality(self.outer.quality)
         detector, params = self.warm_start.build(), results(self.warm_start).params
-        inputs = LoopInputs(detector, params, results(self.targets).val, self.warm_start.photographs(results))
+        photographs = self.warm_start.photographs(results)
+        pool = results(self.pool) if pooled(self.outer, self.draws, self.distribution) else None
+        inputs = LoopInputs(detector, params, results(self.targets).val, photographs, pool)
         generator = stream(self.seed, "psi")
         inner = InnerLoop.prepare(scene, inputs, self.outer, training, generator, self.draws)
         if self.parts is not None:

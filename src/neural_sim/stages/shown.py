@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from neural_sim.baseline.label_shift.evidence import estimates_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.randomness import stream
-from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.pool import PoolStage
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.symmetry import SymmetryStage
 from neural_sim.stages.target_sets import TargetSetsStage
@@ -33,7 +33,7 @@ class ShownStage(Stage[Estimate]):
     phase: ClassVar[str] = "psi"
     kind: ClassVar[str] = "shown"
 
-    scene: SceneStage
+    pool: PoolStage
     targets: TargetSetsStage
     symmetries: tuple[SymmetryStage, ...]
     distribution: SceneDistribution
@@ -50,9 +50,12 @@ class ShownStage(Stage[Estimate]):
     @override
     def make(self, results: Results) -> Estimate:
         groups = groups_of(self.symmetries, results)
-        scene, validation = results(self.scene), results(self.targets).val
+        pool, validation = results(self.pool), results(self.targets).val
         generator = stream(self.seed, "psi")
-        return estimate(scene, validation, self.psi, self.settings, generator, groups, self.whole)
+        generator.set_state(pool.state)
+        found = estimate(pool.scene, validation, self.psi, self.settings, generator, groups, self.whole)
+        spent = {"pool": pool.spent.cpu_seconds, **found.cpu_seconds}
+        return replace(found, seconds=found.seconds + pool.spent.seconds, cpu_seconds=spent)
 
     @override
     def pack(self, value: Estimate) -> dict[str, Any]:

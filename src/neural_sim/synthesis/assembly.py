@@ -60,7 +60,7 @@ class RenderedImages:
 
     images: LabelledImages
     objects: tuple[RenderedObject, ...]
-    rows: tuple[Int[Tensor, "m"], ...]
+    rows: tuple[Int[Tensor, "_"], ...]
     compose: tuple[Compose, ...]
 
     def __len__(self) -> int:

@@ -107,7 +107,7 @@ PHASES: Mapping[str, Task] = {
         lambda live, stage, fitted: live.fields({stage.views.object: fitted.history}),
     ),
     "target_sets": Phase("target_sets", lambda graph: [graph.targets]),
-    "warm_start": Phase("warm_start", lambda graph: [graph.warm_start]),
+    "warm_start": Phase("warm_start", lambda graph: graph.read_warm_start),
     "psi": Phase(
         "psi",
         lambda graph: [graph.learned],
@@ -182,6 +182,7 @@ def omitted(graph: Graph, learns: bool) -> list[Omission]:
     rows = [
         (not distribution.lights, "field", "appearance codes", "no parameter moves the light", None),
         (isinstance(method, Fixed), "psi", "the psi loop", f"baseline={method.name} keeps its distribution", 1.0),
+        (isinstance(method, LabelShift), "warm_start", "the warm start", f"baseline={method.name} does without", 1.0),
         (isinstance(method, LabelShift), "psi", "the psi loop", f"baseline={method.name} trains no detector", 1.0),
         (loops and not follows, "psi", "hypergradients", f"baseline={method.name} compares trainings only", 1.0),
         (follows and isinstance(draws, HardDraws), "psi", "the renderer's derivative",

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2
+from scipy.stats import chi2, mannwhitneyu
 
-from neural_sim.baseline.label_shift.evidence import FactorEstimate, Strangeness, estimates_of
+from neural_sim.baseline.label_shift.evidence import FactorEstimate, Strangeness, estimates_of, part_farther
 
 MOVES = FactorEstimate(
     "mug", "pose", 40, (0.25,) * 4, (0.45, 0.05, 0.45, 0.05), (0.4, 0.0, 0.4, 0.0), (0.5, 0.1, 0.5, 0.1),
@@ -30,20 +30,46 @@ def test_a_sentence_names_groups_with_the_interval_of_their_sum():
     [
         ("stays", "psi stays, it may be right"),
         ("too few boxes", "40 boxes are too few"),
-        ("fits no render", "5% of its"),
+        ("fits no render", "look like no renders of it (less than held-out ones do in 5% of all pairs"),
+        ("not told apart", "90% of held-out ones are read right, 0% by chance, so psi stays"),
     ],
 )
 def test_a_sentence_says_why_psi_does_not_move(finding, said):
     assert said in dataclasses.replace(MOVES, finding=finding).sentence
 
 
+def test_a_search_that_did_not_end_is_said():
+    flat = dataclasses.replace(MOVES, finding="not told apart", converged=False)
+    assert "the likelihood is flat" in flat.sentence
+
+
 def test_strangeness_is_the_distance_in_standard_deviations_to_the_nearest_cell():
     generator = torch.Generator().manual_seed(0)
     cells = torch.arange(2).repeat(4000)
     features = torch.randn(8000, 3, generator=generator, dtype=torch.float64) + 20.0 * cells[:, None]
-    strangeness = Strangeness.of(features, cells, shrinkage=0.0)
-    distances = strangeness(features)
+    dark = torch.zeros(8000, 0, dtype=torch.float64)
+    distances = Strangeness.of(features, cells, dark, shrinkage=0.0)(features, dark)
     np.testing.assert_allclose(distances.quantile(0.95), chi2(3).ppf(0.95), rtol=0.05)
-    assert strangeness.part_above(0.95, features, features) == pytest.approx(0.05, abs=0.001)
-    assert strangeness.part_above(0.95, features, features + 10.0) == 1.0
-    assert strangeness.part_above(0.95, features, features[:0]) == 0.0
+
+
+def test_what_a_light_explains_is_not_strange():
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.rand(4000, 2, generator=generator, dtype=torch.float64)
+    cells, own = torch.zeros(4000, dtype=torch.long), torch.tensor([[5.0, 0.0], [0.0, -3.0]]).double()
+    noise = torch.randn(4000, 2, generator=generator, dtype=torch.float64)
+    strangeness = Strangeness.of(weights @ own + noise, cells, weights, shrinkage=0.0)
+    one = torch.tensor([0.9, 0.1], dtype=torch.float64)  # all boxes under one light
+    lit = strangeness(one @ own + noise, one)
+    np.testing.assert_allclose(lit.quantile(0.95), chi2(2).ppf(0.95), rtol=0.07)
+
+
+def test_the_part_that_is_farther_is_that_of_all_pairs_by_their_frequency():
+    generator = torch.Generator().manual_seed(0)
+    seen, known = torch.rand(30, generator=generator), torch.rand(40, generator=generator)
+    even = torch.ones(40, dtype=torch.float64)
+    pairs = mannwhitneyu(seen.numpy(), known.numpy()).statistic / (30 * 40)
+    assert part_farther(seen, known, even) == pytest.approx(pairs)
+    assert part_farther(known, known, even) == pytest.approx(0.5)
+    assert part_farther(known[:1], known, torch.eye(40, dtype=torch.float64)[0]) == pytest.approx(0.5)
+    assert part_farther(seen + 1.0, known, even) == 1.0
+    assert part_farther(seen[:0], known, even) == 0.5

@@ -97,9 +97,16 @@ def test_intervals_of_sure_posteriors_are_those_of_the_dirichlet_posterior():
         SURE.repeat_interleave(counts, 0), Cells((4,)), 0.3, torch.Generator().manual_seed(0), chains=400
     )[0]
     for b, count in enumerate(counts.tolist()):
-        exact = beta(count + 1.3, 20 - count + 3 * 1.3)
+        exact = beta(count + 0.3, 20 - count + 3 * 0.3)
         for level in (0.05, 0.5, 0.95):
             assert float(drawn[:, b].quantile(level)) == pytest.approx(exact.ppf(level), abs=0.012)
+
+
+def test_uncertain_likelihoods_share_the_chains():
+    """Half of the samples say one bin, half the other: half of the draws have each."""
+    samples = torch.stack([SURE[:1].repeat(9, 1), SURE[1:2].repeat(9, 1)])
+    drawn = posterior(samples, Cells((4,)), 0.3, torch.Generator().manual_seed(0))[0]
+    assert float((drawn[:, 0] > 0.5).double().mean()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say():

@@ -11,7 +11,7 @@ import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import affine_grid, avg_pool2d, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample
 from torchvision.ops import roi_align
 
 from neural_sim.ranges import Fraction, NonNegative, validated
@@ -112,11 +112,8 @@ class Augmentation:
             return (2.0 * torch.rand((n, *shape), generator=generator) - 1.0).to(like)
 
         zoom, shift = self.jitter * either(), self.jitter * either(2)
+        like = like + self.blur * either(1, 1, 1).abs() * (_softened(like) - like)
         seen = _sampled(like, math.radians(self.roll_deg) * either(), zoom.exp(), shift)
-        soft = avg_pool2d(
-            avg_pool2d(seen, 3, 1, 1, count_include_pad=False), 3, 1, 1, count_include_pad=False
-        )
-        seen = seen + self.blur * either(1, 1, 1).abs() * (soft - seen)
         gain = (math.log(2.0) * self.exposure * (either(1, 1, 1) + 0.2 * either(3, 1, 1))).exp()
         mean = seen.mean((2, 3), keepdim=True)
         seen = (mean + (seen - mean) * (0.3 * self.exposure * either(1, 1, 1)).exp()) * gain
@@ -146,6 +143,20 @@ def plain(crops: Crops) -> tuple[Tensor, Tensor]:
     zero = crops.pixels.new_zeros(len(crops))
     seen = _sampled(crops.pixels, zero, zero + 1.0, torch.stack([zero, zero], 1))
     return seen - 0.5, crops.boxes
+
+
+def quarters(crops: Crops) -> Float[Tensor, "n 12"]:
+    """Return the mean colours of the four quarters of what the network sees."""
+    return adaptive_avg_pool2d(plain(crops)[0], 2).flatten(1)
+
+
+def _softened(pixels: Float[Tensor, "n 3 side side"]) -> Float[Tensor, "n 3 side side"]:
+    """Blur by the weights 1, 2, 3, 2, 1 along both sides."""
+    for axis in (2, 3):
+        for _ in range(2):
+            ahead, behind = (pixels.roll(step, axis) for step in (1, -1))
+            pixels = (pixels + ahead + behind) / 3.0
+    return pixels
 
 
 def _sampled(pixels: Tensor, roll: Tensor, zoom: Tensor, shift: Tensor) -> Float[Tensor, "n 3 side side"]:

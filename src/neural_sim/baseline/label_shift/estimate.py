@@ -23,7 +23,7 @@ from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.baseline.label_shift.mixture import Cells
 from neural_sim.baseline.label_shift.network import BinNetwork
 from neural_sim.baseline.label_shift.reading import Reader
-from neural_sim.baseline.label_shift.renders import known_crops, parted, pool_for
+from neural_sim.baseline.label_shift.renders import known_crops, parted, pool_for, with_bank
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.synthesis.scene import Scene
 from neural_sim.types import LabelledImages
@@ -90,7 +90,7 @@ def estimate(
     clock, begun = _Clock(), time.perf_counter()
     pool = pool_for(scene, settings.per_bin, generator)
     clock("pool")
-    sides = parted(pool, settings.held_out)
+    sides = parted(with_bank(pool, settings.backgrounds, generator), settings.held_out)
     training, held = (known_crops(part, settings.compositions, generator, whole) for part in sides)
     clock("images")
     distribution = scene.distribution

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Finding = Literal["moves", "stays", "fits no render", "too few boxes"]
+Finding = Literal["moves", "stays", "not told apart", "fits no render", "too few boxes"]
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,14 @@ class FactorEstimate:
         high: upper ends.
         groups: bins (from 1) that look the same; their parts of a group's probability are psi's.
         p_value: of the null that the target is where psi stands.
-        strange: part of the boxes that look like fewer than 5 % of the renders do.
-        accuracy: part of held-out renders whose group of bins is told right; None for lights.
+        strange: probability that a box looks less like the renders than a held-out render does, 0.5 where they look
+            alike.
+        accuracy: part of held-out renders whose group of bins is told right; of lights, the part of the guesses'
+            variance that weights explain.
         finding: whether psi ``moves`` to it; ``stays``, since the target may be where psi stands; or does not move
-            because too many boxes look like no render, or there are too few.
+            because renders themselves are not told apart, boxes look like no render, or there are too few.
+        chance: accuracy without looking.
+        converged: whether the search for the mixture ended; it does not where the likelihood is flat.
     """
 
     name: str
@@ -59,8 +63,10 @@ class FactorEstimate:
     groups: tuple[tuple[int, ...], ...]
     p_value: float
     strange: float
-    accuracy: float | None
+    accuracy: float
     finding: Finding
+    chance: float = 0.0
+    converged: bool = True
 
     @property
     def sentence(self) -> str:
@@ -69,9 +75,14 @@ class FactorEstimate:
             return f"{self.name}: {self.boxes} boxes are too few to read its {self.factor} off"
         if self.finding == "fits no render":
             return (
-                f"{self.name}: {self.strange:.0%} of its boxes look like no render of it (5 % would), so its "
-                f"{self.factor} is not read off them"
+                f"{self.name}: its boxes look like no renders of it (less than held-out ones do in {self.strange:.0%} "
+                f"of all pairs, 50 % where alike), so its {self.factor} is not read off them"
             )
+        if self.finding == "not told apart":
+            why = f"{self.accuracy:.0%} of held-out ones are read right, {self.chance:.0%} by chance"
+            if not self.converged:
+                why = f"the likelihood is flat ({why})"
+            return f"{self.name}: renders do not tell its {self.factor}: {why}, so psi stays"
         shown = ", ".join(
             f"{_called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
             for group in self._largest
@@ -123,17 +134,29 @@ def _called(group: Sequence[int]) -> str:
 class Strangeness:
     """How far features are from those of renders: the Mahalanobis distance to the nearest cell (Lee et al. 2018).
 
+    What a light explains of features is no distance: it is taken out first, linearly.
+
     Attributes:
         means: of the features of every cell's renders.
         precision: inverse of the covariance that all cells have in common.
+        light: by how much features change with the weights of the lights.
     """
 
     means: Float[Tensor, "cells d"]
     precision: Float[Tensor, "d d"]
+    light: Float[Tensor, "lights d"]
 
     @staticmethod
-    def of(features: Float[Tensor, "n d"], cells: Int[Tensor, "n"], shrinkage: float = 0.1) -> Strangeness:
+    def of(
+        features: Float[Tensor, "n d"],
+        cells: Int[Tensor, "n"],
+        weights: Float[Tensor, "n lights"],
+        shrinkage: float = 0.1,
+    ) -> Strangeness:
         """Fit means and covariance, which is drawn towards a multiple of the identity by ``shrinkage``."""
+        eye = torch.eye(weights.shape[1], dtype=features.dtype)
+        light = torch.linalg.solve(weights.T @ weights + 1e-6 * eye, weights.T @ features)
+        features = features - weights @ light
         own, index = cells.unique(return_inverse=True)
         counts = torch.bincount(index, minlength=len(own)).to(features)
         means = (
@@ -143,15 +166,30 @@ class Strangeness:
         covariance = left.T @ left / max(len(features) - len(own), 1)
         size = covariance.diagonal().mean().clamp_min(1e-12)
         eye = torch.eye(len(covariance), dtype=features.dtype)
-        return Strangeness(means, torch.linalg.inv((1.0 - shrinkage) * covariance + shrinkage * size * eye))
+        precision = torch.linalg.inv((1.0 - shrinkage) * covariance + shrinkage * size * eye)
+        return Strangeness(means, precision, light)
 
-    def __call__(self, features: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
-        """Compute the squared distance of each."""
-        apart = features[:, None, :] - self.means
+    def __call__(
+        self, features: Float[Tensor, "n d"], weights: Float[Tensor, "*n lights"]
+    ) -> Float[Tensor, "n"]:
+        """Compute the squared distance of each, seen under lights of these weights."""
+        apart = (features - weights @ self.light)[:, None, :] - self.means
         return (apart @ self.precision * apart).sum(-1).amin(-1)
 
-    def part_above(self, quantile: float, known: Float[Tensor, "n d"], seen: Float[Tensor, "m d"]) -> float:
-        """Return the part of ``seen`` that is farther away than the quantile of ``known``; 0 of none."""
-        if not len(seen) or not len(known):
-            return 0.0
-        return float((self(seen) > self(known).quantile(quantile)).double().mean())
+
+def part_farther(seen: Float[Tensor, "m"], known: Float[Tensor, "n"], frequency: Float[Tensor, "n"]) -> float:
+    """Return the probability that one of ``seen`` is larger than one of ``known``, ties counting half.
+
+    Args:
+        seen: distances of boxes.
+        known: distances of held-out renders.
+        frequency: of each of these, as often as the boxes show its cell; not normalised.
+
+    Returns:
+        0.5 of none.
+    """
+    total = frequency.sum()
+    if not len(seen) or not float(total) > 0.0:
+        return 0.5
+    larger = (seen[:, None] > known).double() + 0.5 * (seen[:, None] == known).double()
+    return float((larger @ (frequency / total)).mean())

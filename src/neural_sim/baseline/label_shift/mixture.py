@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Probabilities = tuple[Float[Tensor, "*batch k"], ...]
+Probabilities = tuple[Float[Tensor, "*batch _"], ...]
 """The probabilities of every factor's bins."""
 
 
@@ -89,7 +89,7 @@ class Cells:
 
 
 def grouped(
-    likelihood: Float[Tensor, "boxes cells"], cells: Cells, within: Sequence[Float[Tensor, "k groups"]]
+    likelihood: Float[Tensor, "boxes cells"], cells: Cells, within: Sequence[Float[Tensor, "_ _"]]
 ) -> Float[Tensor, "boxes merged"]:
     """Merge bins that cannot be told apart.
 
@@ -147,7 +147,7 @@ def maximise(
 
 
 def log_likelihood(
-    likelihood: Float[Tensor, "*batch boxes cells"], joint: Float[Tensor, "*batch cells"]
+    likelihood: Float[Tensor, "*batch boxes cells"], joint: Float[Tensor, "*#batch cells"]
 ) -> Float[Tensor, "*batch"]:
     """Compute the logarithm of the boxes' likelihood in a mixture."""
     return (likelihood * joint[..., None, :]).sum(-1).clamp_min(1e-300).log().sum(-1)
@@ -163,7 +163,7 @@ def _normalised(counts: Tensor) -> Tensor:
 
 
 def posterior(
-    likelihood: Float[Tensor, "boxes cells"],
+    likelihood: Float[Tensor, "*samples boxes cells"],
     cells: Cells,
     prior: float,
     generator: torch.Generator,
@@ -173,23 +173,27 @@ def posterior(
 ) -> Probabilities:
     """Draw mixtures from their posterior by Gibbs sampling: cells of the boxes given p, then p given their numbers.
 
-    The Dirichlet prior has the parameter ``prior`` + 1, whose mode :func:`maximise` finds.
+    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, p is on average what :func:`maximise` makes
+    of them. (With 1 more, whose mode that is, a bin that has nearly all boxes would be drawn too rarely.) Where the
+    likelihood is uncertain, its ``samples`` share the chains.
 
     Returns:
         ``chains`` x ``kept`` draws of every factor's probabilities, [draws, k].
     """
     like = likelihood.double()
+    if like.ndim == 3:
+        like = like[torch.arange(chains) * len(like) // chains]
     random = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
     p = tuple(like.new_full((chains, size), 1.0 / size) for size in cells.sizes)
     drawn: list[Probabilities] = []
     for step in range(burn + kept):
         weighted = (like * cells.joint(p)[:, None, :]).cumsum(-1)
-        level = torch.from_numpy(random.random((chains, len(like)))) * weighted[..., -1]
+        level = torch.from_numpy(random.random((chains, like.shape[-2]))) * weighted[..., -1]
         chosen = (weighted <= level[..., None]).sum(-1).clamp_max(cells.count - 1)
         counts = torch.zeros(chains, cells.count, dtype=torch.float64)
         counts.scatter_add_(1, chosen, torch.ones(chosen.shape, dtype=torch.float64))
         p = tuple(
-            _normalised(torch.from_numpy(random.standard_gamma((own + 1.0 + prior).numpy())))
+            _normalised(torch.from_numpy(random.standard_gamma((own + prior).clamp_min(1e-3).numpy())))
             for own in cells.margins(counts)
         )
         if step >= burn:

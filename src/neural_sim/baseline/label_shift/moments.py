@@ -1,10 +1,14 @@
 """Weights of lights from a sample's mean: lights are no mixture of images, so moments are matched (pure functions).
 
-All images of an object share one light. The network's guess y of the weights w is shrunk towards what it saw most, so
-it is no estimate; but over held-out renders of known weights its mean is nearly linear, E[y | w] = B w, and the weights
-are those whose mean is the target's (indirect inference, Gourieroux, Monfort and Renault 1993):
+All images of an object share one light. Guesses y of the weights w are shrunk towards what was seen most: they are no
+estimates, but over held-out renders of known weights their mean is nearly linear, E[y | w] = B w, and the weights are
+those whose mean is the target's (indirect inference, Gourieroux, Monfort and Renault 1993):
 
     w = argmin (ybar - B w)^T S^-1 (ybar - B w),    S = cov(ybar).
+
+There are two guesses of each weight, the network's and one that is linear in the colours of a crop's quarters, as light
+itself adds up. S says which to believe: where few renders trained the network, the colours. Covariances between
+the two are left out: the one's errors, which are no noise, would correct the other's.
 """
 
 from __future__ import annotations
@@ -27,39 +31,64 @@ class Response:
         slope: B.
         scatter: covariance of a guess about B w.
         precision: inverse of the sum of w w^T over the different renders that B is from.
-        misfit: covariance of what products of two weights explain of the rest: no number of boxes averages it out.
+        explained: part of the guesses' variance that B w has.
     """
 
-    slope: Float[Tensor, "k k"]
-    scatter: Float[Tensor, "k k"]
+    slope: Float[Tensor, "m k"]
+    scatter: Float[Tensor, "m m"]
     precision: Float[Tensor, "k k"]
-    misfit: Float[Tensor, "k k"]
+    explained: float
 
     @staticmethod
-    def of(guesses: Float[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Response:
+    def of(guesses: Float[Tensor, "n m"], weights: Float[Tensor, "n k"]) -> Response:
         """Fit B by least squares on renders of known weights."""
         eye = torch.eye(weights.shape[1], dtype=weights.dtype)
         precision = torch.linalg.inv(weights.T @ weights + 1e-6 * eye)
         slope = (precision @ weights.T @ guesses).T
         left = guesses - weights @ slope.T
-        scatter = left.T @ left / max(len(left) - weights.shape[1], 1)
-        first, second = torch.triu_indices(weights.shape[1], weights.shape[1], 1)
-        bent = weights[:, first] * weights[:, second]
-        explained = bent @ torch.linalg.lstsq(bent, left).solution
-        misfit = explained.T @ explained / max(len(left), 1)
-        least = 1e-9 * scatter.diagonal().mean().clamp_min(1e-12) * eye
+        lights = weights.shape[1]
+        own = torch.arange(guesses.shape[1]) // lights
+        scatter = left.T @ left / max(len(left) - lights, 1) * (own[:, None] == own)
+        least = (
+            (0.03 * scatter.diagonal()).clamp_min(1e-12).diag()
+        )  # weights sum to 1, and so do guesses, nearly
         several = len(weights) / len(weights.unique(dim=0))  # images of one render: they err alike
-        return Response(slope, scatter + least, several * precision, misfit)
+        variance = float((guesses - guesses.mean(0)).square().sum())
+        explained = 1.0 - float(left.square().sum()) / max(variance, 1e-12)
+        return Response(slope, scatter + least, several * precision, explained)
 
-    def covariance(self, boxes: int, weights: Float[Tensor, "k"]) -> Float[Tensor, "k k"]:
-        """Compute the covariance of the mean of ``boxes`` guesses less B w, which has errors of its own."""
-        return self.scatter * (1.0 / boxes + weights @ self.precision @ weights) + self.misfit
+    def covariance(self, boxes: int, weights: Float[Tensor, "k"]) -> Float[Tensor, "m m"]:
+        """Compute the covariance of the mean of ``boxes`` guesses less B w, which has errors of its own.
+
+        The boxes share one light. What the line misses of it is the same in all of them, no number of them averages it
+        out, and renders do not tell it from what differs between boxes: all of the scatter may be that.
+        """
+        return self.scatter * (1.0 + 1.0 / boxes + weights @ self.precision @ weights)
+
+    def misfits(self, guesses: Float[Tensor, "n m"], project: Project) -> Float[Tensor, "n"]:
+        """Compute how far each guess is from that of any weights, as in Hansen's test of overidentification."""
+        nearest = matched(guesses, self.slope, self.scatter, project)
+        return distance(guesses, nearest, self.slope, self.scatter)
+
+
+def fitted(
+    inputs: Float[Tensor, "n d"],
+    weights: Float[Tensor, "n k"],
+    others: Float[Tensor, "m d"],
+    ridge: float = 1e-3,
+) -> Float[Tensor, "m k"]:
+    """Guess the weights of others by what is linear in the inputs, from renders of known weights (ridge regression)."""
+    centre, middle = inputs.mean(0), weights.mean(0)
+    apart = inputs - centre
+    eye = ridge * len(inputs) * apart.square().mean().clamp_min(1e-12) * torch.eye(inputs.shape[1]).to(inputs)
+    slope = torch.linalg.solve(apart.T @ apart + eye, apart.T @ (weights - middle))
+    return middle + (others - centre) @ slope
 
 
 def matched(
-    mean: Float[Tensor, "*n k"],
-    slope: Float[Tensor, "k k"],
-    covariance: Float[Tensor, "k k"],
+    mean: Float[Tensor, "*n m"],
+    slope: Float[Tensor, "m k"],
+    covariance: Float[Tensor, "m m"],
     project: Project,
     steps: int = 2000,
 ) -> Float[Tensor, "*n k"]:
@@ -69,7 +98,8 @@ def matched(
     quadratic = slope.T @ inverse @ slope
     linear = mean @ inverse @ slope
     rate = 1.0 / torch.linalg.eigvalsh(quadratic)[-1]
-    w = project(torch.full_like(mean, 1.0 / mean.shape[-1]))
+    lights = slope.shape[1]
+    w = project(mean.new_full((*mean.shape[:-1], lights), 1.0 / lights))
     ahead, t = w, 1.0
     for _ in range(steps):
         new = project(ahead - rate * (ahead @ quadratic - linear))
@@ -82,19 +112,19 @@ def matched(
 
 
 def distance(
-    mean: Float[Tensor, "*n k"],
-    weights: Float[Tensor, "*n k"],
-    slope: Float[Tensor, "k k"],
-    covariance: Float[Tensor, "k k"],
-) -> Float[Tensor, "*n"]:
+    mean: Float[Tensor, "*#n m"],
+    weights: Float[Tensor, "*#n k"],
+    slope: Float[Tensor, "m k"],
+    covariance: Float[Tensor, "m m"],
+) -> Float[Tensor, "..."]:
     """Compute (ybar - B w)^T S^-1 (ybar - B w)."""
     left = mean - weights @ slope.T
     return (left @ torch.linalg.inv(covariance) * left).sum(-1)
 
 
 def scattered(
-    mean: Float[Tensor, "k"], covariance: Float[Tensor, "k k"], draws: int, generator: torch.Generator
-) -> Float[Tensor, "draws k"]:
+    mean: Float[Tensor, "m"], covariance: Float[Tensor, "m m"], draws: int, generator: torch.Generator
+) -> Float[Tensor, "draws m"]:
     """Draw means from the normal distribution about ``mean``."""
     noise = torch.randn(draws, len(mean), generator=generator, dtype=mean.dtype)
     return mean + noise @ torch.linalg.cholesky(covariance).T

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neural_sim.baseline.label_shift.crops import Crops
-from neural_sim.baseline.label_shift.evidence import FactorEstimate, Finding, Span, Strangeness
-from neural_sim.baseline.label_shift.mixture import Cells, grouped, maximise, posterior, ratio_test
-from neural_sim.baseline.label_shift.moments import Response, distance, matched, scattered
+from neural_sim.baseline.label_shift.crops import Crops, quarters
+from neural_sim.baseline.label_shift.evidence import FactorEstimate, Finding, Span, Strangeness, part_farther
+from neural_sim.baseline.label_shift.mixture import Cells, Status, grouped, maximise, posterior, ratio_test
+from neural_sim.baseline.label_shift.moments import Response, distance, fitted, matched, scattered
 from neural_sim.baseline.label_shift.network import BinNetwork, Known, Outputs, calibrate, outputs_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.parameter.distributions import merged
@@ -22,6 +21,10 @@ from neural_sim.parameter.product import SceneDistribution
 
 Bins = Sequence[Sequence[int]]
 """Groups of bins, numbered from 1, that look the same."""
+BEYOND_ALL = 0.995
+"""Largest strangeness where lights alone move: boxes share one, so that they are strange together or not at all."""
+CALIBRATIONS = 20
+"""Samples of the held-out renders whose calibrations differ as much as this one may err."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +54,45 @@ class Reader:
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
         """Return the estimates of an object's factors, and its psi with what moves moved."""
         training, held = (known.select(known.crops.labels == label) for known in (self.training, self.held))
-        seen = outputs_of(self.network, self.target.select(self.target.labels == label))
+        target = self.target.select(self.target.labels == label)
+        seen = outputs_of(self.network, target)
         known = outputs_of(self.network, held.crops)
-        strange = 1.0  # where no render shows the object
+        limits = None  # where no render shows the object
         if len(training.crops) and len(held.crops):
-            limits = Strangeness.of(outputs_of(self.network, training.crops).features, training.cells)
-            strange = limits.part_above(0.95, known.features, seen.features)
-        object_ = _Object(self, name, self.distribution.split(psi), groups, held, known, seen, strange)
-        new = dict(object_.psi)
-        for one in object_.found:
+            features = outputs_of(self.network, training.crops).features
+            limits = Strangeness.of(features, training.cells, training.weights.double())
+        if self.distribution.lights:
+            seen, known = (
+                self._with_colours(training, *pair) for pair in ((target, seen), (held.crops, known))
+            )
+        object_ = _Object(self, name, self.distribution.split(psi), groups, held, known, seen, limits)
+        found, new = object_.found(), dict(object_.psi)
+        for one in found:
             if one.finding == "moves":
                 factor = self.distribution.factor(one.factor)
                 new[one.factor] = factor.project(
                     factor.psi_of(torch.tensor(one.p, dtype=torch.float64), factor.closed(name))
                 )
-        return object_.found, self.distribution.join(new)
+        return found, self.distribution.join(new)
+
+    @staticmethod
+    def _with_colours(training: Known, crops: Crops, outputs: Outputs) -> Outputs:
+        """Add guesses of the lights' weights by colours to those of the network."""
+        own, others = (quarters(each).double() for each in (training.crops, crops))
+        guessed = fitted(own, training.weights.double(), others)
+        return replace(outputs, weights=torch.cat([outputs.weights, guessed], 1))
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A factor as it was read: ``p`` with intervals, by groups of bins, and what speaks for it."""
+
+    span: Span
+    groups: Bins
+    p_value: float
+    accuracy: float
+    chance: float
+    converged: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,46 +106,61 @@ class _Object:
     held: Known
     known: Outputs
     seen: Outputs
-    strange: float
+    limits: Strangeness | None
 
-    @cached_property
     def found(self) -> list[FactorEstimate]:
-        """The estimates, in the order of the factors."""
+        """Estimate the factors, in their order."""
         distribution = self.reader.distribution
-        binned = self._binned() if distribution.binned else {}
-        return [
-            binned[factor.name] if factor.name in binned else self._light(factor)
-            for factor in distribution.factors
-        ]
+        read: dict[str, _Read] = {}
+        frequency = torch.ones(len(self.held.cells), dtype=torch.float64)
+        weights = torch.zeros(0, dtype=torch.float64)
+        if distribution.binned:
+            read, frequency = self._binned()
+        for factor in distribution.factors:
+            if factor.name not in read:
+                read[factor.name] = self._light(factor)
+                weights = torch.tensor(read[factor.name].span.p, dtype=torch.float64)
+        strange = 1.0 if self.limits is None else self._strange(self.limits, weights, frequency)
+        return [self._judged(factor, read[factor.name], strange) for factor in distribution.factors]
 
-    def _estimate(
-        self, factor: str, span: Span, groups: Bins, p_value: float, accuracy: float | None = None
-    ) -> FactorEstimate:
+    def _strange(
+        self, limits: Strangeness, weights: Float[Tensor, "lights"], frequency: Float[Tensor, "held"]
+    ) -> float:
+        """Compare the boxes with held-out renders: by features, or where lights alone move, by what weights explain."""
+        lights = [f for f in self.reader.distribution.factors if f not in self.reader.distribution.binned]
+        if len(lights) == len(self.reader.distribution.factors):
+            response = Response.of(self.known.weights, self.held.weights.double())
+            seen, known = (
+                response.misfits(each.weights, lights[0].project) for each in (self.seen, self.known)
+            )
+        else:
+            seen = limits(self.seen.features, weights)
+            known = limits(self.known.features, self.held.weights.double())
+        return part_farther(seen, known, frequency)
+
+    def _judged(self, factor: Factor, read: _Read, strange: float) -> FactorEstimate:
         settings, boxes = self.reader.settings, len(self.seen)
-        finding: Finding = "moves" if p_value <= settings.level else "stays"
-        if self.strange > settings.strange:
+        finding: Finding = "moves" if read.p_value <= settings.level else "stays"
+        if not read.converged or read.accuracy - read.chance < settings.skill * (1.0 - read.chance):
+            finding = "not told apart"
+        if strange > (settings.strange if self.reader.distribution.binned else BEYOND_ALL):
             finding = "fits no render"
         if boxes < settings.fewest:
             finding = "too few boxes"
-        own = tuple(tuple(group) for group in groups)
-        start = tuple(self.reader.distribution.factor(factor).p_of(self.psi[factor]).tolist())
+        own = tuple(tuple(group) for group in read.groups)
+        start = tuple(factor.p_of(self.psi[factor.name]).tolist())
+        span = read.span
         return FactorEstimate(
-            self.name,
-            factor,
-            boxes,
-            start,
-            span.p,
-            span.low,
-            span.high,
-            own,
-            p_value,
-            self.strange,
-            accuracy,
-            finding,
-        )
+            self.name, factor.name, boxes, start, span.p, span.low, span.high, own, read.p_value, strange,
+            read.accuracy, finding, read.chance, read.converged,
+        )  # fmt: skip
 
-    def _binned(self) -> dict[str, FactorEstimate]:
-        """Estimate the distributions of all factors with bins together: boxes are a mixture of their combinations."""
+    def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:
+        """Read all factors with bins together: boxes are a mixture of their combinations.
+
+        Returns:
+            The factors, and how often the boxes show what each held-out render shows.
+        """
         settings, generator = self.reader.settings, self.reader.generator
         factors = self.reader.distribution.binned
         every = Cells(tuple(factor.bins for factor in factors))
@@ -126,15 +168,14 @@ class _Object:
         p_now = [f.p_of(self.psi[f.name]).double() for f in factors]
         within = [_within(p, own) for p, own in zip(p_now, groups, strict=True)]
         cells = Cells(tuple(len(own) for own in groups))
-        temperature, bias = calibrate(self.known.logits, self.held.cells)
+        calibrated = calibrate(self.known.logits, self.held.cells)
         seen, held = (
-            grouped((outputs.logits / temperature + bias).softmax(-1), every, within)
-            for outputs in (self.seen, self.known)
+            grouped(calibrated(outputs.logits)[0], every, within) for outputs in (self.seen, self.known)
         )
         bins = zip(groups, every.bins(self.held.cells), strict=True)
         truth = cells.index(torch.stack([_group_of(own)[b] for own, b in bins], 1))
-        p = maximise(seen, cells, settings.prior).p
-        drawn = posterior(seen, cells, settings.prior, generator)
+        best = maximise(seen, cells, settings.prior)
+        drawn = posterior(self._recalibrated(every, within), cells, settings.prior, generator)
         told, true = cells.bins(held.argmax(-1)), cells.bins(truth)
         found = {}
         for i, factor in enumerate(factors):
@@ -143,19 +184,32 @@ class _Object:
                 p_value = ratio_test(
                     seen, cells, null, (held, truth), settings.prior, settings.draws, generator
                 )
-            span = Span.of(p[i] @ within[i].T, drawn[i] @ within[i].T, settings.interval)
+            span = Span.of(best.p[i] @ within[i].T, drawn[i] @ within[i].T, settings.interval)
             accuracy = float((told[i] == true[i]).double().mean())
-            found[factor.name] = self._estimate(factor.name, span, groups[i], p_value, accuracy)
-        return found
+            chance = max(map(len, groups[i])) / factor.bins
+            converged = best.status is Status.CONVERGED
+            found[factor.name] = _Read(span, groups[i], p_value, accuracy, chance, converged)
+        counts = torch.bincount(truth, minlength=cells.count).clamp_min(1)
+        return found, (cells.joint(best.p) / counts)[truth]
 
-    def _light(self, factor: Factor) -> FactorEstimate:
+    def _recalibrated(
+        self, every: Cells, within: Sequence[Float[Tensor, "_ _"]]
+    ) -> Float[Tensor, "samples boxes merged"]:
+        """Compute the boxes' likelihoods by the calibration of several samples of the held-out renders."""
+        renders, generator = len(self.held.cells), self.reader.generator
+        drawn = torch.randint(max(renders, 1), (CALIBRATIONS, renders), generator=generator)
+        samples = torch.zeros(CALIBRATIONS, renders).scatter_add_(1, drawn, torch.ones(drawn.shape))
+        posteriors = calibrate(self.known.logits, self.held.cells, samples)(self.seen.logits)
+        return grouped(posteriors.flatten(0, 1), every, within).unflatten(0, posteriors.shape[:2])
+
+    def _light(self, factor: Factor) -> _Read:
         """Estimate the weights of the lights by the mean of the network's guesses."""
         settings, generator = self.reader.settings, self.reader.generator
         response = Response.of(self.known.weights, self.held.weights.double())
         now, boxes = self.psi[factor.name].double(), len(self.seen)
         each = [[b] for b in range(1, factor.lights + 1)]
         if not boxes:
-            return self._estimate(factor.name, Span.of(now, now[None], settings.interval), each, 1.0)
+            return _Read(Span.of(now, now[None], settings.interval), each, 1.0, response.explained, 0.0)
         mean, covariance = self.seen.weights.mean(0), response.covariance(boxes, now)
 
         def weights(means: Tensor) -> Tensor:
@@ -169,7 +223,8 @@ class _Object:
         p_value = (1 + int((statistic(under) >= statistic(mean)).sum())) / (settings.draws + 1)
         best = weights(mean)
         drawn = weights(scattered(mean, response.covariance(boxes, best), settings.draws, generator))
-        return self._estimate(factor.name, Span.of(best, drawn, settings.interval), each, p_value)
+        span = Span.of(best, drawn, settings.interval)
+        return _Read(span, each, p_value, response.explained, 0.0)
 
 
 def _group_of(groups: Bins) -> Int[Tensor, "k"]:

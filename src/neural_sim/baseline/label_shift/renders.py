@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from neural_sim.baseline.label_shift.crops import Crops, crops_of
 from neural_sim.baseline.label_shift.mixture import Cells
@@ -40,8 +42,36 @@ def parted(pool: Scene, held_out: float) -> tuple[Scene, Scene]:
     return replace(pool, subjects=tuple(sides[0])), replace(pool, subjects=tuple(sides[1]))
 
 
+@dataclass(frozen=True)
+class _Bank:
+    """Backgrounds that are drawn once and shown mirrored at random.
+
+    Drawing takes three times as long as all the rest of an image, and a classifier needs other backgrounds for each
+    bin, not for each image.
+    """
+
+    images: Float[Tensor, "n 3 height width"]
+
+    def draw(
+        self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
+    ) -> Float[Tensor, "n 3 height width"]:
+        """See :class:`Background`; of the bank's own size alone."""
+        images = self.images[torch.randint(len(self.images), (n,), generator=generator)]
+        for axis in (2, 3):
+            mirrored = torch.rand((n, 1, 1, 1), generator=generator) < 0.5
+            images = torch.where(mirrored, images.flip(axis), images)
+        return images.to(device)
+
+
+def with_bank(scene: Scene, backgrounds: int, generator: torch.Generator) -> Scene:
+    """Return the scene over ``backgrounds`` that are drawn now."""
+    own, camera = scene.synthesizer, scene.camera
+    images = own.background.draw(backgrounds, camera.height, camera.width, generator)
+    return replace(scene, synthesizer=replace(own, background=_Bank(images)))
+
+
 def known_crops(part: Scene, compositions: int, generator: torch.Generator, whole: bool) -> Known:
-    """Compose images of uniform bins over fresh backgrounds and cut out their boxes."""
+    """Compose images of uniform bins and cut out their boxes."""
     distribution, subject = part.distribution, part.subjects[0]
     assert isinstance(subject, PooledSubject)
     psi = distribution.uniform_of([subject.name for subject in part.subjects])

@@ -1,0 +1,44 @@
+"""Stage ``pool``: renders of all bins, for everything that reads or composes them in one run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from typing_extensions import override
+
+from neural_sim.outer.inner import RenderedPool
+from neural_sim.randomness import stream
+from neural_sim.renderer.nerf import Quality
+from neural_sim.stages.scene import SceneStage
+from neural_sim.stages.stage import Results, Stage
+
+
+@dataclass(frozen=True)
+class PoolStage(Stage[RenderedPool]):
+    """``per_bin`` renders of every bin of ``scene``'s objects, at ``quality``, by the psi loop's random numbers.
+
+    It stays in memory: a run whose estimate and whose loop want the same pool renders it once.
+    """
+
+    phase: ClassVar[str] = "psi"
+    kind: ClassVar[str] = "pool"
+    stored: ClassVar[bool] = False
+
+    scene: SceneStage
+    per_bin: int
+    quality: Quality | None
+    seed: int
+
+    @property
+    @override
+    def title(self) -> str:
+        return "renders of all bins"
+
+    @override
+    def make(self, results: Results) -> RenderedPool:
+        scene = results(self.scene)
+        if self.quality is not None:
+            scene = scene.with_quality(self.quality)
+        lights = scene.distribution.lights > 0
+        return RenderedPool.of(scene, self.per_bin, stream(self.seed, "psi"), lights=lights)
