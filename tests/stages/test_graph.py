@@ -1,14 +1,20 @@
 """Which settings a stored detector depends on: what its images are drawn from, not how a method relaxes the draws."""
 
 import json
+from dataclasses import replace
+from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
+from neural_sim.baseline.label_shift.estimate import Estimate
 from neural_sim.main import build, conf_directory
-from neural_sim.outer.records import LearnedPsi
+from neural_sim.outer.inner import RenderedPool
+from neural_sim.outer.records import Cost, LearnedPsi
+from neural_sim.stages import shown
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Results
 from neural_sim.stages.store import Store
@@ -78,6 +84,17 @@ def test_what_reads_psi_off_the_target_wants_no_warm_start_and_shares_the_render
     assert reading.read_warm_start == () and not any(stage.kind == "detector" for stage in made)
     assert loop.read_warm_start == (loop.warm_start,)
     assert loop.shown.pool is loop.learned.pool and loop.shown.pool.key == reading.shown.pool.key
+
+
+def test_an_estimate_is_charged_for_the_renders_that_it_reads(tmp_path, monkeypatch):
+    with initialize_config_dir(str(conf_directory()), version_base="1.3"):
+        config = ["+experiment=pose_gap", "scale=smoke", "baseline=label_shift", f"paths.store={tmp_path}"]
+        stage = replace(Graph(build(compose("config", config))).shown, symmetries=())
+    pool = RenderedPool(cast(Any, None), torch.Generator().get_state(), Cost(seconds=9.0, cpu_seconds=8.0))
+    found = Estimate((), stage.psi, 5, 2.0, {"pool": 0.5, "images": 1.0})
+    monkeypatch.setattr(shown, "estimate", lambda *arguments: found)
+    made = stage.make(cast(Any, lambda wanted: pool if wanted is stage.pool else Mock()))
+    assert made.seconds == 11.0 and made.cpu_seconds == {"pool": 8.5, "images": 1.0}
 
 
 def test_a_first_hypergradient_at_a_warm_start_of_other_images_is_refused():

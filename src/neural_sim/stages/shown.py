@@ -54,7 +54,7 @@ class ShownStage(Stage[Estimate]):
         generator = stream(self.seed, "psi")
         generator.set_state(pool.state)
         found = estimate(pool.scene, validation, self.psi, self.settings, generator, groups, self.whole)
-        spent = {"pool": pool.spent.cpu_seconds, **found.cpu_seconds}
+        spent = {**found.cpu_seconds, "pool": found.cpu_seconds["pool"] + pool.spent.cpu_seconds}
         return replace(found, seconds=found.seconds + pool.spent.seconds, cpu_seconds=spent)
 
     @override
