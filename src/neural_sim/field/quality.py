@@ -52,7 +52,7 @@ class Quality:
     cells: int | None
     views: tuple[UInt8[Tensor, "n s s 3"], UInt8[Tensor, "n s s 1"], UInt8[Tensor, "n s s 3"]]
     photographs: tuple[UInt8[Tensor, "_ _ 3"], ...]
-    bins: Mapping[str, UInt8[Tensor, "bins h w 3"]]
+    bins: Mapping[str, UInt8[Tensor, "_ _ _ 3"]]
     placed: Placed | None
 
 

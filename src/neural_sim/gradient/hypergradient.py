@@ -80,8 +80,8 @@ class Hypergradient(Generic[Adjoint_co]):
         seconds: by phase: validation, solve or unrolled, mixed.
     """
 
-    gradients: dict[str, Float[Tensor, "k"]]
-    errors: dict[str, Float[Tensor, "k"]]
+    gradients: dict[str, Float[Tensor, "_"]]
+    errors: dict[str, Float[Tensor, "_"]]
     adjoint: Adjoint_co
     p_values: dict[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
     seconds: dict[str, float] = field(default_factory=dict[str, float])

@@ -117,7 +117,7 @@ def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
     return functional.max_pool2d(alpha[None, None], step, ceil_mode=True)[0, 0] > 0.5
 
 
-def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]) -> None:
+def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "_ _"]]) -> None:
     """Warn of masks that touch the edges of their photographs or cover nearly all of them."""
     kinds = {
         "touch the edges of their photographs, beyond which the object is unknown": lambda mask: bool(
@@ -135,7 +135,7 @@ def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]]) -> None
 
 
 def sphere_of(
-    capture: Capture, silhouettes: Sequence[Bool[Tensor, "h w"]], box: Corners | None = None
+    capture: Capture, silhouettes: Sequence[Bool[Tensor, "_ _"]], box: Corners | None = None
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """Centre and radius of the silhouettes' visual hull, or of its part in a box, in the capture's frame."""
     empty = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if not mask.any()]

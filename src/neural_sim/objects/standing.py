@@ -27,7 +27,7 @@ AROUND = 5
 """Pixels about which contrast is measured."""
 
 
-def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "h w"]] | None:
+def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "_ _"]] | None:
     """Return what stands still in photographs of one size, None where next to nothing does.
 
     Contrast with the surroundings is compared, which the exposure changes little.

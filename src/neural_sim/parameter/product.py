@@ -146,12 +146,12 @@ class SceneDistribution:
         """Numbers of psi for each object."""
         return sum(factor.size for factor in self.factors)
 
-    def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
+    def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n _"]]:
         """Split psi, or any vector of psi's shape, into every factor's part."""
         parts = torch.split(psi, [factor.size for factor in self.factors], -1)
         return dict(zip(self.names, parts, strict=True))
 
-    def join(self, parts: Mapping[str, Float[Tensor, "*n k"]]) -> Float[Tensor, "*n K"]:
+    def join(self, parts: Mapping[str, Float[Tensor, "*n _"]]) -> Float[Tensor, "*n K"]:
         """Join what :meth:`split` has split."""
         return torch.cat([parts[name] for name in self.names], -1)
 
@@ -193,7 +193,7 @@ class SceneDistribution:
         """The psi of uniform bins and equal weights of lights."""
         return torch.cat([f.psi_of(distribution("uniform", f.size)) for f in self.factors])
 
-    def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n k"]]:
+    def probabilities(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n _"]]:
         """Compute every factor's probabilities of its bins, and the weights of the lights."""
         parts = self.split(psi)
         return {f.name: f.p_of(parts[f.name]) for f in self.factors}

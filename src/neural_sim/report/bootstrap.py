@@ -132,12 +132,12 @@ def class_scores(
     random = np.random.default_rng(seed)
     counts = sorted({len(outcomes.boxes_per_image) for group in matches for row in group for outcomes in row})
 
-    def scored(weights: Mapping[int, Float[np.ndarray, "images"] | None]) -> list[list[list[float]]]:
+    def scored(weights: Mapping[int, Float[np.ndarray, "_"] | None]) -> list[list[list[float]]]:
         return [
             [[class_score(o, weights[len(o.boxes_per_image)]) for o in row] for row in g] for g in matches
         ]
 
-    def drawn() -> dict[int, Float[np.ndarray, "images"]]:
+    def drawn() -> dict[int, Float[np.ndarray, "_"]]:
         return {n: np.bincount(random.integers(n, size=n), minlength=n).astype(float) for n in counts}
 
     point = np.asarray(scored(dict.fromkeys(counts)))

@@ -45,7 +45,7 @@ class HeldOut:
     """
 
     object: str
-    images: Mapping[str, Float[Tensor, "h w 3"]]
+    images: Mapping[str, Float[Tensor, "_ _ 3"]]
     scores: Mapping[str, Mapping[str, float]]
 
 

@@ -15,7 +15,7 @@ from neural_sim.types import LabelledImages
 def matching(
     images: LabelledImages,
     rows: Int[Tensor, "part"],
-    targets: Mapping[str, Float[Tensor, "k"]],
+    targets: Mapping[str, Float[Tensor, "_"]],
     generator: torch.Generator,
     where: str,
 ) -> Int[Tensor, "chosen"]:

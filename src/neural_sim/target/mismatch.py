@@ -43,7 +43,7 @@ class Mismatch:
         return self.p_value * self.tests <= LEVEL and abs(self.larger - 0.5) >= LARGE
 
 
-def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "values"]]:
+def statistics(images: LabelledImages) -> dict[str, Float[Tensor, "_"]]:
     """Return what is compared, a value for each image, or for each box where the name says so.
 
     Sizes and offsets are in fractions of the image's size (of its area's root, and of its half diagonal), brightness

@@ -162,6 +162,19 @@ def test_bins_that_look_the_same_are_one_group_whose_parts_are_those_of_psi(pose
     assert sum(lamp.p[:2]) == pytest.approx(0.8, abs=0.12)
 
 
+def test_bins_that_no_photograph_shows_are_no_choice(posed):
+    """What is drawn there trains nothing and gets no probability; the others share the target's boxes."""
+    scene, target, psi = posed
+    (factor,) = scene.distribution.factors
+    closed = torch.tensor([False, False, True, False])
+    start = psi.clone()
+    start[0] = factor.psi_of(torch.tensor([1.0, 1.0, 0.0, 1.0], dtype=torch.float64) / 3.0, closed)
+    lamp, cup = read(scene, target_of(scene, [0.8, 0.1, 0.001, 0.099]), start).factors
+    assert lamp.p[2] == lamp.low[2] == lamp.high[2] == 0.0 and sum(lamp.p) == pytest.approx(1.0)
+    assert lamp.finding == "moves" and lamp.p[0] == pytest.approx(0.8, abs=0.15)
+    assert lamp.accuracy > 0.8 and lamp.groups == ((1,), (2,), (4,)) and cup.finding == "stays"
+
+
 def test_few_boxes_move_nothing(posed):
     scene, target, psi = posed
     result = read(scene, target.select(torch.arange(5)), psi)

@@ -111,7 +111,7 @@ def maximise(
     likelihood: Float[Tensor, "*batch boxes cells"],
     cells: Cells,
     prior: float,
-    fixed: Mapping[int, Float[Tensor, "k"]] | None = None,
+    fixed: Mapping[int, Float[Tensor, "_"]] | None = None,
     steps: int = 1000,
     tolerance: float = 1e-7,
 ) -> Mixed:
@@ -204,7 +204,7 @@ def posterior(
 def ratio_test(
     likelihood: Float[Tensor, "boxes cells"],
     cells: Cells,
-    null: Mapping[int, Float[Tensor, "k"]],
+    null: Mapping[int, Float[Tensor, "_"]],
     known: tuple[Float[Tensor, "m cells"], Int[Tensor, "m"]],
     prior: float,
     draws: int,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neural_sim.baseline.label_shift.crops import Crops, quarters
@@ -21,6 +21,8 @@ from neural_sim.parameter.product import SceneDistribution
 
 Bins = Sequence[Sequence[int]]
 """Groups of bins, numbered from 1, that look the same."""
+NEVER = -1e3
+"""The logit of what is never drawn: finite, so that a temperature can be found."""
 BEYOND_ALL = 0.995
 """Largest strangeness where lights alone move: boxes share one, so that they are strange together or not at all."""
 CALIBRATIONS = 20
@@ -53,10 +55,15 @@ class Reader:
         self, label: int, name: str, psi: Float[Tensor, "K"], groups: Mapping[str, Bins]
     ) -> tuple[list[FactorEstimate], Float[Tensor, "K"]]:
         """Return the estimates of an object's factors, and its psi with what moves moved."""
-        training, held = (known.select(known.crops.labels == label) for known in (self.training, self.held))
+        now = self.distribution.split(psi)
+        drawn = _drawn(self.distribution, now)
+        training, held = (
+            known.select((known.crops.labels == label) & drawn[known.cells])
+            for known in (self.training, self.held)
+        )
         target = self.target.select(self.target.labels == label)
-        seen = outputs_of(self.network, target)
-        known = outputs_of(self.network, held.crops)
+        outputs = (outputs_of(self.network, crops) for crops in (target, held.crops))
+        seen, known = (replace(one, logits=one.logits.masked_fill(~drawn, NEVER)) for one in outputs)
         limits = None  # where no render shows the object
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
@@ -65,7 +72,7 @@ class Reader:
             seen, known = (
                 self._with_colours(training, *pair) for pair in ((target, seen), (held.crops, known))
             )
-        object_ = _Object(self, name, self.distribution.split(psi), groups, held, known, seen, limits)
+        object_ = _Object(self, name, now, groups, held, known, seen, limits)
         found, new = object_.found(), dict(object_.psi)
         for one in found:
             if one.finding == "moves":
@@ -164,16 +171,19 @@ class _Object:
         settings, generator = self.reader.settings, self.reader.generator
         factors = self.reader.distribution.binned
         every = Cells(tuple(factor.bins for factor in factors))
-        groups = [self.groups.get(f.name) or [[b + 1] for b in range(f.bins)] for f in factors]
         p_now = [f.p_of(self.psi[f.name]).double() for f in factors]
+        groups = [
+            _drawn_groups(p, self.groups.get(f.name) or [[b + 1] for b in range(f.bins)])
+            for p, f in zip(p_now, factors, strict=True)
+        ]
         within = [_within(p, own) for p, own in zip(p_now, groups, strict=True)]
         cells = Cells(tuple(len(own) for own in groups))
         calibrated = calibrate(self.known.logits, self.held.cells)
         seen, held = (
             grouped(calibrated(outputs.logits)[0], every, within) for outputs in (self.seen, self.known)
         )
-        bins = zip(groups, every.bins(self.held.cells), strict=True)
-        truth = cells.index(torch.stack([_group_of(own)[b] for own, b in bins], 1))
+        bins = zip(groups, every.sizes, every.bins(self.held.cells), strict=True)
+        truth = cells.index(torch.stack([_group_of(own, size)[b] for own, size, b in bins], 1))
         best = maximise(seen, cells, settings.prior)
         drawn = posterior(self._recalibrated(every, within), cells, settings.prior, generator)
         told, true = cells.bins(held.argmax(-1)), cells.bins(truth)
@@ -186,7 +196,8 @@ class _Object:
                 )
             span = Span.of(best.p[i] @ within[i].T, drawn[i] @ within[i].T, settings.interval)
             accuracy = float((told[i] == true[i]).double().mean())
-            chance = max(map(len, groups[i])) / factor.bins
+            lengths = [len(group) for group in groups[i]]
+            chance = max(lengths) / sum(lengths)
             converged = best.status is Status.CONVERGED
             found[factor.name] = _Read(span, groups[i], p_value, accuracy, chance, converged)
         counts = torch.bincount(truth, minlength=cells.count).clamp_min(1)
@@ -227,9 +238,23 @@ class _Object:
         return _Read(span, each, p_value, response.explained, 0.0)
 
 
-def _group_of(groups: Bins) -> Int[Tensor, "k"]:
-    """Return the position of every bin's group."""
-    found = torch.zeros(sum(len(group) for group in groups), dtype=torch.long)
+def _drawn(distribution: SceneDistribution, psi: Mapping[str, Tensor]) -> Bool[Tensor, "cells"]:
+    """Select the combinations of bins that are drawn at all: not those that no photograph of the object shows."""
+    parts = tuple((factor.p_of(psi[factor.name]) > 0.0).double() for factor in distribution.binned)
+    if not parts:
+        return torch.ones(1, dtype=torch.bool)
+    return Cells(tuple(len(part) for part in parts)).joint(parts) > 0.0
+
+
+def _drawn_groups(p: Float[Tensor, "k"], groups: Bins) -> Bins:
+    """Leave out bins whose probability is 0: their renders are of sides that no photograph shows."""
+    left = ([number for number in group if float(p[number - 1]) > 0.0] for group in groups)
+    return [group for group in left if group]
+
+
+def _group_of(groups: Bins, bins: int) -> Int[Tensor, "k"]:
+    """Return the position of every bin's group, 0 for those in none."""
+    found = torch.zeros(bins, dtype=torch.long)
     for g, group in enumerate(groups):
         found[torch.tensor(group) - 1] = g
     return found

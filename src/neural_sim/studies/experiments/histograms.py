@@ -42,7 +42,7 @@ class Histogram:
     aim: str
     seeds: tuple[int, ...]
     groups: Sequence[Sequence[int]]
-    p: Mapping[str, Float[np.ndarray, "seeds groups"]]
+    p: Mapping[str, Float[np.ndarray, "seeds _"]]
     distance: Mapping[str, Estimate]
     commits: Sequence[str]
 

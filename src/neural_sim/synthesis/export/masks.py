@@ -32,7 +32,7 @@ def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "corners 2"]]:
+def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 2"]]:
     """Trace the closed outlines of a mask, each by its corners (x, y) along pixel edges, those round most pixels first.
 
     Outlines of parts go clockwise in the image, those of holes the other way; parts that touch at a corner are two.
