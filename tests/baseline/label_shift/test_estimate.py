@@ -164,7 +164,7 @@ def test_bins_that_look_the_same_are_one_group_whose_parts_are_those_of_psi(pose
 
 def test_bins_that_no_photograph_shows_are_no_choice(posed):
     """What is drawn there trains nothing and gets no probability; the others share the target's boxes."""
-    scene, target, psi = posed
+    scene, _, psi = posed
     (factor,) = scene.distribution.factors
     closed = torch.tensor([False, False, True, False])
     start = psi.clone()
