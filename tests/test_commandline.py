@@ -90,6 +90,7 @@ def test_folders_and_configurations_of_ones_own(tmp_path):
         with pytest.raises(UserError, match="did you mean own_task"):
             checked([*words, "+experiment=mine", "own_tusk.a=1"], layout)
     assert layout_of(["--config-name=other"], conf_directory()) is None
+    assert layout_of(["-sc", "install=bash"], conf_directory()) is None
 
 
 LEFT_TO_HYDRA = [
@@ -101,6 +102,8 @@ LEFT_TO_HYDRA = [
     ["parameter=[]"],
     ["+mine={_target_: my_task.Task}", "stages=[mine]"],
     ["-m", "objects=ycb,procedural"],
+    ["--cfg", "job", "seed=1"],
+    ["--info", "defaults"],
 ]
 
 

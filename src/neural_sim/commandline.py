@@ -14,9 +14,10 @@ import yaml
 
 from neural_sim.configuration import UserError, first_line
 
-OWN_FILES = ("--config-name", "-cn", "--config-path", "-cp")
-"""Flags with which the configuration is another, of which nothing is known here."""
+OWN_WORDS = ("--config-name", "-cn", "--config-path", "-cp", "--shell-completion", "-sc", "--hydra-help")
+"""Flags with which the configuration is another, or the words are no settings: nothing is checked here."""
 FOLDERS = ("--config-dir", "-cd")
+WITH_VALUE = (*FOLDERS, "--cfg", "-c", "--package", "-p", "--info", "-i", "--experimental-rerun")
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Layout:
 
 def layout_of(words: Sequence[str], conf: Path) -> Layout | None:
     """Find the files that a command reads; None where it brings a configuration of its own."""
-    if any(word.partition("=")[0] in OWN_FILES for word in words):
+    if any(word.partition("=")[0] in OWN_WORDS for word in words):
         return None
     following = zip(words, (*words[1:], ""), strict=False)
     more = [word.partition("=")[2] or after for word, after in following if word.partition("=")[0] in FOLDERS]
@@ -110,7 +111,7 @@ def checked(words: Sequence[str], layout: Layout) -> None:
     skipped = False
     for word in words:
         if skipped or word.startswith("-"):
-            skipped = not skipped and word in (*FOLDERS, "--package", "-p", "--experimental-rerun")
+            skipped = not skipped and word in WITH_VALUE
             continue
         name = word.lstrip("+~")
         key, equals, value = name.partition("=")
