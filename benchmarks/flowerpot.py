@@ -80,7 +80,7 @@ def erase(options: argparse.Namespace) -> Path:
     pictures = source.pictures(stage.object, context.results(stage.masks))
     for frame in pictures.capture.frames:
         rgba = pictures.rgba(frame)[::2, ::2].numpy()  # half of the pixels a side are enough for a background
-        hidden = binary_dilation(rgba[..., 3] > 0.1, iterations=8)
+        hidden = np.asarray(binary_dilation(rgba[..., 3] > 0.1, iterations=8), dtype=bool)
         filled = np.where(hidden[..., None], 0.0, rgba[..., :3])
         for blur in (6.0, 20.0, 60.0):  # the nearest that reaches
             seen = gaussian_filter((~hidden).astype(np.float32), blur)

@@ -190,7 +190,7 @@ def test_it_learns_to_find_a_box(tools):
         images,
         torch.cat([corners, corners + 24], -1)[:, None],
         torch.zeros(16, 1, dtype=torch.long),
-        torch.zeros(16),
+        torch.zeros(16, dtype=torch.long),
     )
     detector = make_fcos(1, head=Head(16, 1))
     params = detector.init(torch.Generator().manual_seed(0))

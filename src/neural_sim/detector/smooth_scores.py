@@ -132,7 +132,7 @@ def nearest_box(
     return best, torch.where(present.any(1), which, -1)
 
 
-def overlap(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+def overlap(a: Float[Tensor, "*#n 4"], b: Float[Tensor, "*#n 4"]) -> Float[Tensor, "..."]:
     """Intersection over union of boxes (x0, y0, x1, y1), pair by pair; differentiable in both."""
     sides = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp_min(0.0)
     shared = sides.prod(-1)
