@@ -50,7 +50,7 @@ def test_its_limit_is_ap_as_one_counts_it(seed):
 
 def test_a_box_is_found_once_however_many_detections_it_has():
     found = Ranked(
-        torch.tensor([3.0, 2.0, 1.0]), torch.tensor([0.8, 0.9, 0.9]), torch.zeros(3), torch.zeros(3).long(), 1
+        torch.tensor([3.0, 2.0, 1.0]), torch.tensor([0.8, 0.9, 0.9]), *[torch.zeros(3).long()] * 2, 1
     )
     true = SmoothAP().true_positives(found)
     assert bool((true.sum(0) <= 1.0 + 1e-6).all())

@@ -146,9 +146,9 @@ def test_an_empty_trajectory_is_refused():
     with pytest.raises(ValueError, match="learning rate for each"):
         Trajectory(AdamW(), (), (), {0: state}, {}, theta)
     with pytest.raises(ValueError, match="checkpoints"):
-        Trajectory(AdamW(), (torch.zeros(1),), (0.1,), {}, {}, theta)
+        Trajectory(AdamW(), (torch.zeros(1, dtype=torch.long),), (0.1,), {}, {}, theta)
     with pytest.raises(ValueError, match="checkpoints"):
-        Trajectory(AdamW(), (torch.zeros(1),), (0.1,), {1: state}, {}, theta)
+        Trajectory(AdamW(), (torch.zeros(1, dtype=torch.long),), (0.1,), {1: state}, {}, theta)
     recorder = Recorder(Recording(), AdamW(), 1, theta)
     recorder.step(lambda: state, lambda: theta, 0.1)
-    assert recorder.trajectory((torch.zeros(1),), theta).rates == (0.1,)
+    assert recorder.trajectory((torch.zeros(1, dtype=torch.long),), theta).rates == (0.1,)

@@ -102,7 +102,7 @@ class ProbeGroups:
     """
 
     losses: IndexedLoss
-    groups: Sequence[Int[Tensor, "strata per_bin"]]
+    groups: Sequence[Int[Tensor, "_ per_bin"]]
 
     def __post_init__(self) -> None:
         widths = {table.shape[-1] for table in self.groups}
