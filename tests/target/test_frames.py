@@ -18,6 +18,7 @@ def item(**changes):
     )
 
 
+@pytest.mark.usefixtures("wrong_shapes")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
