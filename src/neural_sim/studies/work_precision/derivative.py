@@ -64,7 +64,7 @@ def case(field: RadianceField, renderer: NerfRenderer, size: int, numbers: int) 
     """Make an image by phi, rho and distance, then by random directions of the pose's twelve entries."""
     generator, device = torch.Generator().manual_seed(0), next(field.parameters()).device
     camera = PinholeCamera(size, size, math.radians(40.0))
-    draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, dtype=torch.long))
+    draw = SceneDraw(*(torch.tensor([x]) for x in (1.1, 0.4, 3.0)), bins=torch.zeros(1, 1, dtype=torch.long))
     rates = torch.randn(MOST, 1, 4, 4, generator=generator) * 0.3
     rates[:, :, 3] = 0.0
     rates[:3] = pose_rates(draw, RIGID)

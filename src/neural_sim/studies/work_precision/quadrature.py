@@ -59,7 +59,9 @@ def _blob(distance: Along, offset: Along) -> Along:
     return 3.0 * torch.exp(-(((distance - 0.9 - 0.2 * offset) / 0.7) ** 2))
 
 
-def box(thickness: float, offset: Along) -> tuple[Along, Along]:
+def box(
+    thickness: float, offset: Float[Tensor, "*rays"]
+) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
     """Return where a box of about this thickness begins and ends on each ray.
 
     Both ends vary by themselves: with one thickness for all rays the errors at its two jumps would cancel for some
