@@ -62,7 +62,11 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     coco = json.loads((tmp_path / "run" / "training_set" / "annotations.json").read_text())
     assert coco["images"] and "phi" in coco["images"][0]["poses"][0]
 
-    words = ["stages=[report,repeat]", "repeat.trainings=2", "repeat.draws=5"]
+    words = [
+        "stages=[views,field,target_sets,warm_start,psi,evaluate,report,repeat]",
+        "repeat.trainings=2",
+        "repeat.draws=5",
+    ]
     again = _run(tmp_path, "+experiment=pose_gap", "scale=smoke", "progress=false", *words)
     assert again.returncode == 0, again.stderr[-3000:]
     repeated = json.loads((tmp_path / "run" / "results.json").read_text())

@@ -102,6 +102,7 @@ def test_pinholes_are_filled_and_other_holes_are_not():
     torch.testing.assert_close(without_pinholes(torch.zeros(4, 5)), torch.zeros(4, 5))
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_masks(made):
     few = SceneMasks(image_size=48, resolution=48, steps=40, batch_rays=1024)
     box = [[0.15, -0.35, 0.95], [0.45, -0.1, 1.25]]
