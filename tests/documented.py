@@ -13,6 +13,8 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from neural_sim.guide import spoken
+
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 PROGRAMS = re.compile(
@@ -37,10 +39,10 @@ class Command:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """What comes after the program's name, which is one, two or three words long."""
-        return self.words[
-            {"python": 3 if self.kind == "main" else 2, "mlflow": 2, "pip": 2}.get(self.words[0], 1) :
-        ]
+        """What comes after the program's name, of one to three words; ``demo`` and the like as what they stand for."""
+        program = {"python": 3 if self.kind == "main" else 2, "mlflow": 2, "pip": 2}.get(self.words[0], 1)
+        rest = self.words[program:]
+        return tuple(spoken(rest)) if self.kind == "main" else rest
 
     @property
     def flags(self) -> set[str]:
@@ -117,7 +119,8 @@ def commands_in(text: str, name: str) -> Iterator[Command]:
                 words = shlex.split(part, comments=True)
                 while re.fullmatch(r"\w+=.*", words[0]):  # OMP_NUM_THREADS=1 python ...
                     words = words[1:]
-                yield Command(f"{name}:{line}", tuple(words))
+                if "COMMAND" not in words:  # stands for any
+                    yield Command(f"{name}:{line}", tuple(words))
 
 
 def _parts(code: str) -> list[str]:
