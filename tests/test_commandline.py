@@ -41,8 +41,9 @@ BELOW = [  # keys that Hydra refuses once it has composed
     ("outer.iteration", "did you mean outer.iterations?"),
     ("training.epochs", "did you mean"),
     ("synthesis.object_per_image", "did you mean synthesis.objects_per_image?"),
-    ("objects.root", "want one of objects=bop, objects=co3d, objects=folder"),
-    ("target.annotations", "want one of target=coco"),
+    ("objects.root", "want objects=bop or objects=co3d or objects=folder"),
+    ("target.annotations", "want target=coco"),
+    ("work_precision.families", "want +experiment=work_precision"),
 ]
 
 

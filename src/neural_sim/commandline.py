@@ -168,13 +168,14 @@ def worded(error: BaseException, layout: Layout | None) -> str:
 def explained(key: str, layout: Layout) -> str:
     """Say of a key that does not exist which one was meant, or which choices have it."""
     if key in layout.keys:
-        having = sorted({at.choice for at in layout.keys[key] if not at.choice.startswith("experiment=")})
-        return f"{key}: the choices that were made have no such key; want one of {', '.join(having)}"
+        having = sorted({at.choice for at in layout.keys[key] if at.choice})
+        groups = [choice for choice in having if not choice.startswith("experiment=")]
+        wanted = groups or [f"+{choice}" for choice in having][:5]
+        return f"{key}: the choices that were made have no such key; want {' or '.join(wanted)}"
     parent, _, last = key.rpartition(".")
     beside = {other.rpartition(".")[2] for other in layout.keys if other.rpartition(".")[0] == parent}
-    elsewhere = [
-        other for other in layout.keys if other.endswith(f".{last}")
-    ]  # the right name in another place
+    # The name may be right and the place wrong.
+    elsewhere = [other for other in layout.keys if other.endswith(f".{last}")]
     meant = _close(last, beside if parent else layout.top, 0.8 if elsewhere else 0.6)
     near = [*(f"{parent}.{one}" if parent else one for one in meant), *elsewhere][:3]
     return f"{key}: unknown key" + (f"; did you mean {' or '.join(near)}?" if near else "")
