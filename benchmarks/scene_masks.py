@@ -36,7 +36,7 @@ HELD_OUT = 4
 
 
 def overlaps(truth: dict[str, np.ndarray], pictures: Pictures) -> dict[str, float]:
-    """Of each photograph that has a true mask, by name."""
+    """Compute the overlap of each photograph's mask with the true one, where there is one, by the photograph's name."""
     values = {}
     for frame in pictures.capture.frames:
         true = truth.get(frame.image.name)

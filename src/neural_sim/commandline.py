@@ -1,4 +1,4 @@
-"""What a command line may say: groups, choices and keys of ``conf/``, read without composing them; slips explained."""
+"""Check the words of a command line against the groups, choices and keys of ``conf/``, and explain slips."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def checked(words: Sequence[str], layout: Layout) -> None:
 
 
 def _declared(word: str, key: str, value: str) -> bool:
-    """Whether a word adds something of the user's own, such as a task."""
+    """Return whether a word adds something of the user's own, such as a task."""
     return word.startswith("+") and (key.endswith("._target_") or "_target_" in value)
 
 

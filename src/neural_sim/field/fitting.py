@@ -31,8 +31,8 @@ and where few look a field has pictures of its own in the air."""
 BRIDGED = 2
 """Cells by which parts are grown before they connect: a surface may have holes about pieces of itself."""
 SPREAD = 0.25
-"""Of photographs, the part of ``prune_weight`` that counts: cameras and focus that are not exact spread a surface over
-several cells, of which none shows as much, and walls had holes."""
+"""The factor on ``prune_weight`` for photographs. Inexact cameras and blur spread a surface over several cells, each of
+which shows less; with the whole weight, walls had holes."""
 BATCHES_PER_BLOCK = 8
 """Batches whose samples are chosen at once; choosing has a cost per call."""
 

@@ -29,7 +29,7 @@ MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
 """Where models lie, the likelier first. COLMAP numbers several (``sparse/0``, ``sparse/1``), of which the one with the
 most photographs is taken."""
 PLACES = ("images", "input")
-"""Where photographs lie, ``input`` being that of 3D Gaussian splatting's tools; else in the folder itself."""
+"""Folders of photographs; tools of 3D Gaussian splatting call it ``input``. Without one, the capture's own folder."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {

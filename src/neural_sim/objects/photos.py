@@ -372,7 +372,7 @@ def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
 
 
 def can_be_captured(folder: Path) -> bool:
-    """Whether a folder holds pictures of its own, or in a folder ``images``, or a video."""
+    """Return whether a folder, or its folder ``images``, holds pictures, or the folder holds a video."""
     return bool(pictures_of(folder) or videos_of(folder))
 
 

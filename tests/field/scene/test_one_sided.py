@@ -138,7 +138,8 @@ def test_what_one_side_shows_is_all_there(figures):
 
 
 @pytest.mark.xfail(
-    strict=True, reason="a dark patch of the table, whose depth one side does not say, is taken too"
+    strict=True,
+    reason="masks from one side take more than the object (docs/results.md, Masks from the scene)",
 )
 def test_one_side_is_as_good_as_all_around_where_both_look(figures):
     one, other = figures["side"], figures["all"]

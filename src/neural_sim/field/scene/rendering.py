@@ -53,7 +53,7 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
 
 
 def without_pinholes(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Fill holes small beside the object: where few photographs look, walls have some, but a handle's is larger."""
+    """Fill holes that are small for the object: walls that few photographs show have some; a handle's is larger."""
     solid = (mask > 0.5).numpy()
     holes, count = scipy.ndimage.label(~solid)  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(holes.ravel(), minlength=count + 1)

@@ -19,7 +19,7 @@ AT_ONCE = 4096
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What rays meet.
+    """The surfaces that rays meet.
 
     ``points`` are where half of a ray's light has ended, in the normalised frame, with their number in each of the
     grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
@@ -37,7 +37,7 @@ class SeenSurface:
 def seen_surface(
     grid: SceneGrid, pixels: ScenePixels, index: Int[Tensor, "some"], frame: Frame
 ) -> SeenSurface:
-    """Collect what the rays of these pixels meet."""
+    """Collect the surfaces that the rays of these pixels meet."""
     points, largest = [], torch.zeros(grid.resolution**3)
     for part in index.split(AT_ONCE):
         seen = visible(grid, pixels.rays(part, frame), torch.full((len(part),), 0.5), grid.samples)
