@@ -26,7 +26,7 @@ def check_of(config):
 
 
 def _export(folder, config):
-    """usage.md, Exporting a data set."""
+    """use.md, Export a data set."""
     made = folder / "dataset" if config["export"]["folder"] is None else Path(config["export"]["folder"])
     manifest = json.loads((made / "manifest.json").read_text())
     assert len(manifest["images"]) == 3 and all(
@@ -97,7 +97,7 @@ def _run(folder, config):
 
 
 def _model(folder, config, names):
-    """README, What a run leaves."""
+    """README.md, Use: the files of a run."""
     assert SavedDetector.load(folder).class_names == tuple(names)
     assert (folder / "model.onnx").exists() == config["model"]["onnx"]
     if config["model"]["registered_name"]:
@@ -106,7 +106,7 @@ def _model(folder, config, names):
 
 
 def _predict(folder, config):
-    """README, The detector, and what it sees."""
+    """use.md, Detect in photographs."""
     images = json.loads((folder / "coco_images.json").read_text())["images"]
     rows = json.loads((folder / "coco_results.json").read_text())
     assert images and rows and {row["image_id"] for row in rows} <= {image["id"] for image in images}
@@ -116,7 +116,7 @@ def _predict(folder, config):
 
 
 def _preflight(folder, config):
-    """usage.md, Before an optimisation."""
+    """reading.md, Before an optimisation."""
     report = json.loads((folder / "preflight.json").read_text())
     assert {one["name"] for one in report["foreseen"]} == set(report["names"])
     bins = config["parameter"]["pose"]["bins"]
@@ -128,7 +128,7 @@ def _preflight(folder, config):
 
 
 def _repeat(folder, config):
-    """usage.md, the end of Methods and their comparison."""
+    """reading.md, The report."""
     written = json.loads((folder / "repeat.json").read_text())
     biased, everything, *each = written["groups"]
     assert set(biased["names"]) == set(config["parameter"]["pose"]["biased"]) < set(everything["names"])
@@ -144,7 +144,7 @@ def _repeat(folder, config):
 
 
 def _viewer(folder, config):
-    """usage.md, Looking at fields and bins; what the page shows is checked in tests/report/test_viewer.py."""
+    """reading.md, The viewer; what the page shows is checked in tests/report/test_viewer.py."""
     assert config["viewer"]["seconds"] == 1 and config["viewer"]["psi"] in ("initial", "learned")
 
 
@@ -243,7 +243,7 @@ def _stress(folder, config):
 
 
 def _work_precision(folder, config):
-    """usage.md, Error against run time."""
+    """methods.md, Studies."""
     held = json.loads((folder / "work_precision.json").read_text())
     families = {name.split("/")[0] for name in held["measured"]}
     assert families == set(config["work_precision"]["families"])

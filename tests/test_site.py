@@ -16,3 +16,5 @@ def test_the_documentation_builds_and_has_all_pages(tmp_path):
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     built = {path.parent.name for path in tmp_path.glob("*/index.html")}
     assert pages - {"index"} <= built and (tmp_path / "index.html").is_file()
+    keys = (tmp_path / "reference" / "index.html").read_text(encoding="utf-8")
+    assert "outer.trust.level" in keys and "significance" in keys

@@ -43,7 +43,7 @@ UNKNOWN_RADIUS = 100.0
 @validated
 @dataclass(frozen=True)
 class ExportTask(Task):
-    """A data set of ``count`` images. See ``docs/usage.md``, Exporting a data set.
+    """A data set of ``count`` images. See ``docs/use.md``, Export a data set.
 
     Args:
         count: images. A folder that has some already gets the missing ones.
