@@ -67,6 +67,7 @@ _TOP = {
     "stages": Annotated[list[str], MinLen(1)],
     "score_at": list[PositiveFraction],
     "progress": bool,
+    "resume": bool,
     "trainer": TypedDict("Trainer", {"accelerator": Literal["cpu", "gpu"]}),
 }
 
@@ -94,6 +95,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         mlflow=plain["paths"]["mlflow"],
         accelerator=plain["trainer"]["accelerator"],
         progress=plain["progress"],
+        resume=plain["resume"],
         score_at=tuple(plain["score_at"]),
         task=plain["task"],
     )

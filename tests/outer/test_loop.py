@@ -3,34 +3,10 @@
 import itertools
 from types import SimpleNamespace
 
-import pytest
 import torch
 
 from neural_sim.baseline.lts import LearningToSimulate
-from neural_sim.detector.retinanet import RetinaNet
-from neural_sim.detector.settings import Anchors, Head
-from neural_sim.detector.training import Training
-from neural_sim.outer.inner import InnerLoop, LoopInputs
-from neural_sim.outer.loop import RewardLoop, learn_psi
-from neural_sim.outer.settings import Outer
-
-
-@pytest.fixture
-def reward_loop(scene):
-    generator = torch.Generator().manual_seed(0)
-    detector = RetinaNet(2, 32, anchors=Anchors(sizes=((10,), (18,)), reference=32), head=Head(8, 1))
-    validation = scene.training_set(torch.zeros(2, 4), 3, generator).images
-    settings = Outer(iterations=2, images_per_object=6, epochs=1, pool_per_bin=2)
-    inputs = LoopInputs(detector, detector.init(torch.Generator().manual_seed(1)), validation)
-
-    def make(method):
-        generator = torch.Generator().manual_seed(2)
-        inner = InnerLoop.prepare(
-            scene, inputs, settings, Training(batch_size=4, weight_decay=0.0), generator
-        )
-        return RewardLoop(inner, torch.zeros(2, 4), method, generator)
-
-    return make
+from neural_sim.outer.loop import learn_psi
 
 
 def test_rounds_are_counted_and_the_trajectory_is_the_methods(reward_loop):

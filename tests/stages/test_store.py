@@ -1,5 +1,6 @@
 """The store finds what was made, makes what was not, survives damage, and lets one process make at a time."""
 
+import errno
 import hashlib
 import io
 import multiprocessing
@@ -7,6 +8,7 @@ import os
 import signal
 import stat
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
@@ -160,6 +162,91 @@ def test_a_failed_make_leaves_nothing_and_frees_the_lock(tmp_path):
         fetch(Store(tmp_path), lambda: (_ for _ in ()).throw(RuntimeError("no")))
     assert not list(tmp_path.rglob("*.pt"))
     assert fetch(Store(tmp_path), lambda: 3).value == 3
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A dataclass in a state."""
+
+    value: torch.Tensor
+    parts: tuple[int, ...] = ()
+
+
+def _resumed(store, classes=(Stand,)):
+    """Make an entry that notes where it stands, and return where it found the work."""
+    found = []
+
+    def make():
+        found.append(store.state("field", "a", classes))
+        store.keep("field", "a", {"at": 7, "stand": Stand(torch.arange(3), (1, 2))})
+        raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError):
+        fetch(store, make)
+    return found[0]
+
+
+def test_unfinished_work_is_found_until_its_result_stands(tmp_path):
+    store = Store(tmp_path)
+    assert _resumed(store) is None
+    state = _resumed(store)
+    assert state["at"] == 7 and state["stand"].parts == (1, 2)
+    assert torch.equal(state["stand"].value, torch.arange(3))
+    assert store.audit().checkpoints == [tmp_path / "field" / "a.checkpoint"]
+    fetch(store, lambda: 1)
+    assert store.state("field", "a") is None and not store.audit().checkpoints
+
+
+@pytest.mark.parametrize("change", [_flip, _truncate, _clear, None])
+def test_a_damaged_checkpoint_is_set_aside_and_the_work_begins_anew(tmp_path, caplog, change):
+    store, path = Store(tmp_path), tmp_path / "field" / "a.checkpoint"
+    _resumed(store)
+    if change is not None:
+        path.write_bytes(change(path.read_bytes(), Random(1)))
+    # A class that the reader does not expect may run code when it is made.
+    assert _resumed(store, (Stand,) if change else ()) is None
+    (record,) = caplog.records
+    assert f"{path} is damaged" in record.getMessage() and "begins anew" in record.getMessage()
+    assert (tmp_path / "field" / "a.checkpoint.damaged").is_file()
+    assert _resumed(store)["at"] == 7
+
+
+def test_a_checkpoint_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, caplog):
+    store = Store(tmp_path)
+
+    def make():
+        with monkeypatch.context() as patch:
+            patch.setattr("torch.save", full_disk)
+            store.keep("field", "a", {"at": 1})
+        return 5
+
+    assert fetch(store, make).value == 5
+    (record,) = caplog.records
+    assert "a.checkpoint cannot be written: No space left on device; the work goes on" in record.getMessage()
+    assert {path.name for path in (tmp_path / "field").iterdir()} == {"a.pt", "a.json", "a.lock"}
+
+
+def test_a_result_that_cannot_be_written_leaves_earlier_ones_and_the_checkpoint(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+    fetch(store, lambda: 1, "b")
+
+    def make():
+        store.keep("field", "a", {"at": 1})
+        monkeypatch.setattr("torch.save", full_disk)
+        return 5
+
+    with pytest.raises(
+        ValueError, match=r"^paths\.store: .*a\.pt cannot be written: No space left on device$"
+    ):
+        fetch(store, make)
+    assert {path.name for path in (tmp_path / "field").iterdir() if path.suffix != ".lock"} == {
+        "a.json", "a.checkpoint", "b.pt", "b.json",
+    }  # fmt: skip
+    assert store.state("field", "a")["at"] == 1 and fetch(store, lambda: 2, "b").value == 1
+
+
+def full_disk(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _slow(folder, begun, seconds, key):

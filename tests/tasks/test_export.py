@@ -14,6 +14,8 @@ from PIL import Image
 
 from neural_sim.main import UserError, conf_directory, context_of
 from neural_sim.stages.detail import finer_recipe, view_size_for
+from neural_sim.stages.store import locked
+from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.target.coco import CocoTarget
 from neural_sim.tasks import export as task
 from neural_sim.tasks.walk import walk
@@ -75,6 +77,51 @@ def test_images_follow_the_psi_that_is_asked_for(base, made):
     assert int(np.argmax(weights)) == wanted - 1 and weights[wanted - 1] == pytest.approx(0.86)
     rows = [row for row in held["rows"] if row["object"] == "pitcher" and row["factor"] == "pose"]
     assert [row["weight"] for row in rows] == pytest.approx(weights)
+
+
+def _contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _killed(monkeypatch, base, folder, *overrides):
+    """Export, and end in the middle of the third image."""
+    draw = ImageSource.image
+
+    def image(source, number):
+        if number == 2:
+            raise KeyboardInterrupt
+        return draw(source, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ImageSource, "image", image)
+        with pytest.raises(KeyboardInterrupt):
+            export(base, folder, *overrides)
+
+
+FORMATS = "export.formats=[coco,yolo,bop]"
+
+
+def test_a_killed_export_goes_on_in_the_folder_of_the_next_run(base, made, tmp_path, monkeypatch):
+    _killed(monkeypatch, base, tmp_path / "killed", FORMATS)
+    assert len(list((tmp_path / "killed" / "dataset" / "images").iterdir())) == 2
+    drawn, draw = [], ImageSource.image
+    monkeypatch.setattr(ImageSource, "image", lambda *of: drawn.append(of[1]) or draw(*of))
+    assert _contents(export(base, tmp_path / "next", FORMATS)) == _contents(made)
+    assert drawn == [2] and not (tmp_path / "killed" / "dataset").exists()
+    assert not list((base / "store" / "export").glob("*.checkpoint"))
+
+
+def test_resume_false_begins_a_data_set_anew(base, made, tmp_path, monkeypatch):
+    _killed(monkeypatch, base, tmp_path / "killed", FORMATS)
+    assert _contents(export(base, tmp_path / "next", FORMATS, "resume=false")) == _contents(made)
+    assert len(list((tmp_path / "killed" / "dataset" / "images").iterdir())) == 2
+
+
+def test_a_data_set_that_another_run_works_on_is_left_alone(base, made, tmp_path, monkeypatch):
+    _killed(monkeypatch, base, tmp_path / "other", FORMATS)
+    with locked(tmp_path / "other" / ".dataset"):
+        assert _contents(export(base, tmp_path / "next", FORMATS)) == _contents(made)
+    assert len(list((tmp_path / "other" / "dataset" / "images").iterdir())) == 2
 
 
 def test_a_second_run_continues_the_folder(base, made, monkeypatch):

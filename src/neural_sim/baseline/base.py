@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,14 @@ class Search(Protocol):
 
         ``by_object`` is what it scored on each object's class, 0 of classes that validation images do not show.
         """
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Return what it has learned, without its generator, so that a run that is killed can be taken up."""
+        ...
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a :meth:`state`, just after ``begin``."""
         ...
 
 

@@ -7,8 +7,9 @@ set, on which one detector is trained; what that scores on the target set is the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Lt
@@ -66,6 +67,9 @@ class LearningToSimulate:
         return Policy(self, distribution, psi.detach().clone(), generator)
 
 
+_LEARNED = ("omega", "noise", "rewards", "mean", "variance")
+
+
 class Policy(Search):
     """See :class:`LearningToSimulate`."""
 
@@ -91,6 +95,15 @@ class Policy(Search):
     @override
     def psi(self) -> Float[Tensor, "objects K"]:
         return self._omega
+
+    @override
+    def state(self) -> dict[str, Any]:
+        return {name: getattr(self, f"_{name}") for name in _LEARNED}
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        for name in _LEARNED:
+            setattr(self, f"_{name}", state[name])
 
     @override
     def ask(self) -> Float[Tensor, "objects K"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -70,7 +71,9 @@ class AppearanceFitting(Fitting):
         self._view_weights, mixing = self._codes_of(views)
         self.field.reset_codes(mixing, generator)
         if self.transients:
-            self._transient = TransientHead(len(views)).to(self.field.codes)
+            with torch.random.fork_rng(devices=[]):  # whatever else the process has drawn
+                torch.manual_seed(generator.initial_seed())
+                self._transient = TransientHead(len(views)).to(self.field.codes)
             self._transient.reset(generator)
         self.grid.start(views, generator)
 
@@ -117,6 +120,26 @@ class AppearanceFitting(Fitting):
         changed = self.grid.advance(step)
         self._settled = self._settled or changed
         return changed
+
+    @override
+    def state(self) -> dict[str, Any] | None:
+        grid, transient = self.grid.state(), self._transient
+        if grid is None:
+            return None
+        return {
+            "field": self.field.state_dict(),
+            "next": grid["next"],
+            "transient": None if transient is None else transient.state_dict(),
+            "settled": self._settled,
+        }
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.field.load_state_dict(state["field"])
+        self.grid.restore({"field": self.field.grid.state_dict(), "next": state["next"]})
+        if self._transient is not None:
+            self._transient.load_state_dict(state["transient"])
+        self._settled = state["settled"]
 
     @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:

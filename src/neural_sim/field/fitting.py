@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.ndimage
@@ -124,6 +125,16 @@ class GridFitting(Fitting):
         self.field.keep(seen, refine)
         self._ready = []
         return True
+
+    @override
+    def state(self) -> dict[str, Any] | None:
+        # The samples of a block's batches were chosen by the densities of its first step.
+        return None if self._ready else {"field": self.field.state_dict(), "next": self._blocks.next}
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.field.load_state_dict(state["field"])
+        self._blocks.next = state["next"]
 
     @torch.no_grad()
     def _seen_cells(self) -> Bool[Tensor, "cells"]:

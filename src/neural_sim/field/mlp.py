@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge
@@ -245,6 +246,15 @@ class MLPFitting(Fitting):
     @override
     def advance(self, step: int) -> bool:
         return False
+
+    @override
+    def state(self) -> dict[str, Any]:
+        return {"field": self.field.state_dict(), "next": self._blocks.next}
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.field.load_state_dict(state["field"])
+        self._blocks.next = state["next"]
 
     @override
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neural_sim.checkpoint import Checkpoint
 from neural_sim.field.base import RadianceField
 from neural_sim.field.pool import RayPool
 from neural_sim.field.scores import Rendering, expected_error, score_views
@@ -16,6 +19,9 @@ from neural_sim.types import PosedViews
 
 class Fitting(ABC):
     """One field with its training rays. Calls: ``start`` once, then ``loss`` and ``advance`` in each step."""
+
+    checkpoint: Checkpoint | None = None
+    """Where an earlier run left the fit, and this one writes where it stands; None: nowhere."""
 
     def __init__(self, field: RadianceField, batch_rays: int) -> None:
         self.field = field
@@ -42,20 +48,34 @@ class Fitting(ABC):
     def advance(self, step: int) -> bool:
         """Act after ``step`` steps; return whether the field's parameters were replaced."""
 
+    def state(self) -> dict[str, Any] | None:
+        """Return all but the optimiser's state that a step leaves to the next; None where a step cannot be the first.
+
+        A fitting that never returns any is not taken up where a killed run left it.
+        """
+        return None
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a :meth:`state`, just after ``start`` on the same views."""
+        raise NotImplementedError
+
     @abstractmethod
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
         """Parameter groups with their initial learning rates."""
 
 
 class RayBlocks:
-    """Consecutive blocks of a shuffled pool of rays, again from its beginning when fewer than a block are left."""
+    """Consecutive blocks of a shuffled pool of rays, again from its beginning when fewer than a block are left.
+
+    ``next`` is the place of the next one.
+    """
 
     def __init__(self, pool: RayPool) -> None:
-        self._pool, self._next = pool, 0
+        self._pool, self.next = pool, 0
 
     def draw(self, count: int) -> RayPool:
         """Return the next ``count`` rays, or the whole pool if it has fewer."""
-        if self._next + count > len(self._pool):
-            self._next = 0
-        first, self._next = self._next, self._next + count
-        return self._pool.select(slice(first, self._next))
+        if self.next + count > len(self._pool):
+            self.next = 0
+        first, self.next = self.next, self.next + count
+        return self._pool.select(slice(first, self.next))

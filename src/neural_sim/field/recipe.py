@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import torch
 from torch.utils.data import DataLoader
 from typing_extensions import override
 
+from neural_sim.checkpoint import Checkpoint
 from neural_sim.devices import synchronise, trainer_on
 from neural_sim.field.appearance import AppearanceField
 from neural_sim.field.base import RadianceField
@@ -20,6 +22,8 @@ from neural_sim.field.mlp import MLPField
 from neural_sim.field.objective import Fitting
 from neural_sim.ranges import NonNegativeInt, PositiveFraction, PositiveInt, validated
 from neural_sim.types import PosedViews
+
+_log = logging.getLogger(__name__)
 
 KINDS: dict[str, type[RadianceField]] = {
     "AppearanceField": AppearanceField,
@@ -58,13 +62,17 @@ class FieldRecipe:
         return made if isinstance(made, type) and issubclass(made, RadianceField) else None
 
     def fit(
-        self, views: PosedViews, held_out: int, device: torch.device
+        self, views: PosedViews, held_out: int, device: torch.device, checkpoint: Checkpoint | None = None
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
-        """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds."""
+        """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds.
+
+        It is taken up where ``checkpoint`` says that an earlier run left it.
+        """
         placed = views.to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)  # layers of a new field draw from the global generator
             fitting = self.fitting(self.field().to(device))
+        fitting.checkpoint = checkpoint
         generator = torch.Generator().manual_seed(self.seed)
         return fit_field(
             placed, fitting, generator, steps=self.steps, held_out=held_out,
@@ -153,15 +161,40 @@ class RadianceFieldModule(lightning.LightningModule):
         self._steps_done = 0
         self._begun = time.perf_counter()
         self._paused = 0.0
+        self._optimised: dict[str, Any] | None = None
 
     @override
     def setup(self, stage: str) -> None:
         self._begun = time.perf_counter()
         self.fitting.start(self.views, self.generator)
+        state = None if self.fitting.checkpoint is None else self.fitting.checkpoint.read()
+        if state is not None:
+            self._restore(state)
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        self.fitting.restore(state["fitting"])
+        self.generator.set_state(state["generator"])
+        self.history, self._steps_done, self._optimised = state["history"], state["step"], state["optimiser"]
+        self._begun = time.perf_counter() - state["seconds"]
+        _log.info("field: goes on after step %d/%d of a run that was ended", self._steps_done, self.steps)
+
+    def _state(self) -> dict[str, Any] | None:
+        """Return all that a step leaves to the next, on the CPU; None where it does so in a way of its own."""
+        fitting = self.fitting.state()
+        optimiser = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
+        return fitting and {
+            "fitting": _on_cpu(fitting),
+            "optimiser": _on_cpu(optimiser.state_dict()),
+            "generator": self.generator.get_state(),
+            "history": self.history,
+            "step": self._steps_done,
+            "seconds": time.perf_counter() - self._begun - self._paused,
+        }
 
     def train_dataloader(self) -> DataLoader[int]:
-        """Count the steps, which need no data."""
-        return DataLoader(range(self.steps), batch_size=None)  # pyright: ignore[reportArgumentType]
+        """Count the steps that are left, which need no data."""
+        left = range(self._steps_done, self.steps)
+        return DataLoader(left, batch_size=None)  # pyright: ignore[reportArgumentType]
 
     @override
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -169,7 +202,10 @@ class RadianceFieldModule(lightning.LightningModule):
             {"params": parameters, "lr": rate, "initial_lr": rate}
             for parameters, rate in self.fitting.learning_rates()
         ]
-        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
+        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-8, fused=True)
+        if self._optimised is not None:
+            optimiser.load_state_dict(self._optimised)
+        return optimiser
 
     @override
     def training_step(self, batch: Any, batch_index: int) -> None:
@@ -186,6 +222,8 @@ class RadianceFieldModule(lightning.LightningModule):
         last = self._steps_done == self.steps
         if last or (self.score_every and self._steps_done % self.score_every == 0):
             self._score()
+        if self.fitting.checkpoint is not None and not last:
+            self.fitting.checkpoint.offer(self._state)
 
     def _score(self) -> None:
         if self.held_out is None:
@@ -199,6 +237,15 @@ class RadianceFieldModule(lightning.LightningModule):
         self._paused += time.perf_counter() - now
         self.history.append({"seconds": seconds, "step": float(self._steps_done), **scores})
         self.log_dict({f"field/{name}": value for name, value in scores.items()} | {"field/seconds": seconds})
+
+
+def _on_cpu(tree: Any) -> Any:
+    """Copy the tensors of a state, which the next steps change in place."""
+    if isinstance(tree, torch.Tensor):
+        return tree.detach().cpu().clone()
+    if isinstance(tree, Mapping):
+        return {key: _on_cpu(value) for key, value in tree.items()}
+    return [_on_cpu(value) for value in tree] if isinstance(tree, (list, tuple)) else tree
 
 
 def _replace_parameters(optimizer: torch.optim.Optimizer, groups: list[list[torch.nn.Parameter]]) -> None:

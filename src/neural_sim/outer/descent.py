@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -67,6 +68,7 @@ class GradientLoop(OuterLoop, ABC):
         self._way = Way.begin(self.objects.names, start)
         self._offered = False
         self._folds: list[Objective] = []
+        self._before_folds = generator.get_state()
         self._stopped = False
 
     @override
@@ -196,6 +198,7 @@ class GradientLoop(OuterLoop, ABC):
         if count == 1:
             return self.inner.objective
         if not self._folds:
+            self._before_folds = self.numbers.generator.get_state()
             self._folds = self.inner.objective.folds(count, self.numbers.generator)
         return self._folds.pop()
 
@@ -209,6 +212,37 @@ class GradientLoop(OuterLoop, ABC):
     @override
     def on_train_batch_start(self, batch: int, batch_idx: int) -> int | None:
         return -1 if self._stopped else None
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return self._stopped or super().ended
+
+    @override
+    def state(self) -> dict[str, Any]:
+        given = ("settings", "objects")
+        return {
+            **super().state(),
+            "steps": {name: value for name, value in vars(self.steps).items() if name not in given},
+            "before": self._before,
+            "way": dict(self._way.stays),
+            "offered": self._offered,
+            "folds": len(self._folds),
+            "before_folds": self._before_folds,
+            "stopped": self._stopped,
+        }
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._before_folds = state["before_folds"]
+        if state["folds"]:  # those that are left are the first: they are taken from the end
+            self.numbers.generator.set_state(self._before_folds)
+            count = self.settings.steps.folds
+            self._folds = self.inner.objective.folds(count, self.numbers.generator)[: state["folds"]]
+        super().restore(state)
+        self.steps = replace(self.steps, **state["steps"])  # pyright: ignore[reportArgumentType]
+        self._before, self._way = state["before"], Way(state["way"])
+        self._offered, self._stopped = state["offered"], state["stopped"]
 
     def _prepare(self) -> None:
         """Draw what the derivative needs in addition to the training images."""

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 import lightning.pytorch as pl
@@ -17,8 +18,9 @@ from typing_extensions import override
 
 from neural_sim.baseline.base import RewardMethod
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
+from neural_sim.checkpoint import Checkpoint
 from neural_sim.detector.trajectory import Recording
-from neural_sim.devices import trainer_on
+from neural_sim.devices import placed, trainer_on
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop, Numbers, Trained, timed
@@ -48,6 +50,7 @@ class OuterLoop(pl.LightningModule):
         self.trajectory = [self.psi.detach().clone()]
         self.shown: tuple[FactorEstimate, ...] = ()
         self.on_record: Callable[[IterationRecord], object] = lambda record: None
+        self.checkpoint: Checkpoint | None = None
         self._cost, self._seconds = Cost(), {"pool": inner.preparation.seconds}
         self._cpu = time.process_time() - inner.preparation.cpu_seconds
 
@@ -56,15 +59,46 @@ class OuterLoop(pl.LightningModule):
         return None
 
     def train_dataloader(self) -> range:
-        """Count the iterations, which need no data."""
-        return range(self.rounds)
+        """Count the iterations that are left, which need no data."""
+        return range(len(self.records), self.rounds)
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is no iteration left."""
+        return len(self.records) == self.rounds
 
     @override
     def on_train_batch_end(self, *step: Any) -> None:
-        """Call ``on_record``, whose processor time is not counted as the method's."""
+        """Write the checkpoint and call ``on_record``, whose processor time is not counted as the method's."""
         begun = time.process_time()
+        if self.checkpoint is not None:
+            self.checkpoint.offer(self.state)
         self.on_record(self.records[-1])
         self._cpu += time.process_time() - begun
+
+    def state(self) -> dict[str, Any]:
+        """Return all that an iteration leaves to the next: psi, records, random numbers, the detector's parameters.
+
+        What follows from the loop's inputs, such as its pool, is left out.
+        """
+        return {
+            "psi": self.psi.data,
+            "records": self.records,
+            "trajectory": self.trajectory,
+            "shown": self.shown,
+            "theta": placed(self.theta, torch.device("cpu")),
+            "index": self.numbers.index,
+            "generator": self.numbers.generator.get_state(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a :meth:`state` of a loop of the same inputs, which has not begun."""
+        self.psi.data = state["psi"]
+        self.records, self.trajectory, self.shown = state["records"], state["trajectory"], state["shown"]
+        self.theta = placed(state["theta"], self.inner.device)
+        self.numbers = replace(self.numbers, index=state["index"])
+        self.numbers.generator.set_state(state["generator"])
+        self._seconds, self._cpu = {}, time.process_time()
 
     def renew(self) -> None:
         """Change the common random numbers."""
@@ -170,20 +204,46 @@ class RewardLoop(OuterLoop):
         self.psi.data = self.search.psi.clone()
         self.trajectory.append(self.psi.detach().clone())
 
+    @override
+    def state(self) -> dict[str, Any]:
+        return {**super().state(), "search": self.search.state()}
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self.search.restore(state["search"])
+
 
 def learn_psi(
-    module: OuterLoop, progress: bool, on_record: Callable[[IterationRecord], object] | None = None
+    module: OuterLoop,
+    progress: bool,
+    on_record: Callable[[IterationRecord], object] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> LearnedPsi:
     """Run the loop to its end by a Lightning Trainer that writes nothing.
 
-    ``on_record`` is called with the record of each iteration when it ends.
+    Args:
+        module: the loop, not yet run.
+        progress: whether to show a bar.
+        on_record: is called with the record of each iteration when it ends.
+        checkpoint: where the loop is taken up, and what it writes after each iteration.
     """
     if on_record is not None:
         module.on_record = on_record
+    module.checkpoint = checkpoint
+    state = None if checkpoint is None else checkpoint.read()
+    if state is not None:
+        module.restore(state)
+        logger.info(
+            "psi loop: goes on after round %d/%d of a run that was ended", len(module.records), module.rounds
+        )
+        for record in module.records:
+            module.on_record(record)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
-        # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
-        trainer_on(torch.device("cpu"), progress=progress).fit(module)
+        if not module.ended:
+            # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
+            trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)
 
 

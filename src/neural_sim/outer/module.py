@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -45,6 +46,23 @@ class SimulatorModule(GradientLoop):
         self._adjoint: Tensor | None = None
         if isinstance(self.settings.adjoint, Unrolled):
             self._recording = self.settings.adjoint.recording
+
+    @override
+    def state(self) -> dict[str, Any]:
+        cpu = torch.device("cpu")
+        probes, adjoint = self._probes, self._adjoint
+        return {
+            **super().state(),
+            "probes": None if probes is None else probes.state(),
+            "adjoint": None if adjoint is None else adjoint.to(cpu),
+        }
+
+    @override
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        detector, device, adjoint = self.inner.detector, self.inner.device, state["adjoint"]
+        self._probes = None if state["probes"] is None else ProbeSet.of(state["probes"], detector, device)
+        self._adjoint = None if adjoint is None else adjoint.to(device)
 
     @override
     def _derivative(self, trained: Trained, objective: Objective) -> Hypergradient:

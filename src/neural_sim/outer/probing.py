@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neural_sim.detector.cached import CachedSet
+from neural_sim.detector.losses import Targets
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.gradient.base import Probes
 from neural_sim.synthesis.scene import Scene
@@ -56,6 +58,24 @@ class ProbeSet:
                     yield images
 
         return ProbeSet(probes, CachedSet.streamed(detector, backbone, drawn()), per_bin)
+
+    def state(self) -> dict[str, Any]:
+        """Return the probes as tensors and numbers on the CPU, see :meth:`of`."""
+        cached = self.cached
+        return {
+            "rows": [{name: (p.index, p.bins) for name, p in own.items()} for own in self.probes],
+            "features": [level.cpu() for level in cached.features],
+            "targets": [cached.targets.labels.cpu(), cached.targets.deltas.cpu()],
+            "per_bin": self.per_bin,
+        }
+
+    @staticmethod
+    def of(state: Mapping[str, Any], detector: Detector, device: torch.device) -> ProbeSet:
+        """Return the probes of a :meth:`state`, with their features on ``device``."""
+        features = tuple(level.to(device) for level in state["features"])
+        targets = Targets(*(part.to(device) for part in state["targets"]))
+        probes = [{name: Probes(*rows) for name, rows in own.items()} for own in state["rows"]]
+        return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"])
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
         """Replace the next ``fresh.per_bin`` probes of every bin, cyclically by the iteration ``turn``.

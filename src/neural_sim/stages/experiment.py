@@ -40,7 +40,8 @@ _OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", Sm
 class Run:
     """What a run is called and where it works.
 
-    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of :data:`SCORES`.
+    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of :data:`SCORES`; with ``resume``
+    unfinished work of killed runs is taken up.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Run:
     mlflow: str
     accelerator: str = "cpu"
     progress: bool = False
+    resume: bool = True
     score_at: tuple[float, ...] = ()
     task: str = "detection"
 

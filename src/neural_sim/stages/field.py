@@ -16,6 +16,9 @@ from neural_sim.field.recipe import FieldRecipe, field_from_state, field_state
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.views import ViewsStage
 
+EVERY = 60.0
+"""Seconds of fitting from one checkpoint to the next."""
+
 
 @dataclass(frozen=True)
 class FittedField:
@@ -69,7 +72,9 @@ class FieldStage(Stage[FittedField]):
 
     @override
     def make(self, results: Results) -> FittedField:
-        return FittedField(*self.recipe.fit(results(self.views), self.views.held_out, self.device))
+        checkpoint = results.checkpoint(self, every=EVERY)
+        views = results(self.views)
+        return FittedField(*self.recipe.fit(views, self.views.held_out, self.device, checkpoint))
 
     @override
     def pack(self, value: FittedField) -> dict[str, Any]:

@@ -13,11 +13,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop, Response, RewardMethod
-from neural_sim.baseline.label_shift.evidence import estimates_of
+from neural_sim.baseline.label_shift.evidence import FactorEstimate, estimates_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.detector.classifier import Classifier
 from neural_sim.gradient.estimators import Estimator
 from neural_sim.gradient.implicit import Implicit
+from neural_sim.outer.certificate import Certificate, ImplicitQuality, UnrolledQuality
+from neural_sim.outer.evidence import Average
 from neural_sim.outer.first_step import Derivative, FirstStep, WhatTheTargetShows
 from neural_sim.outer.inner import InnerLoop, LoopInputs, pooled
 from neural_sim.outer.loop import OuterLoop, RewardLoop, learn_psi
@@ -25,7 +27,10 @@ from neural_sim.outer.module import SimulatorModule
 from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, record_of
 from neural_sim.outer.response import ResponseLoop
 from neural_sim.outer.settings import Outer
+from neural_sim.outer.steps import Verdict
+from neural_sim.outer.way import Stay, TakenBack
 from neural_sim.parameter.product import HARD, Draws, SceneDistribution
+from neural_sim.parameter.update import UpdateState
 from neural_sim.randomness import stream
 from neural_sim.solver.adjoint import AdjointSolver
 from neural_sim.stages.detector import DetectorStage
@@ -35,6 +40,11 @@ from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.symmetry import SymmetryStage
 from neural_sim.stages.target_sets import TargetSetsStage
 
+_STATE = (
+    Average, Certificate, FactorEstimate, ImplicitQuality, IterationRecord, Stay, TakenBack, UnrolledQuality,
+    UpdateState, Verdict,
+)  # fmt: skip
+"""What a loop's state holds, see :meth:`OuterLoop.state`."""
 Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
 
 
@@ -118,7 +128,8 @@ class PsiStage(Stage[LearnedPsi]):
             spent = Cost(found.images, 0, 0, found.seconds, sum(found.cpu_seconds.values()))
             return LearnedPsi(torch.stack([self.initial, found.psi]), [], spent, found.factors)
         warm_start = results(self.warm_start)
-        learned = learn_psi(self.loop(results), self.progress, self.on_record)
+        checkpoint = results.checkpoint(self, _STATE)
+        learned = learn_psi(self.loop(results), self.progress, self.on_record, checkpoint)
         return replace(learned, before=warm_start.cost)
 
     def loop(self, results: Results) -> OuterLoop:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
 
+from neural_sim.checkpoint import Checkpoint
 from neural_sim.digests import digest
 from neural_sim.stages.account import Account
 from neural_sim.stages.describe import describe, modules_of
@@ -111,10 +112,12 @@ class Results:
     Args:
         store: where results are kept.
         account: is charged for every result, and told of those that the store had.
+        resume: whether unfinished work of earlier runs is taken up; it begins anew otherwise.
     """
 
-    def __init__(self, store: Store, account: Account | None = None) -> None:
+    def __init__(self, store: Store, account: Account | None = None, resume: bool = True) -> None:
         self._store, self._account = store, Account() if account is None else account
+        self._resume = resume
         self._kept: dict[str, Any] = {}
         self._seen: set[str] = set()
 
@@ -137,6 +140,21 @@ class Results:
             self._account.reused(stage.phase, stage.title, entry.seconds)
         self._seen.add(name)
         return stage.unpack(entry.value)
+
+    def checkpoint(self, stage: Stage[Any], classes: Sequence[type] = (), every: float = 0.0) -> Checkpoint:
+        """Return where the work of a stage that is being made stands, see :class:`Checkpoint` and :class:`Store`.
+
+        Args:
+            stage: the stage.
+            classes: the dataclasses that its state holds.
+            every: seconds between two writings, at least.
+        """
+        store, kind, key = self._store, stage.kind, stage.key
+        if not self._resume:
+            store.forget(kind, key)
+        return Checkpoint(
+            lambda: store.state(kind, key, classes), lambda state: store.keep(kind, key, state), every
+        )
 
     def missing(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
         """Return the stages whose results would be computed in order to evaluate these, inputs first."""

@@ -5,7 +5,8 @@ is locked between processes: concurrent runs wait for a result that one of them 
 process.
 
 An entry is a line of text, which has the SHA-256 and the size of all that follows, and then what ``torch.save`` wrote.
-Both are checked whenever it is read: one that a disk or a copy has changed is set aside and made again.
+Both are checked whenever it is read: one that a disk or a copy has changed is set aside and made again. Checkpoints of
+unfinished work lie beside the entries, in the same form, until the result stands.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import os
 import pickle
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +28,15 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
+from neural_sim.checkpoint import State
+
 _log = logging.getLogger(__name__)
 
 DAMAGED = ".damaged"
 """Suffix, in the place of ``.pt``, of an entry that was not what had been written."""
+CHECKPOINT = ".checkpoint"
+"""Suffix, in the place of ``.pt``, of where the work on a result stands."""
+_SUFFIXES = (".pt", ".json", CHECKPOINT)
 _HEADER = "neural-sim entry 1, sha256 {sha256:64}, bytes {size:20d}\n"
 
 
@@ -51,12 +57,14 @@ class Audit:
         sound: entries whose content is what was written.
         damaged: the others.
         left: files that are no entries: half written by killed runs, or set aside as damaged.
+        checkpoints: of work that was not finished.
         bytes: size of the sound entries.
     """
 
     sound: list[Path]
     damaged: list[Path]
     left: list[Path]
+    checkpoints: list[Path]
     bytes: int
 
 
@@ -97,7 +105,37 @@ class Store:
             text = json.dumps(description, indent=1, sort_keys=True)
             _write(path.with_suffix(".json"), lambda file: file.write(text.encode()))
             _write(path, lambda file: _save({"value": value, "seconds": seconds}, file))
+            self.forget(kind, key)
         return Entry(value, seconds, reused=False)
+
+    def state(self, kind: str, key: str, classes: Sequence[type] = ()) -> Any:
+        """Return where unfinished work on the result ``key`` stands, None where there is none.
+
+        For the process that makes the result, and alone has its lock. ``classes`` are the dataclasses that a state may
+        hold. A damaged one is set aside, with a warning: the work begins anew.
+        """
+        path = self._path(kind, key).with_suffix(CHECKPOINT)
+        try:
+            return _content(path, classes)
+        except _Damage as damage:
+            _set_aside(path, damage)
+            return None
+
+    def keep(self, kind: str, key: str, state: State) -> None:
+        """Write where the work on the result ``key`` stands; where that fails the work goes on, with a warning."""
+        path = self._path(kind, key).with_suffix(CHECKPOINT)
+        try:
+            with _writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            _write(path, lambda file: _save(state, file))
+        except ValueError as error:
+            _log.warning("%s; the work goes on, and could not be taken up here", error)
+
+    def forget(self, kind: str, key: str) -> None:
+        """Remove the checkpoint of the result ``key``, if there is one."""
+        path = self._path(kind, key).with_suffix(CHECKPOINT)
+        with _writing(path):
+            path.unlink(missing_ok=True)
 
     def has(self, kind: str, key: str) -> bool:
         """Whether there is a file of the result; it is not read."""
@@ -114,12 +152,10 @@ class Store:
                 sound.append(path)
             except (_Damage, OSError):
                 damaged.append(path)
-        left = [
-            *self.root.glob("*/.*.pt.*"),
-            *self.root.glob("*/.*.json.*"),
-            *self.root.glob(f"*/*{DAMAGED}"),
-        ]
-        return Audit(sound, damaged, sorted(left), size)
+        drafts = (path for suffix in _SUFFIXES for path in self.root.glob(f"*/.*{suffix}.*"))
+        left = [*drafts, *self.root.glob(f"*/*{DAMAGED}")]
+        checkpoints = sorted(self.root.glob(f"*/[!.]*{CHECKPOINT}"))
+        return Audit(sound, damaged, sorted(left), checkpoints, size)
 
     def _path(self, kind: str, key: str) -> Path:
         return self.root / kind / f"{key}.pt"
@@ -130,17 +166,21 @@ class _Damage(Exception):
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Alone with an entry. The operating system frees the lock when its holder ends, however that ends."""
+def locked(path: Path, wait: bool = True) -> Iterator[bool]:
+    """Alone with an entry. The operating system frees the lock when its holder ends, however that ends.
+
+    Yields whether this process has it, which without ``wait`` it may not.
+    """
     lock = _lock(path)
     with _writing(path):
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            _log.info("store: waiting for another run, which is making %s", path)
-            lock.acquire()
+            if wait:
+                _log.info("store: waiting for another run, which is making %s", path)
+                lock.acquire()
     try:
-        yield
+        yield lock.is_locked
     finally:
         lock.release()
 
@@ -151,10 +191,20 @@ def _lock(path: Path) -> FileLock:
 
 def _read(path: Path) -> Entry | None:
     """Return an entry, None where there is none. Raises :class:`_Damage`."""
+    stored = _content(path)
+    if stored is None:
+        return None
+    if not isinstance(stored, dict) or stored.keys() != {"value", "seconds"}:
+        raise _Damage(f"it holds a {type(stored).__name__}, want value and seconds")
+    return Entry(stored["value"], stored["seconds"], reused=True)
+
+
+def _content(path: Path, classes: Sequence[type] = ()) -> Any:
+    """Return what a file holds, None where there is none. Raises :class:`_Damage`."""
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, torch.serialization.safe_globals(list(classes)):
             file.seek(_checked_header(file))
-            stored = torch.load(file, weights_only=True)
+            return torch.load(file, weights_only=True)
     except FileNotFoundError:
         return None
     except pickle.UnpicklingError as error:  # its message advises to read with weights_only=False
@@ -162,9 +212,6 @@ def _read(path: Path) -> Entry | None:
     except (OSError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise _Damage(f"it cannot be read: {reason}") from error
-    if not isinstance(stored, dict) or stored.keys() != {"value", "seconds"}:
-        raise _Damage(f"it holds a {type(stored).__name__}, want value and seconds")
-    return Entry(stored["value"], stored["seconds"], reused=True)
 
 
 def _checked_header(file: BinaryIO) -> int:
@@ -198,15 +245,17 @@ def _sha256(file: BinaryIO) -> str:
 
 
 def _set_aside(path: Path, damage: _Damage) -> None:
-    aside = path.with_suffix(DAMAGED)
+    entry = path.suffix == ".pt"
+    aside = path.with_suffix(DAMAGED) if entry else path.with_name(path.name + DAMAGED)
+    then = "is made again" if entry else "its work begins anew"
     with _writing(path):
         os.replace(path, aside)
-    _log.warning("store: %s is damaged (%s); it is now %s and is made again", path, damage, aside.name)
+    _log.warning("store: %s is damaged (%s); it is now %s and %s", path, damage, aside.name, then)
 
 
 def _sweep(path: Path) -> None:
     """Remove what killed runs left half written in the folder of ``path``, whose lock is held."""
-    for kind in (".pt", ".json"):
+    for kind in _SUFFIXES:
         for left in path.parent.glob(f".*{kind}.*"):
             key = left.name[1:].rpartition(kind)[0]
             if key == path.stem:

@@ -99,7 +99,8 @@ class Context:
     @cached_property
     def results(self) -> Results:
         """Results of stages, read from the store or computed."""
-        return Results(Store(self.experiment.run.store), self.account)
+        run = self.experiment.run
+        return Results(Store(run.store), self.account, run.resume)
 
     @property
     def uri(self) -> str:

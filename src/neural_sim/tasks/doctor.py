@@ -124,6 +124,12 @@ class DoctorTask(Task):
                 "bad", "results in the store", f"{len(audit.damaged)} are damaged or of an older version: {names}",
                 "the next run that needs one makes it again; check the disk if they are new",
             )  # fmt: skip
+        if audit.checkpoints:
+            size = sum(path.stat().st_size for path in audit.checkpoints) / 2**20
+            yield Finding(
+                "note", "checkpoints in the store", f"{len(audit.checkpoints)} of unfinished work, {size:.0f} MB",
+                "the same command goes on from them; delete *.checkpoint of what is not wanted any more",
+            )  # fmt: skip
         if audit.left:
             yield Finding(
                 "note", "results in the store", f"{len(audit.left)} files of killed runs or set aside as damaged",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -16,6 +18,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from neural_sim.cameras import reframed
+from neural_sim.digests import digest
 from neural_sim.parameter.product import SceneDistribution
 from neural_sim.ranges import Distinct, NonNegativeInt, PositiveInt, validated
 from neural_sim.renderer.nerf import NerfRenderer, Quality
@@ -23,12 +26,12 @@ from neural_sim.stages.describe import describe, modules_of
 from neural_sim.stages.detail import finer_fields
 from neural_sim.stages.psi_file import psi_of_file
 from neural_sim.stages.stage import Stage
-from neural_sim.stages.store import locked
+from neural_sim.stages.store import Store, locked
 from neural_sim.stages.version import code_version
 from neural_sim.stages.views import Meshes, Objects
 from neural_sim.synthesis.export.bop import Model
 from neural_sim.synthesis.export.dataset import DataSet, Format, ImageFormat
-from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, write_json, write_whole
+from neural_sim.synthesis.export.folder import MANIFEST, ExportFolder, opencv_entry, write_json, write_whole
 from neural_sim.synthesis.export.images import ImageSource
 from neural_sim.synthesis.export.psi_table import psi_csv, psi_rows
 from neural_sim.synthesis.synthesizer import Synthesizer
@@ -92,7 +95,7 @@ class ExportTask(Task):
         root = context.folder / "dataset" if self.folder is None else Path(self.folder).expanduser()
         data, distribution = self._data_set(context, root), context.experiment.imaging.distribution
         root.parent.mkdir(parents=True, exist_ok=True)
-        with locked(root.with_name(f".{root.name}")):
+        with locked(_lock_of(root)), self._taken_up(context, data):
             records = data.write(lambda numbers: context.shown(numbers, "export"))
             rows = psi_rows(distribution, data.source.psi, data.source.scene.names)
             write_whole(root / "psi.csv", psi_csv(rows))
@@ -137,6 +140,24 @@ class ExportTask(Task):
             self.image_format, self.scene_size, farthest(source), workers,
         )  # fmt: skip
 
+    @contextmanager
+    def _taken_up(self, context: Context, data: DataSet) -> Iterator[None]:
+        """Go on with what a killed run of the same command left in a folder of its own, and note where this one works.
+
+        The store's note of an unfinished data set goes when it is finished.
+        """
+        if self.folder is not None:  # where it goes on anyway
+            yield
+            return
+        run, what = context.experiment.run, {"count": self.count, "formats": list(self.formats)}
+        store, key = Store(run.store), digest({**what, "identity": data.identity})
+        state = store.state("export", key) if run.resume else None
+        if state is not None and not data.root.exists():
+            _take_up(Path(state["folder"]), data)
+        store.keep("export", key, {"folder": str(data.root.resolve())})
+        yield
+        store.forget("export", key)
+
     def _psi(self, context: Context) -> Float[Tensor, "objects K"]:
         graph, distribution = context.graph, context.experiment.imaging.distribution
         if self.psi == "learned":
@@ -162,6 +183,25 @@ class ExportTask(Task):
             "bop": {"scene_size": self.scene_size} if "bop" in self.formats else None,
             "code": code_version([ImageSource.__module__, *modules_of(described)]),
         }
+
+
+def _lock_of(root: Path) -> Path:
+    """Return the path that :func:`locked` takes for a data set."""
+    return root.with_name(f".{root.name}")
+
+
+def _take_up(left: Path, data: DataSet) -> None:
+    """Move an unfinished data set to where this run writes it, unless another run is at work on it."""
+    if not (left / MANIFEST).is_file():
+        return
+    try:
+        with locked(_lock_of(left), wait=False) as ours:
+            if ours:
+                ExportFolder(left, data.identity).check()
+                shutil.move(left, data.root)
+                _log.info("export: goes on with what a run that was ended left in %s", left)
+    except (OSError, ValueError) as error:
+        _log.warning("export: begins anew; %s is left as it is (%s)", left, error)
 
 
 def _rounded_probabilities(
