@@ -1,7 +1,8 @@
-"""Fill the page of keys from ``conf/`` when the site is built; a hook of mkdocs."""
+"""Fill pages when the site is built: all keys from ``conf/``, all tables of experiments; a hook of mkdocs."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +19,10 @@ OTHERS = ("experiment", "hydra", "variant")
 """Groups whose files set keys of others, and so have none of their own."""
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace what stands between the marks by a table of keys for each part of the configuration."""
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Replace what stands between the marks by tables of keys; add tables to the page of experiments."""
+    if page.file.src_uri == "experiments.md":
+        return markdown + experiments()
     before, begin, rest = markdown.partition(BEGIN)
     return before + tables() + rest.partition(END)[2] if begin else markdown
 
@@ -44,3 +47,16 @@ def _own(places: list[Key], layout: Layout) -> Iterator[Key]:
     default = {"", *(f"{group}={chosen.value}" for group, chosen in layout.defaults.items())}
     first = next((at for at in known if at.choice in default), None)
     yield from [first] if first else known
+
+
+def experiments() -> str:
+    """Return what ``experiments.json`` has of each experiment: settings, tables and costs."""
+    rows = json.loads((ROOT / "docs" / "experiments.json").read_text(encoding="utf-8"))["rows"]
+    parts = ["\n## Tables"]
+    for name, row in rows.items():
+        cells = [entry["cells"] for entry in row["entries"]]
+        head = list(dict.fromkeys(column for each in cells for column in each))
+        settings = markdown_table(head, [[each.get(c, "") for c in head] for each in cells]) if cells else ""
+        texts = [text for text in (settings, row["text"], row.get("costs", "")) if text]
+        parts += [f"### {name.replace('_', ' ')}", *texts]
+    return "\n\n".join(parts)

@@ -40,12 +40,14 @@ class Measured:
         text: Markdown below it.
         commits: of the runs' code.
         entries: rows of a table above the text, with lines and commits of their own.
+        costs: Markdown below the text, what the methods cost.
     """
 
     lines: Sequence[str]
     text: str
     commits: Sequence[str]
     entries: Sequence[Entry] = ()
+    costs: str = ""
 
     @property
     def summary(self) -> list[str]:
@@ -53,15 +55,20 @@ class Measured:
         return [*self.lines, *(entry.line for entry in self.entries if entry.line)]
 
     @property
+    def all_commits(self) -> list[str]:
+        """Those of the runs and of the entries' runs."""
+        return sorted({*self.commits, *(commit for entry in self.entries for commit in entry.commits)})
+
+    @property
     def cell(self) -> str:
         """What stands in the page's table."""
-        commits = sorted({*self.commits, *(commit for entry in self.entries for commit in entry.commits)})
-        return "<br>".join([*self.summary, f"(commit {', '.join(commits)})"])
+        return "<br>".join([*self.summary, f"(commit {', '.join(self.all_commits)})"])
 
     @property
     def below(self) -> str:
         """What stands below the page's table."""
-        return "\n\n".join(part for part in (table(self.entries) if self.entries else "", self.text) if part)
+        parts = (table(self.entries) if self.entries else "", self.text, self.costs)
+        return "\n\n".join(part for part in parts if part)
 
     def with_kept(self, kept: Measured | None, experiments: Sequence[str]) -> Measured:
         """Add the entries of ``kept`` for places that have none here, in the order of ``experiments``."""
@@ -101,7 +108,7 @@ def read_measured(file: Path, budget: Mapping[str, Any]) -> dict[str, Measured]:
 
 
 def _row(entries: Sequence[Mapping[str, Any]] = (), **row: Any) -> Measured:
-    """Older files have no entries."""
+    """Older files have no entries and no costs."""
     read = tuple(Entry(**{**entry, "place": tuple(entry["place"])}) for entry in entries)
     return Measured(**row, entries=read)
 

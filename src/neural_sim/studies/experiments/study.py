@@ -30,6 +30,10 @@ from neural_sim.tasks.context import Context, Task
 
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
+IN_JSON = (
+    "Tables of every object and setting next to the paper's, and what the methods cost, are on the site "
+    "(`nox -s docs`), from `experiments.json`, and in the folder of an `experiments_table` run."
+)
 COMMAND = "python -m src.main +experiment=experiments_table experiments.page=docs/experiments.md"
 
 
@@ -136,8 +140,8 @@ class Experiments(Task):
     def write(self, uri: str, config: Mapping[str, Any], folder: Path) -> str:
         """Write experiments.md, experiments.json and figures, and the page where it is asked for.
 
-        A page keeps what it said of experiments, and of settings in a table of settings, without runs here, from the
-        JSON file of the same name.
+        The page is short: what settings and objects gave, and costs, are in the JSON file of the same name. A page
+        keeps what it said of experiments, and of settings in a table of settings, without runs here, from that file.
 
         Args:
             uri: of the MLflow store.
@@ -145,7 +149,7 @@ class Experiments(Task):
             folder: where the files go.
 
         Returns:
-            The page's text.
+            The text of experiments.md.
         """
         budget = config["budget"]
         settings = Settings(uri, budget, self.reference, self.draws, config["seed"])
@@ -171,7 +175,7 @@ class Experiments(Task):
             made = {name: own for name, own in {**kept, **made}.items() if name in rows}
             text = self._page(rows, made, budget)
             write_measured(document_of(self.page), budget, made)
-            Path(self.page).write_text(text, encoding="utf-8")
+            Path(self.page).write_text(self._brief(rows, made, budget), encoding="utf-8")
         (folder / "experiments.md").write_text(text, encoding="utf-8")
         return text
 
@@ -189,11 +193,11 @@ class Experiments(Task):
         table = self._tables.get(row.table) if row.table else None
         shown = LAYOUTS[row.layout](found, table)
         runs = [run for setting in found for run in setting.group.runs]
-        text = "\n\n".join(part for part in (shown.text, costs_table(runs)) if part)
         commits = sorted({commit for setting in found for commit in setting.commits})
-        return Measured(list(shown.lines), text, commits, shown.entries), shown.figures, left_out
+        measured = Measured(list(shown.lines), shown.text, commits, shown.entries, costs_table(runs))
+        return measured, shown.figures, left_out
 
-    def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
+    def _head(self, budget: Mapping[str, Any]) -> list[str]:
         views, training, outer = budget["views"], budget["training"], budget["outer"]
         note = (
             f"Ours: runs with {views['count']} views of {views['image_size']} pixels per object, detectors at "
@@ -203,6 +207,32 @@ class Experiments(Task):
             "again). NS is no optimisation, NSO is `baseline=neural_sim`. Line numbers are those of the "
             "paper's LaTeX source."
         )
+        written = (
+            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
+            "their tables, without runs there it keeps what it said before."
+        )
+        return ["# Experiments", written, note]
+
+    def _brief(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
+        """Return a section for each row: its command, what the paper says, what we have, and what differs."""
+        parts = [*self._head(budget), IN_JSON]
+        for name, row in rows.items():
+            own = made.get(name)
+            said = [("The paper", self._claims(row))]
+            if own is None:
+                said.append(("Ours", [row.without_runs]))
+            else:
+                said.append((f"Ours, commit {', '.join(own.all_commits)}", own.summary))
+            said.append(("What differs", [row.differs] if row.differs else []))
+            points = [_point(title, lines) for title, lines in said if lines]
+            parts += [f"## {row.title}", f"    {row.command_line}", "\n".join(points)]
+            if own and row.layout is None:
+                parts.append(own.below)
+            if row.table and not (own and row.layout):
+                parts.append(self._tables[row.table].markdown())
+        return "\n\n".join(parts) + "\n"
+
+    def _page(self, rows: Mapping[str, Row], made: Mapping[str, Measured], budget: Mapping[str, Any]) -> str:
         cells = [
             [
                 row.title,
@@ -214,10 +244,7 @@ class Experiments(Task):
             for name, row in rows.items()
         ]
         parts = [
-            "# Experiments",
-            f"Written by `{COMMAND}` from finished runs in MLflow; do not edit. Of experiments, and settings in "
-            "their tables, without runs there it keeps what it said before.",
-            note,
+            *self._head(budget),
             markdown_table(["the paper's experiment", "command", "ours", "the paper", "what differs"], cells),
         ]
         for name, row in rows.items():
@@ -241,3 +268,10 @@ class Experiments(Task):
         if row.table:
             texts.append(f"{self._tables[row.table].title}: below")
         return texts
+
+
+def _point(title: str, lines: Sequence[str]) -> str:
+    """Write one point of a list; several lines are points below it."""
+    if len(lines) == 1:
+        return f"- **{title}**: {lines[0]}"
+    return "\n".join([f"- **{title}**:", *(f"    - {line}" for line in lines)])
