@@ -1,4 +1,4 @@
-"""Fill pages when the site is built: all keys from ``conf/``, all tables of experiments; a hook of mkdocs."""
+"""Fill pages when the site is built: all keys from ``conf/``, all tables that the pages shorten; a hook of mkdocs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ OTHERS = ("experiment", "hydra", "variant")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Replace what stands between the marks by tables of keys; add tables to the page of experiments."""
+    """Replace what stands between the marks by tables of keys; add tables to the pages that are short of them."""
     if page.file.src_uri == "experiments.md":
         return markdown + experiments()
+    if page.file.src_uri == "numerics.md":
+        return markdown + numerics()
     before, begin, rest = markdown.partition(BEGIN)
     return before + tables() + rest.partition(END)[2] if begin else markdown
 
@@ -60,3 +62,9 @@ def experiments() -> str:
         texts = [text for text in (settings, row["text"], row.get("costs", "")) if text]
         parts += [f"### {name.replace('_', ' ')}", *texts]
     return "\n\n".join(parts)
+
+
+def numerics() -> str:
+    """Return every setting that ``numerics.json`` has of each family."""
+    held = json.loads((ROOT / "docs" / "numerics.json").read_text(encoding="utf-8"))
+    return "\n\n".join(["\n## Tables", *(f"### {family}\n\n{text}" for family, text in held.items())])

@@ -8,6 +8,7 @@ from matplotlib import image
 from mlflow import MlflowClient
 
 from neural_sim.studies.work_precision.report import (
+    brief,
     document,
     figure,
     markdown,
@@ -93,6 +94,20 @@ def test_files_figures_and_metrics(context):
     assert metrics["renderer_opacity/order_quality"] == 1.98
 
 
+def test_a_page_s_table_has_the_default_and_what_takes_as_long_on_every_other_line():
+    given = Series("renderer/given", "error", (Point("alone", 1.0, 1.0, line="quality"),))
+    text = brief(document((*SERIES, given), MACHINE), "renderer")
+    row = "| opacity: mean error of opacity | **final**: 0.01 in 4 s | **clever**: 0.01 in 2 s |"
+    assert row in text and "draft" not in text and "given" not in text
+    assert (
+        "Observed orders of convergence (in theory): opacity, quality 1.98 (2); opacity, other none (1)."
+        in text
+    )
+    assert "final, is not Pareto-optimal: clever" in text and "*opacity*: Against everything." in text
+    assert "**one**: 1 in 1 s |  |" in brief(document(SERIES, MACHINE), "field")
+    assert "**alone**: 1 in 1 s |" in brief(document((given,), MACHINE), "renderer")
+
+
 def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
     page = tmp_path / "numerics.md"
     page.write_text("kept\n")
@@ -102,4 +117,6 @@ def test_a_page_gets_a_section_for_each_family_that_was_measured(tmp_path):
     text = page.read_text()
     assert text.startswith("kept\n") and text.count("## Error against run time: renderer\n") == 1
     assert text.count("## Error against run time: field\n") == 1
+    whole = json.loads((tmp_path / "numerics.json").read_text())
+    assert list(whole) == ["renderer", "field"] and whole["renderer"] == markdown(held, "renderer")
     assert "    python -m src.main +experiment=work_precision\n" in text

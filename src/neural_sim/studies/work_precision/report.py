@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from neural_sim.documents import finite, markdown_table, replace_section
+from neural_sim.documents import finite, markdown_table, read_json, replace_section, write_json
 from neural_sim.report import figures
 from neural_sim.report.tracking import Run
 from neural_sim.studies.work_precision.series import Point, Series
@@ -20,6 +20,7 @@ INTRODUCTION = (
     "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. *Optimal*: no other setting "
     "of the table has a smaller error in less time. MB is the most that tensors took at one time."
 )
+MACHINE = "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}."
 CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
 Row = Mapping[str, Any]
 
@@ -71,11 +72,69 @@ def markdown(held: Mapping[str, Any], family: str) -> str:
     return "\n\n".join(parts)
 
 
+def brief(held: Mapping[str, Any], family: str) -> str:
+    """Return one table of a family: of each series the default and, of every other line, the nearest in run time.
+
+    Series without a default are left out where others have one. Of series without other lines, the Pareto-optimal
+    settings are shown. A note stands once for the series that share it.
+    """
+    names = [name for name in held["measured"] if name.partition("/")[0] == family]
+    decided = [name for name in names if any(row["default"] for row in held["series"] if row["name"] == name)]
+    names = decided or names
+    parts = [MACHINE.format(clock=CLOCKS[held["measured"][names[0]]["clock"]], **held["machine"])]
+    cells, orders, noted = [], [], ""
+    for name in names:
+        called, note = name.partition("/")[2], held["measured"][name]["note"]
+        parts += [f"*{called}*: {note}"] if note and note != noted else []
+        noted = note
+        rows = _telling([row for row in held["series"] if row["name"] == name])
+        shown = (
+            "<br>".join(_short(row) for row in rows if row["default"] is default) for default in (True, False)
+        )
+        cells.append([f"{called}: {rows[0]['error_kind']}", *shown])
+        orders += [
+            f"{called}, {o['line']} {_observed(o)} ({o['theory']:g})"
+            for o in held["orders"]
+            if o["name"] == name
+        ]
+    parts.append(markdown_table(["error", "default", "others"], cells))
+    parts += [f"Observed orders of convergence (in theory): {'; '.join(orders)}."] if orders else []
+    parts += [_overtaken(each) for each in held["overtaken"] if each["name"].partition("/")[0] == family]
+    return "\n\n".join(parts)
+
+
+def _short(row: Row) -> str:
+    detail = f" ({row['detail']})" if row["detail"] else ""
+    return f"**{row['setting']}**: {_shown(row['error'])} in {_shown(row['seconds'])} s{detail}"
+
+
+def _telling(rows: Sequence[Row]) -> list[Row]:
+    own = next((row for row in rows if row["default"]), None)
+    lines: dict[str, list[Row]] = {}
+    for row in rows:
+        if own and row["line"] != own["line"] and row["seconds"]:
+            lines.setdefault(row["line"], []).append(row)
+    if own is None or not own["seconds"] or not lines:
+        return [row for row in rows if row["pareto"] or row["default"]] or list(rows)
+    return [
+        own,
+        *(min(of, key=lambda r: abs(math.log(r["seconds"] / own["seconds"]))) for of in lines.values()),
+    ]
+
+
+def _named(row: Row) -> str:
+    return f"**{row['setting']}** (default)" if row["default"] else row["setting"]
+
+
+def _observed(order: Row) -> str:
+    return "none" if order["observed"] is None else f"{order['observed']:.2f}"
+
+
 def _table(rows: Sequence[Row]) -> str:
     detailed = any(row["detail"] for row in rows)
     cells = [
         [
-            f"**{row['setting']}** (default)" if row["default"] else row["setting"],
+            _named(row),
             _shown(row["error"]),
             _shown(row["seconds"]),
             "" if row["memory_mb"] is None else f"{row['memory_mb']:.3g}",
@@ -95,9 +154,9 @@ def _shown(value: float | None) -> str:
 
 
 def _order(order: Row) -> str:
-    observed = "none" if order["observed"] is None else f"{order['observed']:.2f}"
     return (
-        f"Order of {order['line']} for steps of {order['steps']}: {observed}, in theory {order['theory']:g}."
+        f"Order of {order['line']} for steps of {order['steps']}: {_observed(order)}, "
+        f"in theory {order['theory']:g}."
     )
 
 
@@ -181,10 +240,17 @@ def _families(held: Mapping[str, Any]) -> list[str]:
 
 
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
-    """Rewrite a section of ``page`` for each family, see :func:`neural_sim.documents.replace_section`."""
+    """Rewrite a section of ``page`` for each family, see :func:`neural_sim.documents.replace_section`.
+
+    The page has :func:`brief` tables; the whole ones go to the JSON file of the same name.
+    """
+    file = page.with_suffix(".json")
+    whole = read_json(file) if file.is_file() else {}
     for family in _families(held):
         name = f"Error against run time: {family}"
-        replace_section(page, name, f"    {command}\n\n{markdown(held, family)}")
+        replace_section(page, name, f"    {command}\n\n{brief(held, family)}")
+        whole[family] = markdown(held, family)
+    write_json(file, whole)
 
 
 def publish(context: Context, series: Sequence[Series], held: Mapping[str, Any]) -> Run:
