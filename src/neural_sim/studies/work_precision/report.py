@@ -116,10 +116,9 @@ def _telling(rows: Sequence[Row]) -> list[Row]:
             lines.setdefault(row["line"], []).append(row)
     if own is None or not own["seconds"] or not lines:
         return [row for row in rows if row["pareto"] or row["default"]] or list(rows)
-    return [
-        own,
-        *(min(of, key=lambda r: abs(math.log(r["seconds"] / own["seconds"]))) for of in lines.values()),
-    ]
+    spent = own["seconds"]
+    nearest = (min(of, key=lambda row: abs(math.log(row["seconds"] / spent))) for of in lines.values())
+    return [own, *nearest]
 
 
 def _named(row: Row) -> str:
