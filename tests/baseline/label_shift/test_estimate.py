@@ -204,6 +204,29 @@ def test_products_are_read_by_the_joint_posterior_and_every_factor_is_tested():
     }
 
 
+def test_distances_are_read_off_the_size_of_boxes_where_few_renders_say_little_else():
+    """Every render has a pattern of its own, which a network knows by heart; the four bins differ in size alone."""
+    distribution, generator = SceneDistribution.of([Zoom(bins=4)]), torch.Generator().manual_seed(0)
+    patterns = torch.randint(256, (EACH, SIDE, SIDE, 3), generator=generator, dtype=torch.uint8)
+    wider = torch.rand(EACH, generator=generator)  # as poses are
+    maps = torch.zeros(4 * EACH, SIDE, SIDE, 4, dtype=torch.uint8)
+    for row in range(len(maps)):
+        half = round((16.0, 11.4, 8.2, 5.8)[row // EACH] * float(1.0 + 0.15 * wider[row % EACH]))
+        inside = slice(SIDE // 2 - half, SIDE // 2 + half)
+        maps[row, inside, inside, :3], maps[row, inside, inside, 3] = (
+            patterns[row % EACH, inside, inside],
+            255,
+        )
+    noise = distribution.draw_noise(len(maps), generator)
+    draw = distribution.at_bins({"zoom": torch.arange(4).repeat_interleave(EACH)}, noise)
+    subjects = tuple(PooledSubject(name, maps, draw, EACH) for name in COLOURS)
+    scene = Scene(subjects, PinholeCamera(SIDE, SIDE, 0.7), Synthesizer(ProceduralClutter()), distribution)
+    lamp, cup = read(scene, target_of(scene, P), distribution.uniform.expand(2, -1)).factors
+    assert min(lamp.accuracy, cup.accuracy) > 0.9
+    assert lamp.finding == "moves" and float(total_variation(torch.tensor(lamp.p), torch.tensor(P))) < 0.1
+    assert cup.finding == "stays"
+
+
 def test_augmented_crops_keep_their_shape_and_differ(posed):
     from neural_sim.baseline.label_shift.crops import crops_of, plain
 

@@ -25,6 +25,8 @@ _STORED = 44
 _SHOWN = 1.1  # side of what the network sees, in sides of the box
 BOX_NUMBERS = 5
 """Numbers that describe a box."""
+SIZE = (0, 1, 4)
+"""Those that say how large it is: width, height and whether the border may cut it off."""
 
 
 @dataclass(frozen=True)

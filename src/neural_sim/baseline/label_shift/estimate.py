@@ -2,10 +2,11 @@
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
-Renders of all bins, from a pool that is rendered once, train a small classifier of bins (:mod:`.network`); it reads the
-target's boxes, and expectation maximisation over its calibrated posteriors (:mod:`mixture`) gives the distribution of
-every object and factor, with an interval for each bin, a test against where psi stands, and a test of fit
-(:mod:`evidence`). ``Estimate.psi`` moves only where both tests allow it.
+Renders of all bins, from a pool that is rendered once, train a small classifier of bins (:mod:`.network`) and one by
+the size of boxes alone (:mod:`.calibration`); both read the target's boxes. Expectation maximisation over their
+calibrated posterior (:mod:`mixture`) gives the distribution of every object and factor, with an interval for each bin,
+a test against where psi stands, and a test of fit (:mod:`evidence`). ``Estimate.psi`` moves only where both tests allow
+it.
 """
 
 from __future__ import annotations

@@ -148,9 +148,12 @@ class Fitting:
 
 @dataclass(frozen=True)
 class Outputs:
-    """A network's outputs on crops: logits of the cells, guesses of the lights' weights, features behind both."""
+    """A network's outputs on crops: logits of the cells, guesses of the lights' weights, features behind both.
 
-    logits: Float[Tensor, "n cells"]
+    Other guesses than the network's may join these.
+    """
+
+    logits: Float[Tensor, "*guesses n cells"]
     weights: Float[Tensor, "n lights"]
     features: Float[Tensor, "n features"]
 
@@ -166,46 +169,3 @@ def outputs_of(network: BinNetwork, crops: Crops) -> Outputs:
     rows = torch.arange(len(crops)).split(256)
     parts = [network(seen[part], boxes[part], crops.labels[part]) for part in rows]
     return Outputs(*(torch.cat(part).double() for part in zip(*parts, strict=True)))
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Calibrated logits are ``logits`` / ``temperature`` + ``bias``, by sample of the renders that it was found on."""
-
-    temperature: Float[Tensor, "samples 1 1"]
-    bias: Float[Tensor, "samples 1 cells"]
-
-    def __call__(self, logits: Float[Tensor, "n cells"]) -> Float[Tensor, "samples n cells"]:
-        """Return calibrated posteriors."""
-        return (logits / self.temperature + self.bias).softmax(-1)
-
-
-def calibrate(
-    logits: Float[Tensor, "n cells"],
-    cells: Int[Tensor, "n"],
-    samples: Float[Tensor, "samples n"] | None = None,
-    ridge: float = 1.0,
-) -> Calibration:
-    """Find the temperature and the biases that make held-out posteriors calibrated (Alexandari et al. 2020, BCTS).
-
-    Args:
-        logits: of held-out renders of one object.
-        cells: their true ones.
-        samples: how often each render is in several samples of them; None: one sample of all.
-        ridge: weight of the biases' squares, in renders; keeps those of few renders near 0.
-    """
-    counts = logits.new_ones(1, len(cells)) if samples is None else samples.to(logits)
-    log_t = torch.zeros(len(counts), 1, 1, dtype=torch.float64, requires_grad=True)
-    bias = torch.zeros(len(counts), 1, logits.shape[1], dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([log_t, bias], max_iter=100, line_search_fn="strong_wolfe")
-
-    def closure() -> Tensor:
-        optimiser.zero_grad()
-        found = (logits * (-log_t).exp() + bias).log_softmax(-1)
-        right = found.gather(-1, cells.expand(len(counts), -1)[..., None])[..., 0]
-        loss = ridge * bias.square().sum() - (counts * right).sum()
-        loss.backward()
-        return loss
-
-    optimiser.step(closure)
-    return Calibration(log_t.detach().exp(), bias.detach() - bias.detach().mean(-1, keepdim=True))

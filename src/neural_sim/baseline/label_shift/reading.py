@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neural_sim.baseline.label_shift.crops import Crops, quarters
+from neural_sim.baseline.label_shift.calibration import BoxReader, calibrate
+from neural_sim.baseline.label_shift.crops import SIZE, Crops, quarters
 from neural_sim.baseline.label_shift.evidence import FactorEstimate, Finding, Span, Strangeness, part_farther
 from neural_sim.baseline.label_shift.mixture import Cells, Status, grouped, maximise, posterior, ratio_test
 from neural_sim.baseline.label_shift.moments import Response, distance, fitted, matched, scattered
-from neural_sim.baseline.label_shift.network import BinNetwork, Known, Outputs, calibrate, outputs_of
+from neural_sim.baseline.label_shift.network import BinNetwork, Known, Outputs, outputs_of
 from neural_sim.baseline.label_shift.settings import LabelShift
 from neural_sim.parameter.distributions import merged
 from neural_sim.parameter.factor import Factor
@@ -62,16 +63,11 @@ class Reader:
             for known in (self.training, self.held)
         )
         target = self.target.select(self.target.labels == label)
-        outputs = (outputs_of(self.network, crops) for crops in (target, held.crops))
-        seen, known = (replace(one, logits=one.logits.masked_fill(~drawn, NEVER)) for one in outputs)
+        seen, known = (self._guessed(training, crops, drawn) for crops in (target, held.crops))
         limits = None  # where no render shows the object
         if len(training.crops) and len(held.crops):
             features = outputs_of(self.network, training.crops).features
             limits = Strangeness.of(features, training.cells, training.weights.double())
-        if self.distribution.lights:
-            seen, known = (
-                self._with_colours(training, *pair) for pair in ((target, seen), (held.crops, known))
-            )
         object_ = _Object(self, name, now, groups, held, known, seen, limits)
         found, new = object_.found(), dict(object_.psi)
         for one in found:
@@ -82,12 +78,19 @@ class Reader:
                 )
         return found, self.distribution.join(new)
 
-    @staticmethod
-    def _with_colours(training: Known, crops: Crops, outputs: Outputs) -> Outputs:
-        """Add guesses of the lights' weights by colours to those of the network."""
-        own, others = (quarters(each).double() for each in (training.crops, crops))
-        guessed = fitted(own, training.weights.double(), others)
-        return replace(outputs, weights=torch.cat([outputs.weights, guessed], 1))
+    def _guessed(self, training: Known, crops: Crops, drawn: Bool[Tensor, "cells"]) -> Outputs:
+        """Return the network's outputs, with logits by boxes alone and the lights' weights by colours alone."""
+        outputs = outputs_of(self.network, crops)
+        logits, weights = [outputs.logits], [outputs.weights]
+        if self.distribution.binned and len(training.crops):
+            cells = Cells(tuple(factor.bins for factor in self.distribution.binned))
+            own, others = (each.boxes[:, SIZE] for each in (training.crops, crops))
+            logits.append(BoxReader.fitted(own, training.cells, cells)(others))
+        if self.distribution.lights:
+            own, others = (quarters(each).double() for each in (training.crops, crops))
+            weights.append(fitted(own, training.weights.double(), others))
+        guesses = torch.stack(logits).masked_fill(~drawn, NEVER)
+        return replace(outputs, logits=guesses, weights=torch.cat(weights, 1))
 
 
 @dataclass(frozen=True)

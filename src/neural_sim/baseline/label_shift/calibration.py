@@ -1,0 +1,135 @@
+"""Two guesses of a crop's bins, by the network and by its box alone, and the calibrated posterior of both.
+
+A network that few renders trained knows them by heart: of four bins of distance it told half of other renders right,
+where the size of the box alone tells nine of ten. So a quadratic logistic regression reads the box, and held-out
+renders find out how much to believe each (Wolpert 1992): posteriors are the softmax of a_1 z_1 + a_2 z_2 + b with
+weights a >= 0 for the logits z of each guess, and a bias b for each combination of bins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from neural_sim.baseline.label_shift.mixture import Cells
+
+
+@dataclass(frozen=True)
+class BoxReader:
+    """Logistic regressions of every factor's bins on the numbers of one object's boxes and their products.
+
+    Attributes:
+        low: smallest numbers of the boxes that it was fitted to; others count as these, for squares do not extrapolate.
+        high: largest ones.
+        centre: of the numbers.
+        spread: their standard deviation, 1 of what does not vary.
+        weights: of every factor, of a constant, the numbers and their products.
+        cells: the combinations of bins.
+    """
+
+    low: Float[Tensor, "d"]
+    high: Float[Tensor, "d"]
+    centre: Float[Tensor, "d"]
+    spread: Float[Tensor, "d"]
+    weights: tuple[Float[Tensor, "terms _"], ...]
+    cells: Cells
+
+    @staticmethod
+    def fitted(
+        numbers: Float[Tensor, "n d"], known: Int[Tensor, "n"], cells: Cells, ridge: float = 1.0
+    ) -> BoxReader:
+        """Fit to boxes of renders of ``known`` cells; ``ridge``: half the weight of squares of all but constants."""
+        numbers = numbers.double()
+        centre, spread = numbers.mean(0), numbers.std(0)
+        spread = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
+        terms = _terms((numbers - centre) / spread)
+        bins = zip(cells.bins(known), cells.sizes, strict=True)
+        weights = tuple(_regressed(terms, own, k, ridge) for own, k in bins)
+        return BoxReader(numbers.amin(0), numbers.amax(0), centre, spread, weights, cells)
+
+    def __call__(self, numbers: Float[Tensor, "n d"]) -> Float[Tensor, "n cells"]:
+        """Return logits of the cells, the sums of those of their bins."""
+        numbers = numbers.double().clamp(self.low, self.high)
+        terms = _terms((numbers - self.centre) / self.spread)
+        parts = [terms @ weights for weights in self.weights]
+        whole = parts[0]
+        for own in parts[1:]:
+            whole = (whole[:, :, None] + own[:, None, :]).flatten(1)
+        return whole
+
+
+def _terms(numbers: Float[Tensor, "n d"]) -> Float[Tensor, "n terms"]:
+    rows, columns = torch.triu_indices(numbers.shape[1], numbers.shape[1])
+    products = numbers[:, rows] * numbers[:, columns]
+    return torch.cat([numbers.new_ones(len(numbers), 1), numbers, products], 1)
+
+
+def _regressed(
+    terms: Float[Tensor, "n terms"], bins: Int[Tensor, "n"], size: int, ridge: float
+) -> Float[Tensor, "terms size"]:
+    weights = torch.zeros(terms.shape[1], size, dtype=torch.float64, requires_grad=True)
+    return _minimised(
+        [weights],
+        lambda: (
+            cross_entropy(terms @ weights, bins, reduction="sum") + 0.5 * ridge * weights[1:].square().sum()
+        ),
+    )[0]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibrated logits are the guesses' weighted sum and a bias, by sample of the renders that they were found on."""
+
+    weights: Float[Tensor, "samples guesses 1 1"]
+    bias: Float[Tensor, "samples 1 cells"]
+
+    def __call__(self, guesses: Float[Tensor, "guesses n cells"]) -> Float[Tensor, "samples n cells"]:
+        """Return calibrated posteriors."""
+        return ((self.weights * guesses).sum(1) + self.bias).softmax(-1)
+
+
+def calibrate(
+    guesses: Float[Tensor, "guesses n cells"],
+    cells: Int[Tensor, "n"],
+    samples: Float[Tensor, "samples n"] | None = None,
+    ridge: float = 1.0,
+) -> Calibration:
+    """Find the weights and the biases that make held-out posteriors calibrated (Alexandari et al. 2020, BCTS).
+
+    Args:
+        guesses: logits of held-out renders of one object.
+        cells: their true ones.
+        samples: how often each render is in several samples of them; None: one sample of all.
+        ridge: weight of the biases' squares, in renders; keeps those of few renders near 0.
+    """
+    counts = guesses.new_ones(1, len(cells)) if samples is None else samples.to(guesses)
+    shape = (len(counts), len(guesses), 1, 1)
+    log_weights = guesses.new_full(shape, 1.0 / len(guesses)).log().requires_grad_()
+    bias = guesses.new_zeros(len(counts), 1, guesses.shape[-1]).requires_grad_()
+
+    def loss() -> Tensor:
+        found = ((log_weights.exp() * guesses).sum(1) + bias).log_softmax(-1)
+        right = found.gather(-1, cells.expand(len(counts), -1)[..., None])[..., 0]
+        return ridge * bias.square().sum() - (counts * right).sum()
+
+    _minimised([log_weights, bias], loss)
+    return Calibration(log_weights.detach().exp(), bias.detach() - bias.detach().mean(-1, keepdim=True))
+
+
+def _minimised(variables: Sequence[Tensor], loss: Callable[[], Tensor]) -> list[Tensor]:
+    """Minimise a smooth loss in place."""
+    optimiser = torch.optim.LBFGS(list(variables), max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = loss()
+        value.backward()
+        return value
+
+    optimiser.step(closure)
+    return [variable.detach() for variable in variables]
