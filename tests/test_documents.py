@@ -18,7 +18,7 @@ def test_numbers_that_are_not_finite_become_null_at_every_depth(tmp_path):
 
 def test_what_is_no_json_is_refused_with_its_path(tmp_path):
     assert read_json(write_json(tmp_path / "file.json", {"a": [1]})) == {"a": [1]}
-    for text in (b"{", b"\xff"):
+    for text in (b"{", b"\xff", b"[" * 100_000, b'{"a":' * 100_000):
         (tmp_path / "broken.json").write_bytes(text)
         with pytest.raises(ValueError, match=r"broken\.json: not readable as JSON \("):
             read_json(tmp_path / "broken.json")

@@ -37,6 +37,18 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
     return path
 
 
+def parsed_json(text: str | bytes) -> Any:
+    """Parse JSON.
+
+    Raises:
+        ValueError: what is no JSON, or is nested deeper than Python can follow.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("its lists or mappings are nested too deeply") from error
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file in UTF-8, with or without a byte order mark.
 
@@ -44,8 +56,8 @@ def read_json(path: Path) -> Any:
         ValueError: a file that is missing, cannot be read or is no JSON, with its path.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
+        return parsed_json(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not readable as JSON ({error})") from error
 
 

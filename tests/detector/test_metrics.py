@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.metrics import evaluate, worthless
 from neural_sim.types import LabelledImages
 
 BOX = [10.0, 10.0, 30.0, 30.0]
@@ -72,6 +72,20 @@ def test_nothing_found_and_nothing_there():
     empty = found([], [], [])
     assert evaluate([empty], labelled([[0]]), NAMES).ap == 0.0
     assert math.isnan(evaluate([empty], labelled([[-1]]), NAMES).ap)
+
+
+def test_a_score_that_tells_nothing_says_why_in_one_line():
+    empty, wrong, right = found([], [], []), found([BOX], [0.9], [1]), found([BOX], [0.9], [0])
+    for predictions, labels, score, why in (
+        ([empty], [[0]], "AP", "it is 0 for every class: it detects nothing; want more training"),
+        ([wrong], [[0]], "AP", "none of its 1 boxes lies on an object of its class"),
+        ([right], [[-1]], "AP", "no class has a box in these images"),
+        ([wrong, wrong], [[0], [2]], "accuracy", "no image's best class is right"),
+        ([right, empty], [[0], [1]], "AP", None),
+    ):
+        images = labelled(labels)
+        said = worthless(evaluate(predictions, images, NAMES, score), predictions)
+        assert said is None if why is None else why in said
 
 
 def test_mismatches_and_empty_sets_are_refused():

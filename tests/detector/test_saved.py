@@ -96,12 +96,19 @@ def test_a_detector_from_outside_the_package_is_saved_and_found_again(generator,
     SavedDetector(make, params, NAMES, (32, 48)).save(tmp_path)
     after = SavedDetector.load(tmp_path / WEIGHTS)
     assert type(after.detector).__name__ == "Cells" and len(after.detector.anchors) == 6
+    sys.modules.pop("my_detector")
+    with pytest.raises(
+        ValueError, match=r"detector\.class: my_detector:Cells .* add detector\._target_=my_detector\.Cells$"
+    ):
+        SavedDetector.load(tmp_path)
+    assert "my_detector" not in sys.modules  # a file alone runs no code
+    assert type(SavedDetector.load(tmp_path, "my_detector.Cells").detector).__name__ == "Cells"
     monkeypatch.undo()
     sys.modules.pop("my_detector")
     with pytest.raises(
         ValueError, match=r"detector\.class: my_detector:Cells cannot be imported .*PYTHONPATH"
     ):
-        SavedDetector.load(tmp_path)
+        SavedDetector.load(tmp_path, "my_detector.Cells")
 
 
 def test_settings_that_json_has_not_are_refused_when_saving(tools, generator, tmp_path):
@@ -134,6 +141,7 @@ CHANGES = [
     (("image", "range"), [0, 255], r"image\.range: want \[0\.0, 1\.0\], got \[0, 255\]"),
     (("image", "normalisation", "mean"), [0, 0, 0], r"image\.normalisation: want .*0\.485.* got .*\[0, 0, 0\]"),
     (("detector", "class"), "subprocess:Popen", r"detector\.class: subprocess:Popen is no detector"),
+    (("detector", "class"), "antigravity:x", r"antigravity:x is no detector of this package, and reading it runs code"),
     (("detector", "class"), "nowhere", r"detector\.class: want 'module:class', got 'nowhere'"),
     (("detector", "settings"), None, r"detector\.settings: want a mapping .* got None"),
     (("detector", "settings", "depth"), 3, r"detector\.settings\.depth: unknown key, want one of backbone, head"),

@@ -82,6 +82,15 @@ def test_one_image_and_no_boxes_at_all(tools, generator, images):
     assert all(math.isfinite(loss) for loss in history.losses)
 
 
+def test_a_training_that_diverges_is_refused_with_its_epoch_and_rate(tools, generator, images):
+    detector = tools.detector()
+    start = detector.init(generator)
+    with pytest.raises(
+        ValueError, match=r"loss is (nan|inf) in epoch \d of 3, at a learning rate of 1e\+30: want"
+    ):
+        train(detector, start, images, epochs=3, learning_rate=1e30)
+
+
 def test_nothing_to_train_on_is_refused(tools, generator, images):
     detector = tools.detector()
     start = detector.init(generator)

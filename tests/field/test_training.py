@@ -120,6 +120,14 @@ def test_bad_budgets_are_refused() -> None:
         fit_field(ball_views(3), fitting(), generator, steps=0)
 
 
+def test_a_fit_that_diverges_is_refused() -> None:
+    """Held-out views have no score then, which would read as if there were none of them."""
+    with pytest.raises(
+        ValueError, match=r"field: its loss is nan after 8 steps: want smaller learning rates"
+    ):
+        fit_field(ball_views(), fitting(learning_rate=1e38), torch.Generator().manual_seed(0), steps=8)
+
+
 def test_small_parts_in_the_air_are_left_out():
     """Of three blocks of cells the one with a fiftieth of the largest one's goes, and cells that nothing shows."""
     occupied = torch.zeros(12, 12, 12, dtype=torch.bool)

@@ -109,6 +109,20 @@ def evaluate(
     )
 
 
+def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> str | None:
+    """Say in one line why a score tells nothing and what to do; None where it does."""
+    known = [value for value in score.per_class.values() if value == value]
+    if not known:
+        return "no class has a box in these images, so that nothing is scored: want labels of the classes"
+    if any(known):
+        return None
+    if isinstance(score, Accuracy):
+        return "it is 0 for every class: no image's best class is right; want more training or images nearer to these"
+    count = sum(len(each["scores"]) for each in predictions)
+    why = f"none of its {count} boxes lies on an object of its class" if count else "it detects nothing"
+    return f"it is 0 for every class: {why}; want more training.cold_epochs, or images whose objects are as large"
+
+
 def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:
     """Return the class of each image's best prediction, -1 without one."""
     best = [p["labels"][p["scores"].argmax()] if len(p["scores"]) else -1 for p in predictions]

@@ -13,6 +13,7 @@ import importlib
 import inspect
 import json
 import os
+import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -92,8 +93,13 @@ class SavedDetector:
         return folder / WEIGHTS
 
     @staticmethod
-    def load(path: Path) -> SavedDetector:
-        """Read both files; ``path`` is their folder or one of them.
+    def load(path: Path, outside: str | None = None) -> SavedDetector:
+        """Read both files.
+
+        Args:
+            path: their folder or one of them.
+            outside: ``module.class`` of a detector that is not this package's and may be imported. Without it such a
+                class must have been imported already: a file alone imports nothing.
 
         Raises:
             ValueError: files that are missing, unreadable, of another format or version, that do not belong together,
@@ -115,7 +121,7 @@ class SavedDetector:
             _image_size(document, file),
             _camera(document, file),
         )
-        make = rebuilt(_mapping(document, "detector", file), file)
+        make = rebuilt(_mapping(document, "detector", file), file, outside)
         params = _params(folder / WEIGHTS, _mapping(document, "weights", file), file)
         saved = SavedDetector(make, params, names, size, camera)
         try:
@@ -267,14 +273,18 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
     return {"class": f"{kind.__module__}:{kind.__qualname__}", "settings": settings}
 
 
-def rebuilt(description: Mapping[str, Any], file: Path) -> Callable[..., Detector]:
+def rebuilt(
+    description: Mapping[str, Any], file: Path, outside: str | None = None
+) -> Callable[..., Detector]:
     """Inverse of :func:`described`. Runs no code but the named class's own, which must derive from :class:`Detector`.
+
+    ``outside`` as for :meth:`SavedDetector.load`.
 
     Raises:
         ValueError: a class that cannot be imported or is no detector, a setting that it does not have or refuses;
             with the file and the key.
     """
-    kind = _detector_class(description.get("class"), f"{file}: detector.class")
+    kind = _detector_class(description.get("class"), f"{file}: detector.class", outside)
     where = f"{file}: detector.settings"
     settings = description.get("settings")
     if not isinstance(settings, Mapping):
@@ -302,10 +312,16 @@ def _plain(value: Any, where: str) -> Any:
     )
 
 
-def _detector_class(name: Any, where: str) -> type:
+def _detector_class(name: Any, where: str, outside: str | None) -> type:
     module, colon, qualified = name.partition(":") if isinstance(name, str) else ("", "", "")
     if not (module and colon and qualified):
         raise ValueError(f"{where}: want 'module:class', got {name!r}")
+    ours, target = module.partition(".")[0] == __name__.partition(".")[0], f"{module}.{qualified}"
+    if not ours and module not in sys.modules and target != outside:
+        raise ValueError(
+            f"{where}: {name} is no detector of this package, and reading it runs code of {module}: if you trust that, "
+            f"add detector._target_={target}"
+        )
     try:
         found: Any = functools.reduce(getattr, qualified.split("."), importlib.import_module(module))
     except (ImportError, AttributeError) as error:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -144,7 +145,7 @@ def train_detector(
         leave the proximal term out.
 
     Raises:
-        ValueError: without images; for a recording that does not fit its memory.
+        ValueError: without images; for a recording that does not fit its memory; where the loss stops being finite.
     """
     if len(images) == 0:
         raise ValueError("train_detector: got no images, want at least one")
@@ -161,10 +162,21 @@ def train_detector(
     batches = Batches(inputs, targets, how.batch_size, generator, sampling)
     module = DetectorModule(detector, learned, fixed, how, how.epochs * len(batches), anchor, recording)
     _fit(module, batches, next(iter(learned.values())).device)
+    _check_finite(module.epoch_losses, how)
     values = {**fixed, **module.parameters_by_name()}
     trajectory = module.trajectory(batches.drawn) if recording else None
     history = TrainingHistory(tuple(module.epoch_losses), module.steps_done, trajectory)
     return {name: values[name] for name in params}, history
+
+
+def _check_finite(losses: Sequence[float], how: Optimisation) -> None:
+    """Refuse a training that has diverged: its parameters are not numbers, and would detect nothing in silence."""
+    for epoch, loss in enumerate(losses, 1):
+        if not math.isfinite(loss):
+            raise ValueError(
+                f"detector: the training loss is {loss} in epoch {epoch} of {how.epochs}, at a learning rate of "
+                f"{how.learning_rate:g}: want a smaller training.learning_rate, in the psi loop outer.learning_rate"
+            )
 
 
 def _fit(module: DetectorModule, batches: Batches, device: torch.device) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -220,6 +221,11 @@ class RadianceFieldModule(lightning.LightningModule):
         if self.fitting.advance(self._steps_done):
             _replace_parameters(optimizer, [parameters for parameters, _ in self.fitting.learning_rates()])
         last = self._steps_done == self.steps
+        if last and not math.isfinite(float(loss.detach())):
+            raise ValueError(
+                f"field: its loss is {float(loss.detach())} after {self.steps} steps: want smaller learning rates "
+                "(field.fitting.learning_rate and those of its parts)"
+            )
         if last or (self.score_every and self._steps_done % self.score_every == 0):
             self._score()
         if self.fitting.checkpoint is not None and not last:

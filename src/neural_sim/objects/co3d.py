@@ -7,7 +7,6 @@ at ``<root>``. Cameras are PyTorch3D's: rows of points, x_camera = x_world R + T
 from __future__ import annotations
 
 import gzip
-import json
 from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
@@ -16,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neural_sim.documents import parsed_json
 from neural_sim.objects.capture import Capture, Frame, Lens, checked_pose
 from neural_sim.objects.files import Names
 from neural_sim.objects.photos import Photos, PoseCorrector, Up
@@ -111,7 +111,7 @@ class Co3d(Photos):
 def _entries(path: Path, key: str) -> list[dict[str, Any]]:
     """Read the file's entries, each of which has the key."""
     try:
-        entries = json.loads(gzip.decompress(path.read_bytes()))
+        entries = parsed_json(gzip.decompress(path.read_bytes()))
     except (OSError, EOFError, ValueError) as error:
         raise ValueError(f"{path}: not readable as gzipped JSON ({error})") from error
     if not isinstance(entries, list) or not entries:

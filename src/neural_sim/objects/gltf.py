@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import logging
 import struct
 from collections.abc import Iterator, Mapping
@@ -15,6 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 from jaxtyping import Float, Int
 
+from neural_sim.documents import parsed_json
 from neural_sim.objects.gltf_accessors import Accessors
 from neural_sim.objects.paint import Part, Texture, Wrap, encoded, find_named, read_texture, tinted
 
@@ -86,7 +86,7 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
 
 
 def _document(data: bytes) -> dict[str, Any]:
-    document = json.loads(data.decode("utf-8-sig").rstrip("\0 "))
+    document = parsed_json(data.decode("utf-8-sig").rstrip("\0 "))
     if not isinstance(document, dict):
         raise ValueError(f"want a JSON object, got {type(document).__name__}")
     return document

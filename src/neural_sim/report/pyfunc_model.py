@@ -12,7 +12,8 @@ from mlflow.pyfunc import PythonModel  # pyright: ignore[reportPrivateImportUsag
 from PIL import Image
 from typing_extensions import override
 
-from neural_sim.detector.saved import SavedDetector, detect
+from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
+from neural_sim.documents import read_json
 
 COLUMNS = ("image", "label", "score", "x0", "y0", "x1", "y1")
 
@@ -26,7 +27,10 @@ class PhotographDetector(PythonModel):
 
     @override
     def load_context(self, context: Any) -> None:
-        self.saved = SavedDetector.load(Path(context.artifacts["weights"]).parent)
+        folder = Path(context.artifacts["weights"]).parent
+        # MLflow runs the code of a model, this file: whoever loads it trusts the detector's, too.
+        named = read_json(folder / DOCUMENT)["detector"]["class"]
+        self.saved = SavedDetector.load(folder, named.replace(":", "."))
 
     @override
     def predict(self, context: Any, model_input: Any, params: Any = None) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -24,7 +25,10 @@ from neural_sim.stages.scene import TrainingImages, TrainingImagesStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
 from neural_sim.synthesis.assembly import RenderedImages
+from neural_sim.synthesis.synthesizer import unshown
 from neural_sim.types import LabelledImages, PinholeCamera
+
+_log = logging.getLogger(__name__)
 
 CPU = torch.device("cpu")
 
@@ -131,6 +135,11 @@ class DetectorStage(TrainedStage):
         detector, training, generator = self.build(), self.training, self.generator()
         begun, cpu_begun = time.perf_counter(), time.process_time()
         images, sampling = self.images(results, generator).images.to(self.device), None
+        if unseen := unshown(images, self.names):
+            _log.warning(
+                "%s: no drawn image shows %s, which it cannot learn: want it nearer (parameter, unlearned), larger "
+                "images (training.image_size), or a smaller synthesis.minimum_area", self.title, ", ".join(unseen),
+            )  # fmt: skip
         drawn, photographs = len(images), self.photographs(results)
         if photographs is not None:
             images = LabelledImages.concatenate([images, photographs.to(self.device)])

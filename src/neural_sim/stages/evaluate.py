@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -10,10 +11,12 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.detector.metrics import TestScore, evaluate, of_document
+from neural_sim.detector.metrics import TestScore, evaluate, of_document, worthless
 from neural_sim.stages.detector import TrainedStage
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.target_sets import TargetSetsStage
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,9 @@ class Scores:
 
     ap: TestScore
     detections: list[dict[str, Tensor]]
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,4 +59,7 @@ class ScoresStage(Stage[Scores]):
 
     @override
     def unpack(self, stored: Mapping[str, Any]) -> Scores:
-        return Scores(of_document(stored["ap"]), stored["detections"])
+        scores = Scores(of_document(stored["ap"]), stored["detections"])
+        if (why := worthless(scores.ap, scores.detections)) is not None:
+            _log.warning("%s: %s", self.title, why)
+        return scores

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import ClassVar
@@ -15,9 +16,11 @@ from neural_sim.stages.field import FieldStage
 from neural_sim.stages.stage import UNKEYED, Results, Stage
 from neural_sim.stages.store import from_bytes, to_bytes
 from neural_sim.stages.views import Objects
-from neural_sim.synthesis.synthesizer import Synthesizer
+from neural_sim.synthesis.synthesizer import Synthesizer, unshown
 from neural_sim.target.base import Target
 from neural_sim.types import LabelledImages, PinholeCamera
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,14 @@ class TargetSetsStage(Stage[TargetSets]):
 
     @override
     def unpack(self, stored: Mapping[str, Mapping[str, Tensor]]) -> TargetSets:
-        return TargetSets(**{part: _unpacked(images) for part, images in stored.items()})
+        sets = TargetSets(**{part: _unpacked(images) for part, images in stored.items()})
+        unseen = unshown(sets.test, self.objects.names)
+        if unseen:
+            _log.warning(
+                "target: no test image shows %s: scores are of the other objects; want test images of it, or leave it "
+                "out of objects.names", ", ".join(unseen),
+            )  # fmt: skip
+        return sets
 
 
 def _packed(images: LabelledImages) -> dict[str, Tensor]:

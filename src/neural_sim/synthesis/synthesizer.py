@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -190,6 +191,12 @@ class Synthesizer:
 def _clear(front: Cover, like: Tensor) -> Float[Tensor, "n 1 h w"]:
     """How much of what is behind can be seen."""
     return (1.0 - front.opacity.to(like))[:, None]
+
+
+def unshown(images: LabelledImages, names: Sequence[str]) -> list[str]:
+    """Return the classes of which no image has a box."""
+    shown = set(images.labels[images.present].tolist())
+    return [name for label, name in enumerate(names) if label not in shown]
 
 
 def images_without_boxes(images: LabelledImages) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from torch import Tensor
 from typing_extensions import override
 
-from neural_sim.detector.metrics import evaluate
+from neural_sim.detector.metrics import evaluate, worthless
 from neural_sim.detector.saved import DOCUMENT, SavedDetector, detect
 from neural_sim.devices import device_of
 from neural_sim.documents import write_json
@@ -22,6 +23,8 @@ from neural_sim.report.predictions import draw, save_picture, scores_table
 from neural_sim.target.photographs import PhotoFiles
 from neural_sim.target.truth import Truth, without_pixels
 from neural_sim.tasks.context import Context, Task
+
+_log = logging.getLogger(__name__)
 
 
 @validated
@@ -57,7 +60,7 @@ class PredictTask(Task):
     @override
     def run(self, context: Context) -> None:
         folder, photos = context.folder, PhotoFiles(str(self.images), "predict.images")
-        saved = self._saved(folder).to(device_of(context.config["trainer"]["accelerator"]))
+        saved = self._saved(context).to(device_of(context.config["trainer"]["accelerator"]))
         truth = self._truth(saved, photos)
         category_ids = truth.category_ids if truth else {i: i + 1 for i in range(len(saved.class_names))}
         entries: list[dict[str, Any]] = []
@@ -90,13 +93,16 @@ class PredictTask(Task):
             document = {"images": len(scored), **dataclasses.asdict(ap)}
             write_json(folder / "scores.json", document, indent=None)
             print(scores_table(ap, len(scored)))
+            if (why := worthless(ap, [found for found, _ in scored])) is not None:
+                _log.warning("predict: the score: %s", why)
         print(f"{len(rows)} detections in {len(entries)} pictures\nresults: {folder}")
 
-    def _saved(self, folder: Path) -> SavedDetector:
+    def _saved(self, context: Context) -> SavedDetector:
+        folder, kind = context.folder, context.config["detector"]["_target_"]
         if self.model is None and not (folder / DOCUMENT).is_file():
             raise ValueError("predict.model: want a run's folder or its model.safetensors, got null")
         try:
-            return SavedDetector.load(folder if self.model is None else Path(self.model).expanduser())
+            return SavedDetector.load(folder if self.model is None else Path(self.model).expanduser(), kind)
         except ValueError as error:
             raise ValueError(f"predict.model: {error}") from error
 

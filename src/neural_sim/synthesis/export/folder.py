@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neural_sim.cameras import focal_lengths, principal_point
+from neural_sim.documents import parsed_json
 from neural_sim.synthesis.export.images import ExportImage, ShownObject
 from neural_sim.synthesis.export.masks import box_of, run_lengths
 from neural_sim.types import PinholeCamera
@@ -85,7 +86,7 @@ class ExportFolder:
                 )
             return
         try:
-            known = json.loads(path.read_text(encoding="utf-8"))["identity"]
+            known = parsed_json(path.read_text(encoding="utf-8"))["identity"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"export.folder: {path} is no manifest of an export ({error!r}); want another folder"
@@ -209,7 +210,7 @@ def line_of(record: Mapping[str, Any]) -> str:
 def _parsed(lines: list[str]) -> Iterator[dict[str, Any]]:
     for line in lines:
         try:
-            record = json.loads(line)
+            record = parsed_json(line)
         except ValueError:
             continue
         if isinstance(record, dict) and {"number", "file", "objects"} <= record.keys():
