@@ -1,3 +1,8 @@
 """Neural-Sim: learn which synthetic images to render, so that a detector trained on them does best on a target."""
 
-__version__ = "0.1.0"
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("neural-sim")
+except PackageNotFoundError:
+    __version__ = "not installed"

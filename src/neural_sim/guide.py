@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 
+import neural_sim
 from neural_sim.commandline import Layout
 
 
@@ -133,19 +133,12 @@ def spoken(words: Sequence[str]) -> list[str]:
 def answer(words: Sequence[str], layout: Layout) -> str | None:
     """Answer ``--version``, ``--help``, ``COMMAND --help`` and ``--help keys``; None for all else."""
     if "--version" in words:
-        return _version()
+        return f"neural-sim {neural_sim.__version__}"
     if not {"--help", "-h"} & set(words):
         return None
     if words[0] in VERBS:
         return _help_of(words[0], layout)
     return _all_keys(layout) if words[-1] == "keys" else _help(layout)
-
-
-def _version() -> str:
-    try:
-        return f"neural-sim {version('neural-sim')}"
-    except PackageNotFoundError:
-        return "neural-sim, not installed"
 
 
 def _help(layout: Layout) -> str:

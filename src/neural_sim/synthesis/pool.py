@@ -99,14 +99,14 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
     """Render at least ``per_bin`` maps of every bin of every factor and object, and return a scene that draws these.
 
     Args:
-        scene: of fields.
+        scene: of subjects that can be rendered.
         per_bin: maps of every bin; also of every anchor light, if ``lights``.
         generator: of what the bins do not say.
         lights: render each map under lights of random weights, Dirichlet with parameter 1/2, instead of refusing lights
             that move. Draws from this pool then follow psi in their bins, not in their light.
 
     Raises:
-        ValueError: for fewer than one, or a light that moves with psi.
+        ValueError: for fewer than one, a light that moves with psi, or a subject that there are only pictures of.
     """
     if per_bin < 1:
         raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
@@ -122,7 +122,7 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
     bins = every.repeat_interleave(per_cell, 0)
     named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
     subjects = []
-    for label, subject in enumerate(scene.fields):
+    for label, subject in enumerate(scene.rendered):
         # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
         noise = distribution.draw_noise(per_cell, generator, subject.dtype)
         noise = noise.select(torch.arange(per_cell).repeat(cells))

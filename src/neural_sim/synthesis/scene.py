@@ -42,8 +42,8 @@ class Scene:
     distribution: SceneDistribution
 
     def __post_init__(self) -> None:
-        rendered = [subject for subject in self.subjects if isinstance(subject, RenderedSubject)]
-        self.distribution.radii({subject.name: subject.radius for subject in rendered})
+        able = [subject for subject in self.subjects if isinstance(subject, RenderedSubject)]
+        self.distribution.radii({subject.name: subject.radius for subject in able})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,6 +63,15 @@ class Scene:
     def device(self) -> torch.device:
         """Device of the images."""
         return self.subjects[0].device
+
+    @property
+    def rendered(self) -> tuple[RenderedSubject, ...]:
+        """The subjects, all of which can be rendered from every pose.
+
+        Raises:
+            ValueError: for one that there are only pictures of.
+        """
+        return tuple(_able(subject) for subject in self.subjects)
 
     @property
     def fields(self) -> tuple[FieldSubject, ...]:
@@ -90,10 +99,7 @@ class Scene:
         Raises:
             ValueError: for an object that there are only pictures of.
         """
-        subject = self.subjects[label]
-        if not isinstance(subject, RenderedSubject):
-            raise ValueError(f"{subject.name}: cannot be rendered at given scene parameters")
-        return subject.render(self.camera, self.distribution, draw)
+        return _able(self.subjects[label]).render(self.camera, self.distribution, draw)
 
     def draw(
         self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
@@ -205,3 +211,9 @@ class Scene:
 
     def _nuisance(self, count: int, generator: torch.Generator, objects: int | None = None) -> Nuisance:
         return self.synthesizer.draw_nuisance(count, self.camera, generator, self.device, objects)
+
+
+def _able(subject: Subject) -> RenderedSubject:
+    if not isinstance(subject, RenderedSubject):
+        raise ValueError(f"{subject.name}: cannot be rendered at given scene parameters")
+    return subject

@@ -16,6 +16,7 @@ import torch
 from packaging.requirements import Requirement
 from typing_extensions import override
 
+import neural_sim
 from neural_sim.configuration import first_line
 from neural_sim.devices import device_of
 from neural_sim.documents import markdown_table, write_json
@@ -152,7 +153,7 @@ def packages() -> Iterator[Finding]:
         if not requirement.specifier.contains(version, prereleases=True):
             wrong.append(f"{requirement.name} {version}, want {requirement.specifier}")
         versions.append(f"{requirement.name} {version}")
-    ours = f"neural-sim {importlib.metadata.version('neural-sim')}, Python {platform.python_version()}"
+    ours = f"neural-sim {neural_sim.__version__}, Python {platform.python_version()}"
     advice = "pip install -r requirements.lock" if wrong else ""
     yield Finding(
         "bad" if wrong else "ok", "packages", "; ".join(wrong) or f"{ours}, {len(versions)} as wanted", advice
