@@ -12,7 +12,7 @@ from neural_sim.report.runs import LeftOut
 from neural_sim.studies.experiments import study as module
 from neural_sim.studies.experiments.layouts import LAYOUTS, Paper
 from neural_sim.studies.experiments.measured import Measured
-from neural_sim.studies.experiments.study import Experiments, Row
+from neural_sim.studies.experiments.study import Experiments, Row, _to_first_table
 
 TABLE = {
     "title": "Table 1",
@@ -106,6 +106,7 @@ def test_the_documentation_s_page_is_short_and_its_json_has_the_tables(page, tmp
     assert "- **The paper**: over LTS 34 (Sec. 4.2, l. 845)\n" in gaps
     assert "- **Ours, commit 1234567, unknown**:\n    - gap, can: NSO 75.2" in gaps
     assert "- **Ours**: not yet measured\n" in large and "A table of its own." in own
+    assert _to_first_table("a\n\nb\n\n| c |\n|---|\n\nd\n\n| e |") == "a\n\nb\n\n| c |\n|---|"
     assert "|" not in gaps and "\n| can | 30 | N/A |" in large
     kept = json.loads((tmp_path / "page.json").read_text())["rows"]["gaps"]
     assert kept["entries"][0]["cells"]["object"] == "can" and kept["costs"].startswith("| cost |")

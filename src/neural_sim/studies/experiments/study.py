@@ -31,7 +31,7 @@ from neural_sim.tasks.context import Context, Task
 NOT_YET = "not yet measured"
 BY_FIGURES = "figures in the run's folder"
 IN_JSON = (
-    "Tables of every object and setting next to the paper's, and what the methods cost, are on the site "
+    "All tables, of every object and setting next to the paper's, and what the methods cost, are on the site "
     "(`nox -s docs`), from `experiments.json`, and in the folder of an `experiments_table` run."
 )
 COMMAND = "python -m src.main +experiment=experiments_table experiments.page=docs/experiments.md"
@@ -227,7 +227,7 @@ class Experiments(Task):
             points = [_point(title, lines) for title, lines in said if lines]
             parts += [f"## {row.title}", f"    {row.command_line}", "\n".join(points)]
             if own and row.layout is None:
-                parts.append(own.below)
+                parts.append(_to_first_table(own.below))
             if row.table and not (own and row.layout):
                 parts.append(self._tables[row.table].markdown())
         return "\n\n".join(parts) + "\n"
@@ -275,3 +275,10 @@ def _point(title: str, lines: Sequence[str]) -> str:
     if len(lines) == 1:
         return f"- **{title}**: {lines[0]}"
     return "\n".join([f"- **{title}**:", *(f"    - {line}" for line in lines)])
+
+
+def _to_first_table(text: str) -> str:
+    """Return the paragraphs of a document up to its first table, all where it has none."""
+    parts = text.split("\n\n")
+    first = next((number for number, part in enumerate(parts) if part.startswith("|")), len(parts))
+    return "\n\n".join(parts[: first + 1])
