@@ -1,10 +1,10 @@
-"""Fill pages when the site is built: all keys from ``conf/``, all tables that the pages shorten; a hook of mkdocs."""
+"""Fill pages when the site is built: all keys and commands, all tables that the pages shorten; a hook of mkdocs."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ sys.path.insert(0, str(ROOT / "src"))
 
 from neural_sim.commandline import Key, Layout  # noqa: E402
 from neural_sim.documents import markdown_table  # noqa: E402
+from neural_sim.guide import VERBS  # noqa: E402
 
-BEGIN, END = "<!-- keys -->", "<!-- end of keys -->"
 OTHERS = ("experiment", "hydra", "variant")
 """Groups whose files set keys of others, and so have none of their own."""
 
@@ -25,8 +25,19 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return markdown + experiments()
     if page.file.src_uri == "numerics.md":
         return markdown + numerics()
-    before, begin, rest = markdown.partition(BEGIN)
-    return before + tables() + rest.partition(END)[2] if begin else markdown
+    return _filled(_filled(markdown, "keys", tables), "commands", commands)
+
+
+def _filled(markdown: str, name: str, text: Callable[[], str]) -> str:
+    before, begin, rest = markdown.partition(f"<!-- {name} -->")
+    return before + text() + rest.partition(f"<!-- end of {name} -->")[2] if begin else markdown
+
+
+def commands() -> str:
+    """Return the table of commands."""
+    rows = [[f"`{name}`", verb.says, f"`{' '.join(verb.words)}`" if verb.words else "the default"]
+            for name, verb in VERBS.items()]  # fmt: skip
+    return markdown_table(["command", "what it does", "it stands for"], rows)
 
 
 def tables() -> str:

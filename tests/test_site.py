@@ -18,3 +18,5 @@ def test_the_documentation_builds_and_has_all_pages(tmp_path):
     assert pages - {"index"} <= built and (tmp_path / "index.html").is_file()
     keys = (tmp_path / "reference" / "index.html").read_text(encoding="utf-8")
     assert "outer.trust.level" in keys and "significance" in keys
+    assert "class" in (example := (tmp_path / "extending" / "index.html").read_text(encoding="utf-8"))
+    assert "Cells" in example and "--8&lt;--" not in example

@@ -20,7 +20,7 @@ INTRODUCTION = (
     "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}. *Optimal*: no other setting "
     "of the table has a smaller error in less time. MB is the most that tensors took at one time."
 )
-MACHINE = "{clock} of {processor} with torch {torch} and {threads} thread(s), load {load:.1f}."
+MACHINE = "{clock} of {processor}, torch {torch}, {threads} thread(s), load {load:.1f}."
 CLOCKS = {"cpu_seconds": "Processor seconds", "seconds": "Seconds on the wall"}
 Row = Mapping[str, Any]
 
@@ -104,7 +104,7 @@ def brief(held: Mapping[str, Any], family: str) -> str:
 
 
 def _short(row: Row) -> str:
-    detail = f" ({row['detail']})" if row["detail"] else ""
+    detail = f" ({row['detail']})" if row["detail"] and row["default"] else ""
     return f"**{row['setting']}**: {_shown(row['error'])} in {_shown(row['seconds'])} s{detail}"
 
 
