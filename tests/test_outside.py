@@ -67,9 +67,8 @@ def test_its_settings_are_checked_like_all_others(override, message):
 
 def test_the_pages_example_is_the_detector_that_is_run_here():
     page = (OUTSIDE.parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
-    for kind, path in (("python", "my_detector.py"), ("yaml", "conf/detector/my_cells.yaml")):
-        (shown,) = re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)
-        assert shown == f'--8<-- "tests/outside/{path}"\n' and (OUTSIDE / path).is_file()
+    for path in ("my_detector.py", "conf/detector/my_cells.yaml"):  # the site's build takes the files in
+        assert f'\n--8<-- "tests/outside/{path}"\n' in page and (OUTSIDE / path).is_file()
     assert len((OUTSIDE / "my_detector.py").read_text(encoding="utf-8").splitlines()) <= 60
 
 
