@@ -1,7 +1,10 @@
 """Standard JSON and Markdown tables."""
 
+import errno
 import json
 import math
+import os
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +27,19 @@ def test_what_is_no_json_is_refused_with_its_path(tmp_path):
             read_json(tmp_path / "broken.json")
     with pytest.raises(ValueError, match=r"none\.json: not readable as JSON \("):
         read_json(tmp_path / "none.json")
+
+
+def test_a_disk_that_is_full_leaves_the_earlier_file_and_names_it(tmp_path, monkeypatch):
+    path = write_json(tmp_path / "file.json", {"a": 1})
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write_json(path, {"a": 2})
+    assert caught.value.filename == str(path) and caught.value.errno == errno.ENOSPC
+    assert read_json(path) == {"a": 1} and [each.name for each in tmp_path.iterdir()] == ["file.json"]
 
 
 def test_what_json_cannot_hold_is_refused(tmp_path):

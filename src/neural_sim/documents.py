@@ -1,12 +1,16 @@
-"""JSON by the standard, read and written, and Markdown tables and sections."""
+"""Files that are whole or not there, JSON by the standard, read and written, and Markdown tables and sections."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+PART = ".part"
+"""Suffix of a file that is being written."""
 
 
 def finite(tree: Any) -> Any:
@@ -16,6 +20,26 @@ def finite(tree: Any) -> Any:
     if isinstance(tree, (list, tuple)):
         return [finite(value) for value in tree]
     return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def write_whole(path: Path, content: bytes | str) -> Path:
+    """Write a file, with its folder, at once: what is there stays until the new one is whole. Text is in UTF-8.
+
+    Raises:
+        OSError: what the system says, with the path (a full disk has none of its own).
+    """
+    data = content.encode() if isinstance(content, str) else content
+    part = path.with_name(f".{path.name}{PART}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(data)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror or str(error), str(path)) from error
+    return path
 
 
 def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
@@ -31,10 +55,9 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
 
     Raises:
         TypeError: for a value that JSON cannot hold.
+        OSError: as :func:`write_whole`.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(finite(document), indent=indent, allow_nan=False), encoding="utf-8")
-    return path
+    return write_whole(path, json.dumps(finite(document), indent=indent, allow_nan=False))
 
 
 def parsed_json(text: str | bytes) -> Any:
@@ -98,12 +121,11 @@ def replace_section(path: Path, name: str, markdown: str) -> None:
     counts = text.count(begin), text.count(end)
     if counts == (0, 0):
         gap = "" if not text else "\n" if text.endswith("\n") else "\n\n"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + gap + block)
+        write_whole(path, text + gap + block)
         return
     first, last = text.find(begin), text.find(end)
     if counts != (1, 1) or last < first:
         raise ValueError(
             f"{path}: section {name!r} wants one begin and one end marker in order, got {counts}"
         )
-    path.write_text(text[:first] + block + text[last + len(end) :].removeprefix("\n"))
+    write_whole(path, text[:first] + block + text[last + len(end) :].removeprefix("\n"))

@@ -57,6 +57,58 @@ def test_a_place_where_no_file_can_be_is_refused_at_once(tmp_path):
         raise AssertionError("was opened")
 
 
+def test_an_older_database_is_upgraded_after_a_copy(uri, tmp_path, caplog):
+    from alembic import command
+    from mlflow.store.db.utils import _get_alembic_config
+
+    with opened(uri) as run:
+        run.log({"a": 1.0})
+    file = tmp_path / "mlflow.db"
+    with tracking.quiet():
+        command.downgrade(_get_alembic_config(uri), "-1")
+    with sqlite3.connect(file) as connection:
+        (before,) = connection.execute("select version_num from alembic_version").fetchone()
+    with caplog.at_level(logging.WARNING), opened(uri) as run:
+        run.log({"a": 2.0})
+    copy = tmp_path / f"mlflow.db.{before}.copy"
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert f"{file} is of an older version: it is copied to {copy.name} and upgraded" in line
+    with sqlite3.connect(copy) as connection:
+        assert connection.execute("select version_num from alembic_version").fetchone() == (before,)
+        assert connection.execute("select count(*) from runs").fetchone() == (1,)
+    assert len(tracking.logged_runs(uri, "gap")) == 2
+
+
+def test_a_database_that_another_program_holds_is_not_called_damaged(uri, tmp_path, monkeypatch):
+    monkeypatch.setattr("neural_sim.report.database._PATIENCE", 0.1)
+    with opened(uri):
+        pass
+    with sqlite3.connect(tmp_path / "mlflow.db") as connection:
+        connection.execute("begin exclusive")
+        with (
+            pytest.raises(
+                ValueError, match=r"mlflow\.db cannot be used \(database is locked\); move it away"
+            ),
+            opened(uri),
+        ):
+            raise AssertionError("was opened")
+
+
+def test_a_disk_that_fills_while_the_configuration_is_written_is_refused_in_one_line(uri, monkeypatch):
+    from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+
+    def full(*_args, **_kwargs):
+        raise MlflowException("(sqlite3.OperationalError) database or disk is full")
+
+    monkeypatch.setattr(MlflowClient, "log_batch", full)
+    with (
+        pytest.raises(ValueError, match=r"^paths\.mlflow: .* cannot be written to .*disk is full\)$"),
+        tracking.opened(uri, "gap", "run", {}, {"seed": 0}),
+    ):
+        raise AssertionError("was opened")
+
+
 def test_a_database_of_other_tables_is_refused(uri, tmp_path):
     with sqlite3.connect(tmp_path / "mlflow.db") as connection:
         connection.execute("create table alembic_version (version_num varchar(32))")

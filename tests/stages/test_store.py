@@ -7,6 +7,8 @@ import multiprocessing
 import os
 import signal
 import stat
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -243,6 +245,30 @@ def test_a_result_that_cannot_be_written_leaves_earlier_ones_and_the_checkpoint(
         "a.json", "a.checkpoint", "b.pt", "b.json",
     }  # fmt: skip
     assert store.state("field", "a")["at"] == 1 and fetch(store, lambda: 2, "b").value == 1
+
+
+LIMITED = """
+import resource, signal, sys, torch
+from pathlib import Path
+from neural_sim.stages.store import Store
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    Store(Path(sys.argv[1])).fetch("field", "a", {}, lambda: {"x": torch.zeros(250_000)})
+except ValueError as error:
+    print(error)
+"""
+
+
+def test_a_system_that_lets_no_more_be_written_is_told_as_such(tmp_path):
+    """Not by a stub: torch hides what the system said in an error of its own."""
+    told = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    assert (
+        told.stdout == f"paths.store: {tmp_path}/field/a.pt cannot be written: File too large\n" + told.stderr
+    )
+    assert not list(tmp_path.rglob("*.pt*"))
 
 
 def full_disk(*_, **__):

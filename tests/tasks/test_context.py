@@ -1,5 +1,6 @@
 """What a task publishes: files, and one finished run in MLflow."""
 
+import errno
 import json
 import shutil
 import time
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from neural_sim.configuration import UserError
 from neural_sim.report.figures import Figure
 from neural_sim.report.tracking import connect
 from neural_sim.tasks.context import Context
@@ -64,3 +66,24 @@ def test_a_task_without_a_text_leaves_the_document(context, capsys):
     context.publish("mine", [])
     assert sorted(path.name for path in context.folder.iterdir()) == ["mine.json"]
     assert capsys.readouterr().out.startswith("results: ")
+
+
+def test_a_tracking_store_that_fails_costs_a_line(context, capsys, caplog):
+    (context.folder.parent / "mlflow.db").write_text("no database")
+    assert context.publish("mine", [1], "# Mine") is None
+    assert json.loads((context.folder / "mine.json").read_text()) == [1]
+    assert capsys.readouterr().out == f"# Mine\nresults: {context.folder}\n"
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert "mlflow.db is no SQLite database" in line and line.endswith("MLflow has no run of this")
+
+
+def test_a_full_disk_is_told_with_the_folder_that_was_written_to(context):
+    with (
+        pytest.raises(
+            UserError, match=rf"^mine: writing to {context.folder}: No space left on device; .* is kept$"
+        ),
+        context.running("mine"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(FileNotFoundError), context.running("mine"):  # says itself which file it is
+        (context.folder / "none").read_text()

@@ -12,7 +12,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import os
 import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +29,7 @@ from torch import Tensor
 from neural_sim.detector.protocol import Detector, Parameters
 from neural_sim.detector.settings import SAVED, Backbone
 from neural_sim.devices import placed
-from neural_sim.documents import read_json
+from neural_sim.documents import read_json, write_whole
 from neural_sim.target.photographs import letterbox
 from neural_sim.types import PinholeCamera
 
@@ -82,14 +81,13 @@ class SavedDetector:
             "detector": described(self.make),
             "camera": None if self.camera is None else dataclasses.asdict(self.camera),
         }  # fmt: skip
-        folder.mkdir(parents=True, exist_ok=True)
         weights = save({name: value.detach().cpu().contiguous() for name, value in self.params.items()})
         document["weights"] = {"file": WEIGHTS, "sha256": hashlib.sha256(weights).hexdigest()}
         text = json.dumps(document, indent=1, allow_nan=False)
         for name, content in ((WEIGHTS, weights), (DOCUMENT, text.encode())):
-            draft = folder / f".{name}.part"
-            draft.write_bytes(content)  # by Python, so that it has the permissions that new files have
-            os.replace(draft, folder / name)
+            write_whole(
+                folder / name, content
+            )  # by Python, so that it has the permissions that new files have
         return folder / WEIGHTS
 
     @staticmethod

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any
+
+_log = logging.getLogger(__name__)
 
 _SQLITE = b"SQLite format 3\0"
 """How a database's file begins."""
@@ -50,5 +53,60 @@ def check_database(database: Path) -> None:
         raise ValueError(
             f"paths.mlflow: {database} cannot be used ({error.strerror or error}); {todo}"
         ) from error
+    except sqlite3.OperationalError as error:  # as where another program has it locked, or the disk fails
+        raise ValueError(f"paths.mlflow: {database} cannot be used ({error}); {todo}") from error
     except sqlite3.DatabaseError as error:
         raise ValueError(f"paths.mlflow: {database} is damaged ({error}); {todo}") from error
+
+
+def upgrade(database: Path) -> None:
+    """Bring a database of an older MLflow to this one's schema, after a copy of it and a line in the log.
+
+    MLflow itself either does so without a copy or refuses the database. One that this version does not know stays as
+    it is.
+    """
+    before = _schema_of(database)
+    if before is None:
+        return
+    from alembic.script import ScriptDirectory
+    from mlflow.store.db import utils
+    from sqlalchemy import create_engine
+
+    uri = f"sqlite:///{database}"
+    scripts = ScriptDirectory.from_config(utils._get_alembic_config(uri))
+    if before == scripts.get_current_head() or all(
+        each.revision != before for each in scripts.walk_revisions()
+    ):
+        return
+    copy = database.with_name(f"{database.name}.{before}.copy")
+    _log.warning("mlflow: %s is of an older version: it is copied to %s and upgraded", database, copy.name)
+    _copy(database, copy)
+    engine = create_engine(uri)
+    try:
+        utils._upgrade_db(engine)
+    finally:
+        engine.dispose()
+
+
+def _schema_of(database: Path) -> str | None:
+    """Return the version of a database's tables; None where it has none yet."""
+    if not database.exists() or not database.stat().st_size:
+        return None
+    with closing(sqlite3.connect(database, timeout=_PATIENCE)) as connection:
+        named = "select count(*) from sqlite_master where name = 'alembic_version'"
+        if not connection.execute(named).fetchone()[0]:
+            return None
+        row = connection.execute("select version_num from alembic_version").fetchone()
+    return None if row is None else row[0]
+
+
+def _copy(database: Path, copy: Path) -> None:
+    """Copy a database, whole although others may write to it."""
+    draft = copy.with_name(f".{copy.name}.part")
+    draft.unlink(missing_ok=True)
+    with (
+        closing(sqlite3.connect(database, timeout=_PATIENCE)) as source,
+        closing(sqlite3.connect(draft)) as target,
+    ):
+        source.backup(target)
+    draft.replace(copy)

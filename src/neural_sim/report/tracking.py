@@ -16,7 +16,7 @@ from typing import Any
 
 from neural_sim.configuration import first_line
 from neural_sim.interruption import Interrupted, has_ended, last_act, this_process
-from neural_sim.report.database import check_database, database_of, guard
+from neural_sim.report.database import check_database, database_of, guard, upgrade
 from neural_sim.report.provenance import commit
 
 _log = logging.getLogger(__name__)
@@ -201,7 +201,10 @@ def opened(
     run = Run(client, uri, created.info, clock)
     try:
         with last_act(lambda error: run.close("KILLED", error)):
-            run.parameters(parameters)
+            try:
+                run.parameters(parameters)
+            except (MlflowException, SQLAlchemyError) as error:
+                raise ValueError(f"paths.mlflow: {uri} cannot be written to ({first_line(error)})") from error
             yield run
     except BaseException as error:
         run.close("KILLED" if _interrupted(error) else "FAILED", error)
@@ -273,10 +276,13 @@ def connect(uri: str) -> Any:
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
 
-    if (database := database_of(uri)) is not None:
+    database = database_of(uri)
+    if database is not None:
         check_database(database)
     try:
         with guard(uri):
+            if database is not None:
+                upgrade(database)
             client = MlflowClient(tracking_uri=uri)
             client.search_experiments(max_results=1)  # creates the tables of a new database
     except MlflowException:

@@ -227,7 +227,12 @@ def _checked_header(file: BinaryIO) -> int:
 def _save(content: Mapping[str, Any], file: BinaryIO) -> None:
     begin = len(_header("", 0))
     file.seek(begin)
-    torch.save(content, file)
+    try:
+        torch.save(content, file)
+    except RuntimeError as error:  # of torch, when it closes an archive that the system did not let it write
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from error
+        raise
     size = file.tell() - begin
     file.seek(begin)
     sha256 = _sha256(file)

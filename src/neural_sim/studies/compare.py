@@ -13,7 +13,7 @@ from annotated_types import Ge, MinLen
 from typing_extensions import override
 
 from neural_sim.detector.metrics import IN_FULL
-from neural_sim.documents import markdown_table
+from neural_sim.documents import markdown_table, write_whole
 from neural_sim.ranges import validated
 from neural_sim.report import figures, tracking
 from neural_sim.report.comparison import ONLY_AT_END, Clock, Comparison, biased_ap, compare
@@ -344,5 +344,4 @@ def write_page(tables: Sequence[Table], left_out: Sequence[LeftOut], folder: Pat
     path = folder / "report.html"
     title = "Comparison: " + ", ".join(table.group.label for table in tables)
     text = render.page("comparison.html", title=title, sections=tables, left_out=by_reason(left_out))
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(path, text)

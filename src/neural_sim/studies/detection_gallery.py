@@ -94,7 +94,7 @@ class DetectionGallery(Task):
 
     def publish(
         self, context: Context, test: LabelledImages, found: Mapping[str, Found], class_names: Sequence[str]
-    ) -> Run:
+    ) -> Run | None:
         """Write detection_gallery.json, detection_gallery.md and the figure, and log counts and AP to MLflow."""
         rows = torch.linspace(0, len(test) - 1, min(self.count, len(test))).round().long()
         verdicts = {

@@ -164,7 +164,7 @@ def bin_frequencies(factor: BinnedFactor, psi: Float[Tensor, "k"], draws: int, s
     return (torch.bincount(where, minlength=factor.bins) / draws).tolist()
 
 
-def publish(context: Context, rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> Run:
+def publish(context: Context, rows: Sequence[AtTemperature], truths: Sequence[Truth]) -> Run | None:
     """Write temperatures.json, temperatures.md and the figure, and log the curves over the temperatures to MLflow."""
     document = {
         "rows": [dataclasses.asdict(row) for row in rows],

@@ -118,7 +118,7 @@ def interpolate(
     return InterpolatedViews(torch.stack(images).clamp(0.0, 1.0).cpu(), change)
 
 
-def publish(context: Context, views: Mapping[str, InterpolatedViews], title: str) -> Run:
+def publish(context: Context, views: Mapping[str, InterpolatedViews], title: str) -> Run | None:
     """Write interpolation.json, interpolation.md and the figure, and log the changes of opacity to MLflow."""
     changes = {name: own.opacity_change for name, own in views.items()}
     drawn = {"interpolation": interpolation_figure(views, title)}

@@ -194,7 +194,7 @@ def _apart(values: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> float:
     return float((one - other).norm() / other.norm())
 
 
-def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run:
+def publish(context: Context, rows: Sequence[PatchCost], setting: str) -> Run | None:
     """Write patch_memory.json and patch_memory.md, and log every cost to MLflow; ``setting`` is the table's heading."""
     document = {"setting": setting, "rows": [dataclasses.asdict(row) for row in rows]}
     metrics = {

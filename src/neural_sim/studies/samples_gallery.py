@@ -108,7 +108,7 @@ def _distance(graph: Graph, psi: Psi, label: int) -> dict[str, float] | None:
     return {name: float(total_variation(found[name][label], wanted[name][label])) for name in wanted}
 
 
-def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run:
+def publish(context: Context, samples: Sequence[Samples], columns: int) -> Run | None:
     """Write samples_gallery.json, samples_gallery.md and a figure for each object, and log the distances to MLflow."""
     document = {
         each.object: {

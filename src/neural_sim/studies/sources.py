@@ -124,7 +124,7 @@ def publish(
     classes: Sequence[str],
     heading: str,
     more: More | None = None,
-) -> Run:
+) -> Run | None:
     """Write the table, the document and the figures, and log every source's AP to MLflow.
 
     Args:

@@ -15,7 +15,8 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from neural_sim.documents import write_json
+from neural_sim.configuration import UserError
+from neural_sim.documents import write_json, write_whole
 from neural_sim.outer.records import IterationRecord
 from neural_sim.report import figures as drawing
 from neural_sim.report.figures import Figure
@@ -120,7 +121,14 @@ class Context:
         """Charge the seconds of a task, without those of the phases that it reads, and log those of new phases."""
         self.begun = time.time()
         with self.account.charged(name):
-            yield
+            try:
+                yield
+            except OSError as error:
+                if error.filename is not None:
+                    raise
+                # A disk that is full, or gone, is told without a path.
+                why, kept = error.strerror or error, "what was finished before is kept"
+                raise UserError(f"{name}: writing to {self.folder}: {why}; {kept}") from error
         for phase, spent in self.account.seconds.items():
             if phase not in self.logged:
                 _log.info("%-11s %8.1f s", phase, spent)
@@ -149,8 +157,10 @@ class Context:
         metrics: Mapping[str, float | Sequence[float] | None] | None = None,
         tags: Mapping[str, str] | None = None,
         title: str | None = None,
-    ) -> Run:
+    ) -> Run | None:
         """Write what a task found to the folder and, as a finished run, to MLflow; print the text and where it all is.
+
+        An MLflow store that cannot be written to costs a warning, and None is returned.
 
         The run belongs to the experiment that the command's ``name`` names, begins when the task began, and has
         the whole folder as its artifacts, so also what the task wrote there before. Its parameters are the whole
@@ -167,7 +177,7 @@ class Context:
         """
         write_json(self.folder / f"{name}.json", document)
         if text is not None:
-            (self.folder / f"{name}.md").write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+            write_whole(self.folder / f"{name}.md", text.rstrip("\n") + "\n")
             print(text.rstrip("\n"))
         for key, figure in (figures or {}).items():
             drawing.save(figure, self.folder / "figures" / f"{key}.png")
@@ -178,9 +188,13 @@ class Context:
         whole = "experiment" in self.__dict__  # built, so that the task depends on all of it
         parameters = self.config if whole else {name: self.config.get(name, {}), "seed": self.config["seed"]}
         tags, title = {"seed": seed, **(tags or {})}, title or f"seed {seed}"
-        with opened(self.uri, self.config["name"], title, tags, flatten(parameters), self.begun) as run:
-            run.log(numbers)
-            run.log_series(series)
-            run.log_files(self.folder)
-        print(f"results: {self.folder}\n{run.where}")
+        run = None
+        try:
+            with opened(self.uri, self.config["name"], title, tags, flatten(parameters), self.begun) as run:
+                run.log(numbers)
+                run.log_series(series)
+                run.log_files(self.folder)
+        except ValueError as error:  # the results are in the folder
+            _log.warning("%s; MLflow has no run of this", error)
+        print(f"results: {self.folder}" + (f"\n{run.where}" if run else ""))
         return run

@@ -11,7 +11,7 @@ from annotated_types import Ge
 from typing_extensions import override
 
 from neural_sim.detector.protocol import Score
-from neural_sim.documents import markdown_table, write_json
+from neural_sim.documents import markdown_table, write_json, write_whole
 from neural_sim.ranges import validated
 from neural_sim.report.bootstrap import Outcomes, match
 from neural_sim.report.intervals import points
@@ -69,7 +69,7 @@ class RepeatTask(Task):
         biased = context.experiment.imaging.distribution.biased
         found = [scores.of_classes(group) for group in groups(names, biased, scores.shown)]
         text = f"{sentence(found[0], score)}\n\n{table(found, score)}\n"
-        (context.folder / "repeat.md").write_text(text, encoding="utf-8")
+        write_whole(context.folder / "repeat.md", text)
         document = {"trainings": self.trainings, "score": score, "groups": [group_document(g) for g in found]}
         write_json(context.folder / "repeat.json", document)
         print(f"{text}results: {context.folder}")

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from neural_sim.documents import write_whole
 from neural_sim.field.quality import POOR, Quality
 from neural_sim.parameter.coverage import Coverage
 from neural_sim.report.page import render
@@ -80,7 +81,5 @@ def picture(image: UInt8[Tensor, "h w c"]) -> str:
 def write_objects_page(experiment: str, objects: Sequence[ShownObject], folder: Path) -> Path:
     """Write objects.html."""
     path = folder / FILE
-    folder.mkdir(parents=True, exist_ok=True)
     text = render.page("objects.html", title=f"{experiment}: objects", objects=objects, least=POOR)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(path, text)

@@ -10,6 +10,7 @@ import torch
 
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.protocol import Score
+from neural_sim.documents import write_whole
 from neural_sim.outer.preflight import ExpectedGains, PhotographGain, equivalent
 from neural_sim.report.page import pictures, render
 from neural_sim.report.page.run_page import shown_chart
@@ -162,5 +163,4 @@ def write_preflight_page(
         shown=[(shown_chart(one), one) for one in report.shown],
         bins=by_object(report.bins), weak=weakest(report.bins), promising=report.promising,
     )  # fmt: skip
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(path, text)

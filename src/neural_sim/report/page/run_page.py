@@ -14,6 +14,7 @@ from torch import Tensor
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.detector.metrics import mean_of
 from neural_sim.detector.protocol import Score
+from neural_sim.documents import write_whole
 from neural_sim.outer.certificate import untrusted
 from neural_sim.report import figures
 from neural_sim.report.bootstrap import match
@@ -114,8 +115,7 @@ def write_run_page(results: RunResults, shown: Shown, commands: Mapping[str, str
         files=_files(folder),
     )
     path = folder / FILE
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(path, text)
 
 
 def _gains(results: RunResults, aim: Sequence[str], shown: Shown) -> dict[str, Gain]:

@@ -11,7 +11,7 @@ from annotated_types import Ge
 from typing_extensions import override
 
 from neural_sim.configuration import conf_directory
-from neural_sim.documents import markdown_table, write_json
+from neural_sim.documents import markdown_table, write_json, write_whole
 from neural_sim.ranges import validated
 from neural_sim.report import figures
 from neural_sim.report.costs import costs_table
@@ -165,7 +165,7 @@ class Experiments(Task):
                 for name, (measured, _, _) in found.items() if measured is not None}  # fmt: skip
         lost = list(dict.fromkeys(run for _, _, left in found.values() for run in left))
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "left_out.md").write_text("\n".join(left_out_table(lost)) + "\n", encoding="utf-8")
+        write_whole(folder / "left_out.md", "\n".join(left_out_table(lost)) + "\n")
         data = {name: {"command": row.command_line, "ours": made[name].summary if name in made else None}
                 for name, row in asked.items()}  # fmt: skip
         write_json(folder / "experiments.json", {"rows": data, "left_out": [asdict(run) for run in lost]})
@@ -175,8 +175,8 @@ class Experiments(Task):
             made = {name: own for name, own in {**kept, **made}.items() if name in rows}
             text = self._page(rows, made, budget)
             write_measured(document_of(self.page), budget, made)
-            Path(self.page).write_text(self._brief(rows, made, budget), encoding="utf-8")
-        (folder / "experiments.md").write_text(text, encoding="utf-8")
+            write_whole(Path(self.page), self._brief(rows, made, budget))
+        write_whole(folder / "experiments.md", text)
         return text
 
     def _found(

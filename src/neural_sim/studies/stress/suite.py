@@ -14,7 +14,7 @@ from typing import Annotated, Literal, get_args
 from annotated_types import MinLen
 from tqdm import tqdm
 
-from neural_sim.documents import markdown_table
+from neural_sim.documents import markdown_table, write_whole
 from neural_sim.ranges import validated
 from neural_sim.studies.stress.cases import CASES, Check, Checks, Scope
 from neural_sim.tasks.context import Context, Task, TaskFailure
@@ -39,7 +39,7 @@ class Stress(Task):
             TaskFailure: a check failed, when all is written.
         """
         checks = self.run_all(context.config["seed"], context.config["progress"])
-        (context.folder / "stress.md").write_text(markdown(checks), encoding="utf-8")
+        write_whole(context.folder / "stress.md", markdown(checks))
         print(table(checks))
         context.publish("stress", [check.record() for check in checks], metrics=metrics(checks))
         failed = failures(checks)

@@ -252,7 +252,7 @@ def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
     write_json(file, whole)
 
 
-def publish(context: Context, series: Sequence[Series], held: Mapping[str, Any]) -> Run:
+def publish(context: Context, series: Sequence[Series], held: Mapping[str, Any]) -> Run | None:
     """Write work_precision.json, work_precision.md and a figure a series, and log the defaults to MLflow."""
     metrics = {}
     for each in series:

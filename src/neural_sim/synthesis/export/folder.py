@@ -11,16 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neural_sim import documents
 from neural_sim.cameras import focal_lengths, principal_point
-from neural_sim.documents import parsed_json
+from neural_sim.documents import PART, parsed_json
 from neural_sim.synthesis.export.images import ExportImage, ShownObject
 from neural_sim.synthesis.export.masks import box_of, run_lengths
 from neural_sim.types import PinholeCamera
 
 MANIFEST = "manifest.json"
 RECORDS = "records.jsonl"
-PART = ".part"
-"""Suffix of a file that is being written."""
 LONGEST = 60
 """Characters of a value in a message."""
 
@@ -223,15 +222,8 @@ def write_whole(path: Path, content: bytes | str) -> None:
     Raises:
         ValueError: the system does not let it be written, with the file and the reason.
     """
-    data = content.encode() if isinstance(content, str) else content
-    part = path.with_name(f".{path.name}{PART}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_bytes(data)
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        documents.write_whole(path, content)
     except OSError as error:
         raise ValueError(f"export.folder: {path} cannot be written: {error.strerror or error}") from error
 
