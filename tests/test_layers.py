@@ -7,10 +7,10 @@ import neural_sim
 
 PACKAGE = Path(neural_sim.__file__).parent
 ORDER = (
-    "types", "alpha", "checkpoint", "digests", "documents", "extras", "interruption", "randomness", "configuration",
-    "commandline", "guide", "ranges", "cameras", "devices", "pictures", "masks", "objects", "field", "renderer",
-    "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "report", "stages",
-    "tasks", "studies", "main",
+    "types", "alpha", "checkpoint", "digests", "documents", "extras", "interruption", "processes", "randomness",
+    "configuration", "commandline", "guide", "ranges", "cameras", "devices", "pictures", "masks", "objects", "field",
+    "renderer", "parameter", "synthesis", "target", "detector", "solver", "gradient", "baseline", "outer", "report",
+    "stages", "tasks", "studies", "main",
 )  # fmt: skip
 TORCH_ONLY = ("types", "cameras", "solver")
 

@@ -38,7 +38,7 @@ from neural_sim.configuration import (
 )
 from neural_sim.guide import answer, spoken
 from neural_sim.interruption import interruptible
-from neural_sim.ranges import NonNegativeInt, PositiveFraction, check
+from neural_sim.ranges import NonNegativeInt, PositiveFraction, PositiveInt, check
 
 if TYPE_CHECKING:
     from neural_sim.stages.experiment import Experiment
@@ -68,6 +68,7 @@ _TOP = {
     "score_at": list[PositiveFraction],
     "progress": bool,
     "resume": bool,
+    "workers": PositiveInt,
     "trainer": TypedDict("Trainer", {"accelerator": Literal["cpu", "gpu"]}),
 }
 
@@ -96,6 +97,7 @@ def _build(plain: dict[str, Any]) -> Experiment:
         accelerator=plain["trainer"]["accelerator"],
         progress=plain["progress"],
         resume=plain["resume"],
+        workers=plain["workers"],
         score_at=tuple(plain["score_at"]),
         task=plain["task"],
     )

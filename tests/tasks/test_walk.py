@@ -73,6 +73,16 @@ def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distr
     assert returned == val and 0.0 < val < 1.0 and test != val
 
 
+def test_two_processes_make_the_same_bit_for_bit(folder, returned, tmp_path, monkeypatch):
+    shutil.copytree(folder / "store" / "views", tmp_path / "store" / "views")
+    monkeypatch.setattr("neural_sim.stages.field.FieldStage.make", lambda *_: pytest.fail("not by this process"))
+    one, (two, _) = _context(folder)[0], _context(tmp_path, "workers=2")
+    fields = zip(one.graph.fields, two.together(two.graph.fields), strict=True)
+    for alone, together in [(one.results(a).field, two.results(b).field) for a, b in fields]:
+        assert torch.equal(alone.table, together.table)
+    assert not two.account.left_out
+
+
 def test_another_test_set_does_not_change_it(folder, returned):
     overrides = ["target.test_per_object=3", "target.test_per_biased_object=9"]
     (context, _), (other, steps) = _context(folder), _context(folder, *overrides)

@@ -10,6 +10,7 @@ from typing import Any
 
 from neural_sim.baseline.base import Fixed, HypergradientLoop
 from neural_sim.baseline.label_shift.settings import LabelShift
+from neural_sim.configuration import UserError
 from neural_sim.detector.protocol import Detector, Score, score_of
 from neural_sim.detector.smooth_scores import SmoothAccuracy, SmoothAP
 from neural_sim.detector.training import Training
@@ -41,7 +42,10 @@ class Run:
     """What a run is called and where it works.
 
     ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of :data:`SCORES`; with ``resume``
-    unfinished work of killed runs is taken up.
+    unfinished work of killed runs is taken up. ``workers`` processes make independent results side by side.
+
+    Raises:
+        UserError: several processes on a GPU.
     """
 
     name: str
@@ -51,8 +55,15 @@ class Run:
     accelerator: str = "cpu"
     progress: bool = False
     resume: bool = True
+    workers: int = 1
     score_at: tuple[float, ...] = ()
     task: str = "detection"
+
+    def __post_init__(self) -> None:
+        if self.workers > 1 and self.accelerator != "cpu":
+            raise UserError(
+                f"workers: want 1 with trainer=gpu, which all processes would share, got {self.workers}"
+            )
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,11 @@ class Stage(ABC, Generic[T]):
         """Of the result in the store."""
         return digest(self.description)
 
+    @property
+    def entry(self) -> str:
+        """Kind and key: the result's place in every store."""
+        return f"{self.kind} {self.key}"
+
 
 class Results:
     """Evaluates stages: a result is read once, from memory or the store, or computed from its inputs' results.
@@ -116,14 +121,14 @@ class Results:
     """
 
     def __init__(self, store: Store, account: Account | None = None, resume: bool = True) -> None:
-        self._store, self._account = store, Account() if account is None else account
-        self._resume = resume
+        self.store, self._account = store, Account() if account is None else account
+        self.resume = resume
         self._kept: dict[str, Any] = {}
         self._seen: set[str] = set()
 
     def __call__(self, stage: Stage[T]) -> T:
         """Return the stage's result."""
-        name = f"{stage.kind} {stage.key}"
+        name = stage.entry
         if name in self._kept:
             return self._kept[name]
         with self._account.charged(stage.phase):
@@ -133,13 +138,17 @@ class Results:
         return value
 
     def _stored(self, stage: Stage[T], name: str) -> T:
-        entry = self._store.fetch(
+        entry = self.store.fetch(
             stage.kind, stage.key, stage.description, lambda: stage.pack(stage.make(self))
         )
         if entry.reused and name not in self._seen:
             self._account.reused(stage.phase, stage.title, entry.seconds)
         self._seen.add(name)
         return stage.unpack(entry.value)
+
+    def seen(self, entry: str) -> None:
+        """Note that this run has made a result elsewhere, so that it is not said to have been found in the store."""
+        self._seen.add(entry)
 
     def checkpoint(self, stage: Stage[Any], classes: Sequence[type] = (), every: float = 0.0) -> Checkpoint:
         """Return where the work of a stage that is being made stands, see :class:`Checkpoint` and :class:`Store`.
@@ -149,8 +158,8 @@ class Results:
             classes: the dataclasses that its state holds.
             every: seconds between two writings, at least.
         """
-        store, kind, key = self._store, stage.kind, stage.key
-        if not self._resume:
+        store, kind, key = self.store, stage.kind, stage.key
+        if not self.resume:
             store.forget(kind, key)
         return Checkpoint(
             lambda: store.state(kind, key, classes), lambda state: store.keep(kind, key, state), every
@@ -162,11 +171,11 @@ class Results:
         seen = set(self._kept)
 
         def visit(stage: Stage[Any]) -> None:
-            name = f"{stage.kind} {stage.key}"
+            name = stage.entry
             if name in seen:
                 return
             seen.add(name)
-            if stage.stored and self._store.has(stage.kind, stage.key):
+            if stage.stored and self.store.has(stage.kind, stage.key):
                 return
             for needed in stage.needed:
                 visit(needed)

@@ -119,6 +119,10 @@ class Objects(ABC):
             return captures
         return Mixed(source, captures, Meshes(source.beside, views.backend, views.supersample))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is computed from the fields: a process that gets the objects loads the meshes it renders."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The names, in the order of class labels."""

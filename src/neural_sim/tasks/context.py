@@ -27,6 +27,7 @@ from neural_sim.stages.experiment import Experiment
 from neural_sim.stages.graph import Graph
 from neural_sim.stages.stage import Results, Stage
 from neural_sim.stages.store import Store
+from neural_sim.stages.together import make_together
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -111,6 +112,14 @@ class Context:
     def _iteration(self, record: IterationRecord) -> None:
         if self.live:
             self.live.iteration(dataclasses.asdict(record))
+
+    def together(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
+        """Make what the store lacks of these stages side by side, by as many processes as the run has."""
+        wanted = list(stages)
+        if wanted:
+            with self.account.charged(wanted[0].phase):
+                make_together(self.results, wanted, self.experiment.run.workers)
+        return wanted
 
     def shown(self, items: Iterable[T], name: str) -> Iterable[T]:
         """Return ``items`` behind a progress bar, if the run shows any."""

@@ -46,7 +46,7 @@ class Phase(Task):
 
     @override
     def run(self, context: Context) -> None:
-        for stage in context.shown(self.stages(context.graph), self.name):
+        for stage in context.shown(context.together(self.stages(context.graph)), self.name):
             result = context.results(stage)
             if context.live and self.log:
                 self.log(context.live, stage, result)
@@ -95,7 +95,7 @@ class EvaluateTask(Task):
     @override
     def run(self, context: Context) -> None:
         learned = context.results(context.graph.learned)
-        for stage in context.shown(context.graph.evaluated(learned), "evaluate"):
+        for stage in context.shown(context.together(context.graph.evaluated(learned)), "evaluate"):
             context.results(stage)
 
 

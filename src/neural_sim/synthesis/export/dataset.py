@@ -5,22 +5,16 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import multiprocessing
-import os
-import pickle
-import signal
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import torch
 from PIL import Image
 
+from neural_sim.processes import processes
 from neural_sim.synthesis.export import bop
 from neural_sim.synthesis.export.coco import coco_document
 from neural_sim.synthesis.export.folder import ExportFolder, opencv_entry, record_of, write_json, write_whole
@@ -127,7 +121,6 @@ class DataSet:
 
 
 T = TypeVar("T")
-_task: Callable[[int], Any] | None = None
 
 
 def each(task: Callable[[int], T], numbers: Sequence[int], workers: int) -> Generator[T, None, None]:
@@ -139,14 +132,8 @@ def each(task: Callable[[int], T], numbers: Sequence[int], workers: int) -> Gene
     if workers == 0:
         yield from _here(task, numbers)
         return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(
-        min(workers, max(len(numbers), 1)), context, initializer=_start, initargs=(pickle.dumps(task),)
-    )
-    try:
-        yield from pool.map(_run, numbers)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    with processes(min(workers, max(len(numbers), 1)), task, threads=1) as (pool, run):
+        yield from pool.map(run, numbers)
 
 
 def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:
@@ -157,25 +144,3 @@ def _here(task: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None
             yield task(number)
     finally:
         torch.set_num_threads(threads)
-
-
-def _start(pickled: bytes) -> None:
-    global _task
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, with which a worker ends
-    torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _task = pickle.loads(pickled)
-
-
-def _end_with_parent() -> None:
-    """End this worker with its parent: it would wait for its next number forever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-
-def _run(number: int) -> Any:
-    if _task is None:
-        raise RuntimeError("a worker without a task")
-    return _task(number)
