@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import logging
 import math
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -21,7 +20,7 @@ from neural_sim.cameras import orbit
 from neural_sim.field.fitting import GridFitting
 from neural_sim.field.grid import GridField
 from neural_sim.field.quality import POOR
-from neural_sim.field.recipe import FieldRecipe
+from neural_sim.field.recipe import fit_field
 from neural_sim.field.scene.recipe import SceneMasks
 from neural_sim.objects.motion import Colmap
 from neural_sim.objects.photos import Photos
@@ -31,7 +30,7 @@ from neural_sim.types import PinholeCamera
 
 def main() -> None:
     """Read the photographs, fit the field, print its score and write eight of its views."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="Fit one radiance field to photographs.")
     parser.add_argument("folder", type=Path, help="of the photographs of one object")
     parser.add_argument("picture", type=Path, help="where the rendered views go")
     parser.add_argument("--poses", choices=["given", "colmap"], default="given")
@@ -56,9 +55,9 @@ def main() -> None:
 
     # Coarse cells at first: empty ones go and the others are halved after a third of the steps.
     third = options.steps // 3
-    fitting = partial(GridFitting, resolution=128, refine_steps=(third,), prune_steps=(2 * third,))
-    recipe = FieldRecipe(GridField, fitting, steps=options.steps)
-    field, history = recipe.fit(views, held_out, torch.device("cpu"))
+    fitting = GridFitting(GridField(), resolution=128, refine_steps=(third,), prune_steps=(2 * third,))
+    generator = torch.Generator().manual_seed(0)
+    field, history = fit_field(views, fitting, generator, steps=options.steps, held_out=held_out)
     score = history[-1]["psnr_foreground"]
     print(f"{name}: {score:.1f} dB on the object in {held_out} photographs that the field has not seen")
     if score < POOR:

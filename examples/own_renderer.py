@@ -63,7 +63,7 @@ class PaintedCube(RenderedSubject):
 
 def main() -> None:
     """Learn psi of two cubes, and print how far each was from the target's poses before and after."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="Learn which poses to render with a renderer of your own.")
     parser.add_argument("--iterations", type=int, default=4, help="of the psi loop")
     parser.add_argument("--images", type=int, default=100, help="of each object in a training of the loop")
     parser.add_argument("--steps", type=int, default=100, help="of such a training, at least")
@@ -96,19 +96,20 @@ def main() -> None:
 
     # The first psi to try is read off the target's boxes; then the derivative of each training proposes the next. A
     # training accepts or rejects every step, object by object.
+    reading = LabelShift()
     settings = Outer(
         iterations=options.iterations,
         images_per_object=options.images,
         least_steps=options.steps,
         pool_per_bin=options.renders,
-        first_step=LabelShift(),
+        first_step=reading,
     )
     inputs = LoopInputs(detector, started, validation)
     inner = InnerLoop.prepare(scene, inputs, settings, training, generator)
     solver = AdjointSolver(
         ConjugateGradient(), LanczosDamping()
     )  # idle: the default derivative solves no system
-    first = WhatTheTargetShows(settings.first_step)
+    first = WhatTheTargetShows(reading)
     loop = SimulatorModule(inner, initial, StratifiedEstimator(probes_per_bin=16), solver, generator, first)
     learned = learn_psi(loop, progress=False)
 
