@@ -77,7 +77,7 @@ def _alone(queue, *arguments) -> None:
 
 
 def in_process(*arguments) -> dict[str, float]:
-    """:func:`measured` in a process of its own, with that process's largest memory."""
+    """``measured`` in a process of its own, with that process's largest memory."""
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
     process = context.Process(target=_alone, args=(queue, *arguments))

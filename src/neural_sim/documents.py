@@ -55,7 +55,7 @@ def write_json(path: Path, document: Any, indent: int | None = 1) -> Path:
 
     Raises:
         TypeError: for a value that JSON cannot hold.
-        OSError: as :func:`write_whole`.
+        OSError: as ``write_whole``.
     """
     return write_whole(path, json.dumps(finite(document), indent=indent, allow_nan=False))
 

@@ -18,7 +18,7 @@ def require(extra: str, what: str) -> None:
     """Refuse work whose packages are not installed.
 
     Args:
-        extra: a key of :data:`PACKAGES`.
+        extra: a key of ``PACKAGES``.
         what: what needs them, with which the message begins: a configuration key or a file.
 
     Raises:

@@ -119,7 +119,7 @@ def this_process() -> str:
 
 
 def has_ended(process: str) -> bool:
-    """Tell whether the process of a :func:`this_process` has ended; False where this one cannot know."""
+    """Tell whether the process of a ``this_process`` has ended; False where this one cannot know."""
     try:
         machine, namespace, pid, start = process.split(" ")
     except ValueError:

@@ -122,7 +122,7 @@ def context_of(
     anything else. With ``recompose`` tasks can build the experiment of another method.
 
     Raises:
-        UserError: as :func:`build`, and for an unknown entry of ``stages``.
+        UserError: as ``build``, and for an unknown entry of ``stages``.
     """
     plain = _plain(config)
     from neural_sim.tasks.context import Context

@@ -160,7 +160,7 @@ def check_headers(paths: Iterable[Path], key: str) -> None:
         key: the setting that they come from, for messages.
 
     Raises:
-        ValueError: as :func:`read_header` does, or a mode that :func:`read_picture` refuses.
+        ValueError: as ``read_header`` does, or a mode that ``read_picture`` refuses.
     """
     for path in paths:
         where = f"{key}: {path}"

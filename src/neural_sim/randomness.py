@@ -32,11 +32,11 @@ def stream(seed: int, name: str, parent: torch.Generator | None = None) -> torch
 
     Args:
         seed: the run's, or a count from 0 where there is a ``parent``.
-        name: one of :data:`STREAMS`.
+        name: one of ``STREAMS``.
         parent: a generator whose own first seed is added.
 
     Raises:
-        ValueError: a name that :data:`STREAMS` does not list.
+        ValueError: a name that ``STREAMS`` does not list.
     """
     if name not in STREAMS:
         raise ValueError(f"randomness: unknown stream {name!r}, want one of {', '.join(STREAMS)}")

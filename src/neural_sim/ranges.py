@@ -130,7 +130,7 @@ def hints_of(make: Callable[..., Any]) -> Mapping[str, Any]:
 
 
 def misfit(value: Any, hint: Any, where: str) -> Misfit | None:
-    """Find the first part of a value that does not fit a type. For the arguments see :func:`check`."""
+    """Find the first part of a value that does not fit a type. For the arguments see ``check``."""
     hint, markers = parted(hint)
     plain = hint in _WORDS or typing.get_origin(hint) is Literal
     if isinstance(value, Mapping) and "_target_" in value and not plain:

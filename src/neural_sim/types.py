@@ -24,7 +24,7 @@ class PinholeCamera:
     ``width`` and ``height`` in pixels; ``field_of_view`` in radians is the vertical one of an image of this height
     about the principal point, 2 atan(height / (2 f_y)). ``aspect`` is f_x / f_y, 1 for square pixels. ``centre`` is the
     principal point (x, y) in pixels from the image's upper left corner, whose first pixel has its centre at (0.5, 0.5);
-    None: the image's centre. :func:`neural_sim.cameras.opencv_camera` makes one from a camera matrix.
+    None: the image's centre. ``neural_sim.cameras.opencv_camera`` makes one from a camera matrix.
     """
 
     width: int

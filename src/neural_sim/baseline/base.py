@@ -38,7 +38,7 @@ class Search(Protocol):
         ...
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a :meth:`state`, just after ``begin``."""
+        """Go on from a ``state``, just after ``begin``."""
         ...
 
 
@@ -75,7 +75,7 @@ class HypergradientLoop:
 @validated
 @dataclass(frozen=True)
 class Response:
-    """Steps of psi by the measured response of training, without a derivative (:mod:`outer.response`).
+    """Steps of psi by the measured response of training, without a derivative (``outer.response``).
 
     It takes a training for each bin, in which ``part`` of every object's images moves to it.
     """

@@ -71,7 +71,7 @@ _LEARNED = ("omega", "noise", "rewards", "mean", "variance")
 
 
 class Policy(Search):
-    """See :class:`LearningToSimulate`."""
+    """See ``LearningToSimulate``."""
 
     def __init__(
         self,

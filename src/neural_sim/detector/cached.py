@@ -64,7 +64,7 @@ class CachedSet:
     def streamed(
         detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
     ) -> CachedSet:
-        """Do as :meth:`of` with all images in one set, in the same batches.
+        """Do as ``of`` with all images in one set, in the same batches.
 
         No more images are in memory than one of ``sets`` and a batch.
 
@@ -114,7 +114,7 @@ class CachedSet:
     def losses_from(
         self, params: Parameters, inputs: tuple[Tensor, ...], index: Tensor
     ) -> Float[Tensor, "n"]:
-        """Compute losses of the images ``index`` from given rows of :attr:`inputs`, differentiable in these."""
+        """Compute losses of the images ``index`` from given rows of ``inputs``, differentiable in these."""
         targets = Targets(self.targets.labels[index], inputs[-1])
         return self.detector.per_image_loss(params, inputs[:-1], targets)
 

@@ -29,7 +29,7 @@ class Classifier(BackboneDetector):
 
     An image without an object (label -1) has no loss.
 
-    See :class:`BackboneDetector` for the arguments, which it checks.
+    See ``BackboneDetector`` for the arguments, which it checks.
     """
 
     score: ClassVar[Score] = "accuracy"

@@ -71,7 +71,7 @@ class Fcos(PyramidDetector):
         points: which points should find which object.
         focal_alpha, focal_gamma: of the focal loss (Lin et al. 2017, Eq. 5).
 
-    See :class:`PyramidDetector` for the others, which it checks.
+    See ``PyramidDetector`` for the others, which it checks.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Fcos(PyramidDetector):
         self.ranges = _of_points(points.ranges(min(self.image_size)), self.anchors_per_level)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Assign a target to every point, see :func:`losses.assign_points`.
+        """Assign a target to every point, see ``losses.assign_points``.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.

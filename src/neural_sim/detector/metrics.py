@@ -77,7 +77,7 @@ def evaluate(
     class_names: Sequence[str],
     score: Score = "AP",
 ) -> TestScore:
-    """Score ``predictions`` (one dictionary an image, as :meth:`Detector.predict` gives).
+    """Score ``predictions`` (one dictionary an image, as ``Detector.predict`` gives).
 
     Raises:
         ValueError: where there are no images, predictions and images differ in number, a label has no name, or an image

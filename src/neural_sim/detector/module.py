@@ -51,7 +51,7 @@ class DetectorModule(pl.LightningModule):
         fixed: all others; never written to.
         total_steps: optimiser steps until the learning rate reaches zero.
         anchor: of the detector's proximal term, which is left out without it; holds the learned names.
-        recording: what is recorded of the steps, for :meth:`trajectory`.
+        recording: what is recorded of the steps, for ``trajectory``.
 
     Raises:
         ValueError: for a recording that does not fit its memory.

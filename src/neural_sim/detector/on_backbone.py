@@ -45,7 +45,7 @@ class BackboneDetector(Detector):
         backbone: its settings.
         strides: of its maps that are features.
         activation: ``silu`` or ``relu`` (torchvision's own).
-        proximal: see :class:`Detector`.
+        proximal: see ``Detector``.
         prior: foreground probability that the untrained predictor gives; None: it has no such output.
     """
 
@@ -173,12 +173,12 @@ class PyramidDetector(BackboneDetector):
     Args:
         head: its settings, and the pyramid's.
         strides: of the pyramid's levels; ``where`` is their key.
-        network: the head's module, of :attr:`Head.channels` channels; it returns ``cls_logits`` [n, anchors, classes]
+        network: the head's module, of ``Head.channels`` channels; it returns ``cls_logits`` [n, anchors, classes]
             and ``bbox_regression`` [n, anchors, code].
         activation: ``silu`` or ``relu`` (torchvision's own), of backbone, pyramid and head.
-        detections: see :class:`Detector`.
+        detections: see ``Detector``.
 
-    See :class:`BackboneDetector` for the others.
+    See ``BackboneDetector`` for the others.
 
     Raises:
         ValueError: strides that the backbone does not have, with the key and value.

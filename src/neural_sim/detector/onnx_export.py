@@ -50,7 +50,7 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
     """Write ``path``: input ``images`` [n, 3, h, w] in [0, 1], any n.
 
     Without ``nms`` the outputs are ``boxes`` [n, anchors, 4] and ``scores`` [n, anchors, classes], see
-    :class:`Decoded`. With it they are the detections of all images, as :meth:`Detector.predict` chooses them: ``image``
+    ``Decoded``. With it they are the detections of all images, as ``Detector.predict`` chooses them: ``image``
     [d], ``boxes`` [d, 4], ``scores`` [d], ``labels`` [d], image by image, the best first. The file's metadata has the
     ``class_names`` as JSON.
 

@@ -13,7 +13,7 @@ INPUTS = ("anchor_boxes", "anchor_scores")
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
-    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, as :meth:`Detector.predict` does.
+    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, as ``Detector.predict`` does.
 
     It takes the best candidates of each level, suppresses within each class, and keeps the best ``limit`` of an image.
     """

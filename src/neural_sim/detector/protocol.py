@@ -108,7 +108,7 @@ class Detector(ABC):
     def in_loop(self, layers: int | None) -> Detector:
         """Return the detector as the psi loop trains it.
 
-        The last ``layers`` stages of its backbone are among what :meth:`split` leaves to train; None: as many as a kind
+        The last ``layers`` stages of its backbone are among what ``split`` leaves to train; None: as many as a kind
         of detector proposes. The base class knows no stages.
 
         Raises:
@@ -121,7 +121,7 @@ class Detector(ABC):
         return self
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """Separate the backbone, which :meth:`features` takes and the psi loop freezes, from all other parameters."""
+        """Separate the backbone, which ``features`` takes and the psi loop freezes, from all other parameters."""
         backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
@@ -168,7 +168,7 @@ class Detector(ABC):
 
         Returns:
             For each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
-            :class:`Detections`.
+            ``Detections``.
         """
         backbone, trainable = self.split(params)
         detections, device = [], next(iter(trainable.values())).device

@@ -90,7 +90,7 @@ class Real:
         """Return the settings in terms of a ``count``, so that equal trainings have equal keys.
 
         Raises:
-            ValueError: as :meth:`number`.
+            ValueError: as ``number``.
         """
         return replace(self, count=self.number(available), fraction=None, fewer="refuse")
 
@@ -98,7 +98,7 @@ class Real:
         """Choose those that train: the first of a random order that depends on ``seed`` alone.
 
         Raises:
-            ValueError: as :meth:`number`.
+            ValueError: as ``number``.
         """
         available = 0 if photographs is None else len(photographs)
         count = self.number(available)

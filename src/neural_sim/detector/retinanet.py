@@ -23,7 +23,7 @@ from neural_sim.ranges import NonNegative, PositiveInt, validated
 class RetinaNet(PyramidDetector):
     """A RetinaNet for images of one size; holds its shape, its anchors and its loss, never its parameters.
 
-    See :class:`PyramidDetector` for the arguments, which it checks.
+    See ``PyramidDetector`` for the arguments, which it checks.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class RetinaNet(PyramidDetector):
         self.anchors, self.anchors_per_level = fixed_anchors(anchors, self.image_size)
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Assign a target to every anchor, see :func:`losses.assign_anchors`.
+        """Assign a target to every anchor, see ``losses.assign_anchors``.
 
         Raises:
             ValueError: where a label is not below ``num_classes``, or a box has no area.

@@ -68,7 +68,7 @@ class SavedDetector:
         """Write both files, ``model.json`` last, and return the path of the parameters.
 
         Raises:
-            ValueError: settings that JSON does not have, see :func:`described`.
+            ValueError: settings that JSON does not have, see ``described``.
         """
         document = {
             "format": FORMAT,
@@ -274,9 +274,9 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
 def rebuilt(
     description: Mapping[str, Any], file: Path, outside: str | None = None
 ) -> Callable[..., Detector]:
-    """Inverse of :func:`described`. Runs no code but the named class's own, which must derive from :class:`Detector`.
+    """Inverse of ``described``. Runs no code but the named class's own, which must derive from ``Detector``.
 
-    ``outside`` as for :meth:`SavedDetector.load`.
+    ``outside`` as for ``SavedDetector.load``.
 
     Raises:
         ValueError: a class that cannot be imported or is no detector, a setting that it does not have or refuses;

@@ -16,7 +16,7 @@ Activation = Literal["silu", "relu"]
 """The activation of backbone, pyramid and head; relu is torchvision's own."""
 BetweenZeroAndOne = Annotated[float, Gt(0), Lt(1)]
 Normalisation = Literal["group", "none"]
-"""The normalisation of the pyramid and the head, see :func:`backbones.group_norm`."""
+"""The normalisation of the pyramid and the head, see ``backbones.group_norm``."""
 BoxLoss = Literal["pseudo_huber", "l1"]
 ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
     "micro": (8, 16),
@@ -77,7 +77,7 @@ class Anchors:
 
     Args:
         strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last for each
-            of any coarser levels, see :class:`network.CoarserLevels`.
+            of any coarser levels, see ``network.CoarserLevels``.
         sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side is
             ``reference``; they scale with the image's.
         reference: that side in pixels; None: sizes are pixels of any image, as in torchvision.
@@ -111,7 +111,7 @@ class Points:
     """The points of an FCOS, and which of them should find which object.
 
     Args:
-        strides: of the pyramid's levels, as of :class:`Anchors`; a level has a point in every stride.
+        strides: of the pyramid's levels, as of ``Anchors``; a level has a point in every stride.
         limits: of all levels but the last, the largest distance from a point to a side of its box, in pixels of an
             image whose shorter side is ``reference``; larger ones are for the next level.
         reference: that side in pixels; None: limits are pixels of any image.

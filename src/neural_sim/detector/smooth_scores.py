@@ -72,7 +72,7 @@ class SmoothAP:
         return torch.stack(rows)
 
     def of_class(self, detections: Ranked) -> Float[Tensor, "m"]:
-        """Each detection's contribution to one class's AP, the mean over :data:`THRESHOLDS`.
+        """Each detection's contribution to one class's AP, the mean over ``THRESHOLDS``.
 
         Raises:
             ValueError: a class without boxes, whose AP is not defined.

@@ -34,7 +34,7 @@ class Training:
     ``image_size`` is the side of the square images in pixels; ``warm_start`` says which distribution the images of the
     warm start have, all parameters uniform or psi's initial one; ``warm_epochs`` are its epochs, ``cold_epochs`` those
     of the detectors that are scored; ``real`` says whether labelled photographs train too. For the rest see
-    :class:`Optimisation`.
+    ``Optimisation``.
 
     Raises:
         ValueError: batches of one image that should have photographs and synthetic images.

@@ -80,7 +80,7 @@ class RadianceField(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
         """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the samples of ``sample``.
 
-        Without derivatives. ``span`` is that of these rays from :meth:`span`; ``skip_empty``: skip space known to be
+        Without derivatives. ``span`` is that of these rays from ``span``; ``skip_empty``: skip space known to be
         empty. Neither changes a pixel. A field that knows no empty space ignores both. ``surface``, if given, learns
         where these rays lose half of their light.
         """

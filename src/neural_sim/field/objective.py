@@ -56,7 +56,7 @@ class Fitting(ABC):
         return None
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a :meth:`state`, just after ``start`` on the same views."""
+        """Go on from a ``state``, just after ``start`` on the same views."""
         raise NotImplementedError
 
     @abstractmethod

@@ -125,7 +125,7 @@ def field_state(field: RadianceField) -> dict[str, Any]:
 
 
 def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
-    """Inverse of :func:`field_state`, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
+    """Inverse of ``field_state``, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
     if saved.get("kind") not in KINDS:
         raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
     field = KINDS[saved["kind"]](**saved["settings"])

@@ -33,11 +33,11 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     """Return the surface where the least alpha over all views is ``LEVEL``, with a colour at each vertex.
 
     In the views' frame, without lighting: the colours are those of the views, with the light that was on them.
-    ``resolution`` is that of :func:`visual_hull`; the grid of alphas has its cells' centres as points. Cells that a
+    ``resolution`` is that of ``visual_hull``; the grid of alphas has its cells' centres as points. Cells that a
     photograph does not show are not carved by it.
 
     Raises:
-        ValueError: as :func:`visual_hull`, or where no point's alpha exceeds ``LEVEL``.
+        ValueError: as ``visual_hull``, or where no point's alpha exceeds ``LEVEL``.
     """
     occupied, origin, cell = visual_hull(views, resolution)
     where = occupied.nonzero()

@@ -32,7 +32,7 @@ LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 class Estimator(Protocol):
     """An estimator of the derivative by psi from images.
 
-    ``wanted`` is what :meth:`accumulated` reads of the sums over a training's steps.
+    ``wanted`` is what ``accumulated`` reads of the sums over a training's steps.
     """
 
     wanted: ClassVar[Wanted]
@@ -80,12 +80,12 @@ class StratifiedEstimator:
 
     With ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is ``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits
     without a floor ``p_i (s_i - sum_j p_j s_j)``. For lights, differences of mean scores take its place, see
-    :func:`across_lights`.
+    ``across_lights``.
 
     Only mean scores are estimated: every bin is sampled by itself, whatever p, and the renderer is never
     differentiated. All bins show the same scenes, with the same random numbers for all that is not the bin, so that
     differences between bins owe nothing to backgrounds and distances. An outer iteration costs one Jacobian-vector
-    product over the predictor for its probes, computed by ``theta_mode`` (see :func:`gradient.mixed.scores`).
+    product over the predictor for its probes, computed by ``theta_mode`` (see ``gradient.mixed.scores``).
     """
 
     wanted: ClassVar[Wanted] = "probes"
@@ -106,7 +106,7 @@ class StratifiedEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`Estimator`.
+        """See ``Estimator``.
 
         Null hypothesis of the p-values: a factor's bins, or lights, have equal mean scores, so that the derivative is
         zero.
@@ -123,7 +123,7 @@ class StratifiedEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """See :class:`Estimator`."""
+        """See ``Estimator``."""
         return self._over_strata(lambda index: sums.probes[index.to(sums.probes.device)], images, probes)
 
     def _over_strata(
@@ -177,7 +177,7 @@ def by_strata(
 ) -> MixedDerivative:
     """Estimate the derivative by one factor's psi from the scores of its probes, stratum after stratum.
 
-    For bins it is that of :func:`stratified`, for lights of :func:`across_lights`.
+    For bins it is that of ``stratified``, for lights of ``across_lights``.
     """
     table = scores.view(factor.size, -1)
     if isinstance(factor, BinnedFactor):
@@ -259,7 +259,7 @@ class ReinforceEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`Estimator`.
+        """See ``Estimator``.
 
         Null hypothesis of the p-values: scores do not depend on the bins, or lights, that a factor drew.
         """
@@ -270,7 +270,7 @@ class ReinforceEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """See :class:`Estimator`."""
+        """See ``Estimator``."""
         by_weight = sums.images[images.index.to(sums.images.device)]
         return self._by_score_function(by_weight / images.weights.to(by_weight), images)
 

@@ -1,6 +1,6 @@
 """The hypergradient ``dL_val/dpsi``, and a record of the adjoint that it was computed by.
 
-:mod:`gradient.implicit` computes it at a stationary point (Eq. 2), :mod:`gradient.unrolled` of the training that was
+``gradient.implicit`` computes it at a stationary point (Eq. 2), ``gradient.unrolled`` of the training that was
 run.
 """
 
@@ -76,7 +76,7 @@ class Hypergradient(Generic[Adjoint_co]):
         gradients: the derivatives.
         errors: standard errors of their components.
         adjoint: how it was computed; None where trainings were compared and no adjoint was needed.
-        p_values: by object and factor, see :class:`MixedDerivative`; empty where nothing was tested.
+        p_values: by object and factor, see ``MixedDerivative``; empty where nothing was tested.
         seconds: by phase: validation, solve or unrolled, mixed.
     """
 

@@ -81,9 +81,9 @@ class PathwiseEstimator:
         images: ObjectImages,
         probes: Mapping[str, Probes],
     ) -> MixedDerivative:
-        """See :class:`~neural_sim.gradient.estimators.Estimator`.
+        """See ``Estimator``.
 
-        Tangents of the first render are used in either mode. p-values are those of :func:`significance.zero_mean` for
+        Tangents of the first render are used in either mode. p-values are those of ``significance.zero_mean`` for
         the images' contributions.
 
         Raises:
@@ -104,7 +104,7 @@ class PathwiseEstimator:
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """See :class:`~neural_sim.gradient.estimators.Estimator`."""
+        """See ``Estimator``."""
         path = _path(images)
         cotangents = sums.cotangents(_pixels(images), images.index, self.chunk_size)
         return self._through_images(path, cotangents, images)

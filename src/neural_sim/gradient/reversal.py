@@ -170,7 +170,7 @@ def reversed_steps(
             eps^(2/3); ``reverse_over_reverse``: exact, at the time of three and a half gradients and the memory of a
             second derivative.
         wanted: what each step computes.
-        floor: fraction of :meth:`detector.optimiser.Rule.floored`; at 0 the derivative is that of the training.
+        floor: fraction of ``detector.optimiser.Rule.floored``; at 0 the derivative is that of the training.
 
     Raises:
         ValueError: an unknown product, or a slope of another length than theta.

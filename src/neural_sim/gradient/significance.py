@@ -51,7 +51,7 @@ def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws:
 
     The larger of two p-values, so that the level holds where either does. Scores permuted over the images: exact where
     scores do not depend on what was drawn, for any law of the scores, any skewness and any number of images. Signs
-    changed (:func:`zero_mean`): bins whose scores scatter differently, for scores that scatter symmetrically.
+    changed (``zero_mean``): bins whose scores scatter differently, for scores that scatter symmetrically.
     Asymptotically each holds without its condition (Chung and Romano 2013, for permutations of such a statistic). 1
     for numbers that are not finite.
     """
@@ -75,7 +75,7 @@ def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) ->
 
     Each scene's scores are changed at random, apart from their mean.
 
-    The larger of two p-values, as in :func:`no_association`: each scene's scores permuted among the lights, exact where
+    The larger of two p-values, as in ``no_association``: each scene's scores permuted among the lights, exact where
     a scene's scores differ by chance alone, for any law; signs changed, for lights under which scores scatter
     differently.
     """

@@ -1,6 +1,6 @@
 """The hypergradient of the training that was run.
 
-Its steps are reversed (:mod:`gradient.reversal`). Estimators read sums over these steps: scores of images and probes,
+Its steps are reversed (``gradient.reversal``). Estimators read sums over these steps: scores of images and probes,
 and derivatives by the training's inputs.
 """
 
@@ -42,7 +42,7 @@ from neural_sim.solver.operator import norm
 
 @dataclass(frozen=True)
 class Accumulated:
-    """Sums over the reversed steps; a_t is that of :mod:`gradient.reversal`.
+    """Sums over the reversed steps; a_t is that of ``gradient.reversal``.
 
     Attributes:
         images: derivatives of L_val by the training images' weights (1 in the means of its batches); empty unless
@@ -127,17 +127,17 @@ class Unrolled:
     """``outer.adjoint``: the derivative of the training that was run.
 
     Args:
-        product: how a batch's Hessian is multiplied, see :func:`gradient.reversal.reversed_steps`.
+        product: how a batch's Hessian is multiplied, see ``gradient.reversal.reversed_steps``.
         part: fraction of the steps, the last ones, that are reversed; 1 is exact.
-        max_memory_mb: limit of the recorded training, see :class:`detector.trajectory.Recording`.
+        max_memory_mb: limit of the recorded training, see ``detector.trajectory.Recording``.
         probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them. With
             one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
         scored_steps: about the number of steps that score probes; 0: all. A longer training is divided into blocks, of
-            which one step, drawn at random, scores probes with the block's weight, see :func:`step_weights`. More
+            which one step, drawn at random, scores probes with the block's weight, see ``step_weights``. More
             objects have more probes and more steps: were all scored, the cost would grow with their square.
         chunk_size: probes whose losses are computed at a time.
         floor: least denominator of an entry of theta in AdamW's steps, as a fraction of what is usual for it and for
-            its tensor, see :meth:`detector.optimiser.AdamW.floored`; 0 is exact.
+            its tensor, see ``detector.optimiser.AdamW.floored``; 0 is exact.
     """
 
     product: Product = "forward_difference"
@@ -203,7 +203,7 @@ class Unrolled:
         wanted: Wanted = "weights",
         probes: ProbeGroups | None = None,
     ) -> Accumulated:
-        """Reverse a training from ``slope``, ``dL_val/dtheta`` after its last step; see :meth:`derivative`."""
+        """Reverse a training from ``slope``, ``dL_val/dtheta`` after its last step; see ``derivative``."""
         examples = training.examples
         steps = reversed_steps(training, slope, self.product, wanted, self.floor)
         scoring = None if probes is None else _Scoring(probes, slope, self.chunk_size)

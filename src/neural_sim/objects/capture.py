@@ -96,7 +96,7 @@ class Lens:
         return plane * focal + plane.new_tensor([self.cx, self.cy]), seen
 
     def directions(self, pixel: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-        """Inverse of :meth:`project`: unit directions in the camera's OpenGL frame, and which pixels have one.
+        """Inverse of ``project``: unit directions in the camera's OpenGL frame, and which pixels have one.
 
         The radius is found by bisection, which no distortion leads astray; the small tangential term by repetition.
         """

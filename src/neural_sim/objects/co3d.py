@@ -38,11 +38,11 @@ class Co3d(Photos):
         names: categories; null: all.
         sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
             the highest ``viewpoint_quality_score``, of those without one the longest.
-        masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see :class:`Photos`.
+        masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see ``Photos``.
 
     Raises:
         ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
-            read or lack a key, with the file and the key; and what :class:`Photos` refuses.
+            read or lack a key, with the file and the key; and what ``Photos`` refuses.
     """
 
     def __init__(

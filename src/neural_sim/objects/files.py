@@ -161,7 +161,7 @@ class MeshFiles:
         wanted: what the folder should hold, for messages.
 
     Raises:
-        ValueError: no files, or what :func:`choose` raises.
+        ValueError: no files, or what ``choose`` raises.
     """
 
     metric: ClassVar[bool] = True

@@ -107,7 +107,7 @@ def judged(
         album: the photographs.
         models: COLMAP's, the largest first, each with its capture.
         verified: pairs of photographs that a motion explains: the kind of motion, and how many matches.
-        turning: see :class:`FoundCapture`.
+        turning: see ``FoundCapture``.
 
     Raises:
         ValueError: too few photographs that belong together, or photographs from one place, with what to do.

@@ -86,7 +86,7 @@ class Photos:
     Args:
         root: the folder of the objects' folders, or the folder of one object.
         names: objects to load; null: all.
-        masks: source of the objects' masks, see :class:`Pictures`.
+        masks: source of the objects' masks, see ``Pictures``.
         up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by
             object's name; null: that of the capture's file, else the mean of the cameras' up vectors.
         size: the diameter of the object's bounding sphere in metres, or a mapping by object's name; null: unknown, so
@@ -98,7 +98,7 @@ class Photos:
         poor: what happens where a field does not show its object: nothing trains on it (``refuse``), or ``use``.
         poses: what finds the cameras of photographs alone; null: they are given, by ``transforms.json`` or a model of
             COLMAP's.
-        mask_command: with ``masks="command"``: see :class:`MaskCommand`.
+        mask_command: with ``masks="command"``: see ``MaskCommand``.
         mask_value: the object's value in masks that are images of labels, or a mapping by object's name.
         beside: meshes that are further objects of the run, with other names; null: none.
         frames: where cameras are found and a folder holds a video and no photographs, how many frames of it are taken.
@@ -212,7 +212,7 @@ class Photos:
 
         Args:
             name: of the object.
-            computed: its :meth:`command_masks`; None: they are computed now.
+            computed: its ``command_masks``; None: they are computed now.
             progress: whether to show a bar.
 
         Raises:
@@ -248,7 +248,7 @@ class Photos:
         return tuple(frame.image for frame in self.captures[name].frames)
 
     def command_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return a mask for each of :meth:`images` where ``masks="command"``, else none."""
+        """Return a mask for each of ``images`` where ``masks="command"``, else none."""
         return () if self.command is None else self.command.masks(self.images(name), self._value(name))
 
     def digests(self) -> dict[str, str]:
@@ -289,7 +289,7 @@ class Photos:
     def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
         """Return an object's photographs.
 
-        ``computed`` are its :meth:`command_masks` or :meth:`computed_masks`; None: they are computed now.
+        ``computed`` are its ``command_masks`` or ``computed_masks``; None: they are computed now.
         """
         made = (self.command_masks(name) or self.computed_masks(name)) if computed is None else computed
         if self.command is not None:
@@ -304,7 +304,7 @@ class Photos:
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
     ) -> PosedViews:
-        """Make views of an object, test frames last, and refine them: :meth:`split`, :func:`resampling.resample`."""
+        """Make views of an object, test frames last, and refine them: ``split``, ``resampling.resample``."""
         train, test = self.split(name, count, held_out)
         pictures = pictures or self.pictures(name)
         views = resample(pictures, [*train, *test], self.placement(name, pictures), image_size)

@@ -73,7 +73,7 @@ class Pictures:
     capture's frames, in their order. In files of labels, ``value`` is the object's.
 
     Raises:
-        ValueError: computed masks that are missing or too few; from :meth:`rgba`, a frame without a
+        ValueError: computed masks that are missing or too few; from ``rgba``, a frame without a
             mask, or a mask of another size.
     """
 

@@ -57,7 +57,7 @@ class Trust:
 
 @dataclass(frozen=True)
 class ImplicitQuality:
-    """The numbers of an :class:`ImplicitAdjoint` that are recorded, None where one was not measured.
+    """The numbers of an ``ImplicitAdjoint`` that are recorded, None where one was not measured.
 
     ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` the damped
     operator's condition number (inf where it is not positive definite), both of an estimated spectrum.
@@ -110,7 +110,7 @@ class ImplicitQuality:
 
 @dataclass(frozen=True)
 class UnrolledQuality:
-    """The numbers of an :class:`UnrolledAdjoint` that are recorded."""
+    """The numbers of an ``UnrolledAdjoint`` that are recorded."""
 
     validation_norm: float
     reversed_steps: int
@@ -134,7 +134,7 @@ class Certificate:
         p_values: by object and factor, of the null that a derivative is zero: this iteration's, or, for trust-region
             steps, of the average over iterations that steps follow.
         actions: what happens to the learned objects' steps: one is kept if no condition fails and its derivative is
-            significant. What waited is recorded by :meth:`waiting`.
+            significant. What waited is recorded by ``waiting``.
     """
 
     adjoint: Quality | None

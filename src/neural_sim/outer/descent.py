@@ -39,7 +39,7 @@ class Derived:
 
 
 class GradientLoop(OuterLoop, ABC):
-    """One training step is one outer iteration. A subclass computes the derivative in :meth:`_derivative`.
+    """One training step is one outer iteration. A subclass computes the derivative in ``_derivative``.
 
     In a trust region, consecutive trainings have common random numbers, an iteration begins with a training that
     accepts or rejects the last step, and the last iteration ends with it. Before its first derivative, it tries the psi

@@ -15,7 +15,7 @@ class Average:
 
     So neither a noisy derivative, which is long, nor the first one dominates. Two variances add up: that of the images
     which a derivative was computed from, and that between trainings (of other initial parameters, batches and images),
-    :attr:`between`. A derivative of which a component is not finite counts for nothing.
+    ``between``. A derivative of which a component is not finite counts for nothing.
 
     Attributes:
         directions: the derivatives.

@@ -83,7 +83,7 @@ class RenderedPool:
 
     @staticmethod
     def of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> RenderedPool:
-        """Render a pool (:func:`~neural_sim.synthesis.pool.pool_of`)."""
+        """Render a pool (``pool_of``)."""
         began, cpu_began = time.perf_counter(), time.process_time()
         pool = pool_of(scene, per_bin, generator, lights=lights)
         synchronise(pool.subjects[0].device)
@@ -355,7 +355,7 @@ class InnerLoop:
 
     @torch.no_grad()
     def loss(self, examples: CachedSet, theta: Parameters) -> float:
-        """Compute the training loss of a :meth:`training_set` at theta."""
+        """Compute the training loss of a ``training_set`` at theta."""
         trainable, weights = self.detector.split(theta)[1], self.weights(examples).to(self.device)
         rows = torch.arange(len(examples), device=self.device).split(32)
         return float(sum(examples.losses(trainable, part) @ weights[part] for part in rows))

@@ -33,7 +33,7 @@ class OuterLoop(pl.LightningModule):
     """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
 
     ``inner`` draws an iteration's images and trains the detector on them, from ``theta`` where a training goes on from
-    the one before, under the random ``numbers``. A subclass's ``training_step`` ends with :meth:`record` and, after the
+    the one before, under the random ``numbers``. A subclass's ``training_step`` ends with ``record`` and, after the
     step of psi, appends to ``trajectory`` the method's result if it ended there. ``shown`` is what the target's boxes
     showed, where they were read.
     """
@@ -92,7 +92,7 @@ class OuterLoop(pl.LightningModule):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a :meth:`state` of a loop of the same inputs, which has not begun."""
+        """Go on from a ``state`` of a loop of the same inputs, which has not begun."""
         self.psi.data = state["psi"]
         self.records, self.trajectory, self.shown = state["records"], state["trajectory"], state["shown"]
         self.theta = placed(state["theta"], self.inner.device)

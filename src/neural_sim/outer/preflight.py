@@ -77,7 +77,7 @@ def gains_of(
     moved: float,
     region: TrustRegion,
 ) -> list[ExpectedGains]:
-    """Average derivatives at one psi, and step in ``region``; other arguments as for :func:`expected_gains`."""
+    """Average derivatives at one psi, and step in ``region``; other arguments as for ``expected_gains``."""
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]

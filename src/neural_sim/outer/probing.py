@@ -60,7 +60,7 @@ class ProbeSet:
         return ProbeSet(probes, CachedSet.streamed(detector, backbone, drawn()), per_bin)
 
     def state(self) -> dict[str, Any]:
-        """Return the probes as tensors and numbers on the CPU, see :meth:`of`."""
+        """Return the probes as tensors and numbers on the CPU, see ``of``."""
         cached = self.cached
         return {
             "rows": [{name: (p.index, p.bins) for name, p in own.items()} for own in self.probes],
@@ -71,7 +71,7 @@ class ProbeSet:
 
     @staticmethod
     def of(state: Mapping[str, Any], detector: Detector, device: torch.device) -> ProbeSet:
-        """Return the probes of a :meth:`state`, with their features on ``device``."""
+        """Return the probes of a ``state``, with their features on ``device``."""
         features = tuple(level.to(device) for level in state["features"])
         targets = Targets(*(part.to(device) for part in state["targets"]))
         probes = [{name: Probes(*rows) for name, rows in own.items()} for own in state["rows"]]

@@ -63,7 +63,7 @@ class IterationRecord:
     ``cpu_seconds`` the processor time over all cores, which other processes on the machine disturb less.
     ``certificate`` is None for methods without a hypergradient, and in an iteration that takes none. ``scores``
     [classes] are those of the loop's objective, more is better. ``verdicts``
-    and ``taken_back`` are those of an :class:`Outcome`.
+    and ``taken_back`` are those of an ``Outcome``.
     """
 
     probabilities: dict[str, list[list[float]]]

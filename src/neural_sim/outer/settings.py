@@ -36,7 +36,7 @@ class Outer:
             two objects fill few batches, and so short a training says little about psi. Not of a training that goes on
             from the iteration before.
         loop_layers: last stages of the detector's backbone that this training changes, from the warm start's values;
-            the others are frozen. None: as many as the detector proposes (:meth:`Detector.in_loop`).
+            the others are frozen. None: as many as the detector proposes (``Detector.in_loop``).
         start: initial pyramid and head of that training: those of the iteration before (``previous``, the paper's), of
             the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that goes on remembers
             bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
@@ -49,7 +49,7 @@ class Outer:
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
             get no probes and no second derivatives.
         certify_every: iterations from one comparison of the hypergradient with the response of training at this psi
-            (:mod:`outer.response`, one training for each bin) to the next; 0: never.
+            (``outer.response``, one training for each bin) to the next; 0: never.
         first_step: what proposes the psi that is tried first: the first derivative, or what the target's boxes show.
         steps: how psi follows its derivative: in a trust region, under common random numbers, and the last iteration
             only trains, to accept or reject the last step; or freely.

@@ -1,4 +1,4 @@
-"""Steps of psi: what every kind has, and free gradient steps. Those of a trust region: :mod:`outer.trust_region`."""
+"""Steps of psi: what every kind has, and free gradient steps. Those of a trust region: ``outer.trust_region``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class LearnedObjects:
 class Steps(Protocol):
     """Where psi [objects, K] of the learned objects stands, and what is known for its next step.
 
-    Immutable: :meth:`judge`, :meth:`observe` and :meth:`propose`, called in this order, return what comes after.
+    Immutable: ``judge``, ``observe`` and ``propose``, called in this order, return what comes after.
     """
 
     @property
@@ -75,7 +75,7 @@ class Steps(Protocol):
 
     @property
     def pending(self) -> bool:
-        """Whether the last step waits for :meth:`judge`."""
+        """Whether the last step waits for ``judge``."""
         ...
 
     @property
@@ -173,12 +173,12 @@ class GradientSteps:
         return self, {}
 
     def observe(self, result: Hypergradient) -> tuple[GradientSteps, PValues]:
-        """Follow the last derivative alone; see :class:`Steps`."""
+        """Follow the last derivative alone; see ``Steps``."""
         gradient, error = stacked(result, self.objects.names, self.reported)
         return replace(self, gradient=gradient, error=error), result.p_values
 
     def propose(self, certificate: Certificate, shrink: float) -> GradientSteps:
-        """Take the optimisers' steps; see :class:`Steps`.
+        """Take the optimisers' steps; see ``Steps``.
 
         An insignificant derivative enters the momentum nevertheless: the average of several may be significant.
         """

@@ -64,7 +64,7 @@ class TrustRegion:
             largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
             present mistakes in it, and another once they have moved.
         take_back: whether, at the end, every object goes back to its best psi on the way, by the mean of all trainings
-            that saw each (:mod:`outer.way`); else the last one is the result.
+            that saw each (``outer.way``); else the last one is the result.
         grow: factor of the radius after an accepted step that raised the score.
         shrink: factor after one that lowered it; its square root after another rejected step.
         momentum: factor of a derivative's weight in the average for every later move of its object.
@@ -116,7 +116,7 @@ class TrustRegion:
 
 @dataclass(frozen=True)
 class TrustRegionSteps:
-    """Where psi stands, and the evidence for its next step; see :class:`outer.steps.Steps`.
+    """Where psi stands, and the evidence for its next step; see ``outer.steps.Steps``.
 
     Attributes:
         settings: of the steps.
@@ -155,7 +155,7 @@ class TrustRegionSteps:
 
     @property
     def pending(self) -> bool:
-        """Whether a step waits for :meth:`judge`."""
+        """Whether a step waits for ``judge``."""
         return bool(self._pending.any())
 
     @property
@@ -189,7 +189,7 @@ class TrustRegionSteps:
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> tuple[TrustRegionSteps, dict[str, Verdict]]:
-        """Accept or reject the pending step of each object; see :class:`outer.steps.Steps`.
+        """Accept or reject the pending step of each object; see ``outer.steps.Steps``.
 
         A step is accepted if its derivative and the measured gain together are significant at ``level``, by the sum of
         their normal quantiles over the root of 2 (Stouffer et al. 1949), and the score did not fall beyond ``errors``:
@@ -248,7 +248,7 @@ class TrustRegionSteps:
         }
 
     def observe(self, result: Hypergradient) -> tuple[TrustRegionSteps, PValues]:
-        """Add a derivative at ``accepted`` to the average; see :class:`outer.steps.Steps`."""
+        """Add a derivative at ``accepted`` to the average; see ``outer.steps.Steps``."""
         names, distribution = self.objects.names, self.objects.distribution
         gradient, error = stacked(result, names, self.accepted)
         psi, slope, noise = (distribution.split(values) for values in (self.accepted, gradient, error))
@@ -265,7 +265,7 @@ class TrustRegionSteps:
         return replace(self, observed=observed), p_values
 
     def propose(self, certificate: Certificate, shrink: float) -> TrustRegionSteps:
-        """Go along the averages by the radii; see :class:`outer.steps.Steps`."""
+        """Go along the averages by the radii; see ``outer.steps.Steps``."""
         if certificate.void:
             nothing = torch.zeros_like(self.expected)
             return replace(self, observed=self.averages, trial=self.accepted, expected=nothing)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
-# The softmax of a logit at its lowest (:func:`bounded`), in floors: there p is within this fraction of the floor.
+# The softmax of a logit at its lowest (``bounded``), in floors: there p is within this fraction of the floor.
 LOWEST = 0.25
 # The logit of a bin that nothing may be drawn from, such as one that no photograph of the object shows. Its p is 0 and
 # has no floor; no step of some logits brings it back. Far below what steps reach, so that no low logit is taken for
@@ -27,7 +27,7 @@ class BinNoise:
     """Noise that selects the bins of n draws.
 
     ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see
-    :func:`~neural_sim.parameter.bins.balanced`; None: independent draws.
+    ``balanced``; None: independent draws.
     """
 
     gumbel: Float[Tensor, "n k"]
@@ -100,7 +100,7 @@ def nearest(
 ) -> Float[Tensor, "*n k"]:
     """Find the nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1.
 
-    Nor is any below the p of a logit that :func:`bounded` has raised, if the largest p is 1. Those of ``closed`` bins
+    Nor is any below the p of a logit that ``bounded`` has raised, if the largest p is 1. Those of ``closed`` bins
     are 0.
     """
     bins = values.shape[-1]
@@ -118,7 +118,7 @@ def nearest(
 def logits(
     probabilities: Float[Tensor, "*n k"], floor: float = 0.0, closed: Bool[Tensor, "*n k"] | None = None
 ) -> Float[Tensor, "*n k"]:
-    """Compute centred logits of ``probabilities``, clamped to just above the floor; see :func:`log_probabilities`.
+    """Compute centred logits of ``probabilities``, clamped to just above the floor; see ``log_probabilities``.
 
     What ``closed`` bins have of them goes to the others, in proportion.
     """

@@ -80,7 +80,7 @@ def coverage(
 def coverages(
     distribution: SceneDistribution, directions: Mapping[str, Float[np.ndarray, "_ 3"]], within_deg: float
 ) -> dict[str, dict[str, Coverage]]:
-    """Compute :func:`coverage` of all factors that have one, by object and factor."""
+    """Compute ``coverage`` of all factors that have one, by object and factor."""
     found: dict[str, dict[str, Coverage]] = {}
     for name, seen in directions.items():
         every = {

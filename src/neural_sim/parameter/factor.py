@@ -20,7 +20,7 @@ from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
 COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
-"""The numbers of a :class:`SceneDraw` that images depend on smoothly."""
+"""The numbers of a ``SceneDraw`` that images depend on smoothly."""
 Gap = Literal["disjoint", "uniform", "same"]
 Floor = Annotated[float, Ge(0), Lt(1)]
 """Smallest probability of a bin, below 1 over their number."""
@@ -33,7 +33,7 @@ class ConfiguredDistributions:
 
     Args:
         initial, target: distributions of objects not named in ``biased``.
-        biased: object name -> {initial: ..., target: ...}, see :func:`distributions.distribution`.
+        biased: object name -> {initial: ..., target: ...}, see ``distributions.distribution``.
         gap: how far biased objects start from their target: ``disjoint`` as ``biased`` says, ``uniform``, or ``same``,
             at the target itself.
         closed: object name -> its bins, from 1, that nothing is drawn from, whatever the distributions say of them.
@@ -203,7 +203,7 @@ class BinnedFactor:
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """Compute the logits that give :meth:`probabilities`, but for bins that are closed."""
+        """Compute the logits that give ``probabilities``, but for bins that are closed."""
         return self.psi_of(self.probabilities(which, object_name), self.closed(object_name))
 
     def closed(self, object_name: str) -> Bool[Tensor, "k"]:
@@ -230,7 +230,7 @@ class BinnedFactor:
         return binned.log_slopes(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Raise logits out of reach of the largest, see :func:`~neural_sim.parameter.bins.bounded`."""
+        """Raise logits out of reach of the largest, see ``bounded``."""
         return binned.bounded(psi, self.floor)
 
     def moved(
@@ -238,7 +238,7 @@ class BinnedFactor:
     ) -> Float[Tensor, "*n k"]:
         """Compute logits of the probabilities nearest to p + ``change``.
 
-        None is lower than :meth:`project` lets it be, nor than the fraction ``keep`` of what it was.
+        None is lower than ``project`` lets it be, nor than the fraction ``keep`` of what it was.
         """
         p, closed = self.p_of(psi), binned.is_closed(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p, closed), self.floor, closed)

@@ -49,8 +49,8 @@ class Illumination:
         constraint: ``simplex``: no weight below 0; ``affine``: any that add up to 1.
         deviation: standard deviation of each weight in Gaussian draws.
         initial, target: weights of objects not named in ``biased``: ``uniform``, ``{dominant: b}``,
-            ``{modes: [b, ...]}`` (see :func:`distributions.distribution`) or k numbers that add up to 1.
-        biased, gap: see :class:`ConfiguredDistributions`.
+            ``{modes: [b, ...]}`` (see ``distributions.distribution``) or k numbers that add up to 1.
+        biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.

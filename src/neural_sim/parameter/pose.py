@@ -35,11 +35,11 @@ class Pose:
             (360 - phi, rho + 180) are one place and direction, with the camera upside down in one of them: bins i and
             k + 1 - i show an object from the same sides, upright and on its head.
         other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
-        temperature, bin_mean, floor: see :class:`BinnedFactor`; ``bin_mean`` is that of the full circle.
+        temperature, bin_mean, floor: see ``BinnedFactor``; ``bin_mean`` is that of the full circle.
         uncovered: what happens to bins that no photograph of an object is near: ``leave_out``, their p is 0, or
             ``render``.
         covered_within_deg: angle from a pose to a photograph's direction up to which it is near.
-        initial, target, biased, gap: see :class:`ConfiguredDistributions`. With ``both``, {phi: ..., rho: ...} gives
+        initial, target, biased, gap: see ``ConfiguredDistributions``. With ``both``, {phi: ..., rho: ...} gives
             each angle a distribution; a single distribution is phi's, and rho is uniform.
 
     Raises:

@@ -104,7 +104,7 @@ class SceneDistribution:
         )
 
     def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
-        """List the radii of ``sizes`` where distances are in metres, see :func:`radii_in_metres`; else None."""
+        """List the radii of ``sizes`` where distances are in metres, see ``radii_in_metres``; else None."""
         if self.distance_unit == "radii":
             return None
         nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
@@ -152,7 +152,7 @@ class SceneDistribution:
         return dict(zip(self.names, parts, strict=True))
 
     def join(self, parts: Mapping[str, Float[Tensor, "*n _"]]) -> Float[Tensor, "*n K"]:
-        """Join what :meth:`split` has split."""
+        """Join what ``split`` has split."""
         return torch.cat([parts[name] for name in self.names], -1)
 
     def psi(self, which: str, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
@@ -275,7 +275,7 @@ class SceneDistribution:
         return replace(draw, weights=drawn.weights, explored=drawn.unprojected)
 
     def relaxed(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
-        """Draw samples that are differentiable in psi, see :meth:`BinnedFactor.relaxed`."""
+        """Draw samples that are differentiable in psi, see ``BinnedFactor.relaxed``."""
         parts = self.split(psi)
         placed: dict[str, Tensor] = {}
         bins: dict[str, Tensor] = {}
@@ -332,7 +332,7 @@ class SceneDistribution:
         return statistics
 
     def bins_of(self, draw: SceneDraw) -> Int[Tensor, "n factors"]:
-        """Find the bins of each draw's coordinates, see :meth:`BinnedFactor.stratum_of`; a column a binned factor."""
+        """Find the bins of each draw's coordinates, see ``BinnedFactor.stratum_of``; a column a binned factor."""
         return _columns([f.stratum_of(draw) for f in self.binned], draw.phi)
 
     def _draw(

@@ -105,7 +105,7 @@ class Mirror:
     the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients
     near the end, and objects without a gradient would drift.)
 
-    ``shrink`` multiplies each component of the average by :func:`shrinkage` (James and Stein 1961, positive part):
+    ``shrink`` multiplies each component of the average by ``shrinkage`` (James and Stein 1961, positive part):
     components within their noise do not move. Standard errors that are not finite shrink nothing.
     """
 

@@ -26,8 +26,8 @@ class Zoom:
         range: nearest and farthest distance; or smallest and largest focal length in units of the camera's own. Bin 1
             is the nearest, or the smallest magnification.
         unit: of the distances, ``radii`` of each object or ``metres``; has no meaning for a focal length.
-        temperature, floor: see :class:`BinnedFactor`.
-        initial, target, biased, gap: see :class:`ConfiguredDistributions`.
+        temperature, floor: see ``BinnedFactor``.
+        initial, target, biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
         ValueError: any of these out of its range, with the key and the value.

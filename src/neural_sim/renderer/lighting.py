@@ -68,7 +68,7 @@ def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.n
 def temperature_colour(kelvin: float) -> Vector:
     """SRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
 
-    Raises ``ValueError`` outside :data:`Kelvin`'s range.
+    Raises ``ValueError`` outside ``Kelvin``'s range.
     """
     check(kelvin, Kelvin, "temperature_colour.kelvin")
     wavelength = np.arange(360.0, 831.0, 5.0)

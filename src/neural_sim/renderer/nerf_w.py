@@ -63,7 +63,7 @@ class NerfWRenderer(NerfRenderer):
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """Render as ``render`` does, and depth, see :meth:`NerfRenderer.render_surface`."""
+        """Render as ``render`` does, and depth, see ``NerfRenderer.render_surface``."""
         field, weights = _checked(field, weights, len(camera_to_world))
         maps = camera_to_world.new_empty(len(camera_to_world), camera.height, camera.width, 5)
         for light, views in _groups(weights, maps.device):

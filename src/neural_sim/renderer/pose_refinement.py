@@ -203,7 +203,7 @@ def _flat(maps: Maps) -> Float[Tensor, "views n"]:
 
 
 def pose_rates(poses: Float[Tensor, "views 4 4"]) -> Float[Tensor, "6 views 4 4"]:
-    """Differentiate :func:`moved` by turns about a camera's own axes (1 / rad) and motions along them (1 / radius)."""
+    """Differentiate ``moved`` by turns about a camera's own axes (1 / rad) and motions along them (1 / radius)."""
     rates = poses.new_zeros(6, *poses.shape)
     for axis, unit in enumerate(torch.eye(3, dtype=poses.dtype, device=poses.device)):
         rates[axis, :, :3, :3] = poses[:, :3, :3] @ _cross(unit)

@@ -65,7 +65,7 @@ def write_detections(
 
 
 def read_detections(file: Path) -> tuple[LabelledImages, dict[str, list[Detections]]]:
-    """Read what :func:`write_detections` wrote: the test set without pixels, and the detections of every detector."""
+    """Read what ``write_detections`` wrote: the test set without pixels, and the detections of every detector."""
     stored = json.loads(file.read_text(encoding="utf-8"))
     count = stored.pop("images")
     by_image = {which: _by_image(rows, count) for which, rows in stored.items()}

@@ -44,7 +44,7 @@ class Comparison:
         ahead: the reference's score minus each other method's.
         area: the same of the areas under the score against log seconds, per unit of log seconds.
         spent: what every method needed in all, with the warm start, means over seeds.
-        at_equal_cost: the score at the seconds that the cheapest method took in all, see :func:`ap_at`.
+        at_equal_cost: the score at the seconds that the cheapest method took in all, see ``ap_at``.
         equal_cost: these seconds, their mean over seeds.
         budgets: seconds from the first scored iteration of any run to the last.
         ahead_at: the reference's lead over each other method at each of ``budgets``; a method that has ended by then
@@ -146,7 +146,7 @@ def biased_ap(run: FinishedRun, clock: Clock) -> Curve:
 def area_under(
     seconds: Float[np.ndarray, "points"], ap: Float[np.ndarray, "points"], first: float, last: float
 ) -> float:
-    """Return the mean of AP over log seconds in [first, last], AP as :func:`ap_at` has it at every budget."""
+    """Return the mean of AP over log seconds in [first, last], AP as ``ap_at`` has it at every budget."""
     begun = seconds > 0.0
     if not begun.any():
         return float(ap[0])

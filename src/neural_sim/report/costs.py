@@ -21,7 +21,7 @@ PHASES: Mapping[str, tuple[str, ...]] = {
 """Phases of an iteration of the psi loop, as its records have them, by the columns of a table."""
 SECONDS = ("warm start", *PHASES, "in all")
 HEAD = (*(f"{column}, s" for column in SECONDS), "MB", "images", "error of the gradient")
-"""Of the columns of :func:`cells`."""
+"""Of the columns of ``cells``."""
 NOTE = (
     "Seconds on the wall, of the warm start and of the psi loop by phase. MB: the most that the process of a run had "
     "in memory. Images: those rendered for both. Error of the gradient: its standard error over images relative to "

@@ -11,7 +11,7 @@ from neural_sim.report.tracking import flatten
 from neural_sim.types import LabelledImages
 
 KEYS = ("scoring", "configuration", "test_set")
-"""Digests in results.json, see :func:`identity`."""
+"""Digests in results.json, see ``identity``."""
 SCORED = ("views", "field", "renderer", "synthesis", "unlearned", "target", "detector", "training")
 """Groups of the configuration that a detector's AP depends on, whichever method chose its training distribution."""
 METHOD_KEYS = ("floor", "temperature", "bin_mean", "deviation", "constraint")

@@ -90,7 +90,7 @@ def over_seeds(values: Float[np.ndarray, "seeds"]) -> Estimate:
 def over_seeds_and_images(
     values: Float[np.ndarray, "seeds"], resampled: Float[np.ndarray, "draws seeds"]
 ) -> Estimate:
-    """Return the mean over seeds of a :data:`Sample`, given by its two parts.
+    """Return the mean over seeds of a ``Sample``, given by its two parts.
 
     One seed's interval is from the 2.5 % to the 97.5 % quantile over images.
     """

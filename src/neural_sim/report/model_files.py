@@ -46,7 +46,7 @@ class ModelFiles:
 
     Args:
         onnx: ``model.onnx``; wants the packages of the extra ``onnx``.
-        nms: non-maximum suppression inside ``model.onnx``, see :func:`onnx_export.export`.
+        nms: non-maximum suppression inside ``model.onnx``, see ``onnx_export.export``.
         pyfunc: a pyfunc model in the run in MLflow.
         registered_name: under which MLflow registers a version of that; None: it does not.
 
@@ -91,7 +91,7 @@ def log_detector(
     """Write a detector to an open run as a pyfunc model.
 
     The model takes RGB photographs of any one size and gives a table of detections, see
-    :class:`pyfunc_model.PhotographDetector`.
+    ``pyfunc_model.PhotographDetector``.
 
     Args:
         run: open in MLflow.

@@ -58,7 +58,7 @@ class RunResults:
             real_only and views_only.
         fields: scores of every object's field while it was fitted.
         seconds: by stage.
-        memory: the largest so far in MB by name, see :func:`devices.peak_memory_mb`.
+        memory: the largest so far in MB by name, see ``devices.peak_memory_mb``.
         left_out: work that was not done, and why.
         config: the whole configuration.
         validation_ap: the score of the detector of ``learned`` on the validation images, the outer objective's:
@@ -66,7 +66,7 @@ class RunResults:
         curve: what the method had spent (images, detector_steps, products, seconds) and what its psi was worth (``ap``)
             at every iteration that was scored.
         symmetric_bins: groups of bins (from 1), by object and angle, whose views an object's symmetry makes the same.
-        identity: which runs this one can be compared with, see :func:`identity.identity`.
+        identity: which runs this one can be compared with, see ``identity.identity``.
         real: how photographs trained (``mode``) and how many (``photographs``); empty without.
         score: what detectors are scored by: AP, or accuracy, which ``ap`` then has.
         shown: what the target's boxes show; empty where nobody read them.

@@ -28,7 +28,7 @@ class LiveRun:
 
     @property
     def where(self) -> str:
-        """How to look at it, see :func:`tracking.where`."""
+        """How to look at it, see ``tracking.where``."""
         return self._run.where
 
     def iteration(self, record: Mapping[str, Any]) -> None:
@@ -56,7 +56,7 @@ class LiveRun:
     def detector(
         self, folder: Path, example: UInt8[np.ndarray, "n h w 3"], registered_name: str | None = None
     ) -> str:
-        """Write the run's detector as a model, see :func:`model_files.log_detector`."""
+        """Write the run's detector as a model, see ``model_files.log_detector``."""
         return log_detector(self._run, folder, example, registered_name)
 
     def finish(self, results: RunResults, folder: Path) -> None:
@@ -77,7 +77,7 @@ def live_run(
     biased: Sequence[str],
     begun: float | None = None,
 ) -> Iterator[LiveRun]:
-    """Open a run with the configuration as its parameters, see :func:`tracking.opened`."""
+    """Open a run with the configuration as its parameters, see ``tracking.opened``."""
     seed, gap = config["seed"], config.get("gap", "disjoint")
     name = f"{method} seed {seed}" + ("" if gap == "disjoint" else f" gap {gap}")
     tags = {

@@ -2,7 +2,7 @@
 
 Scores are comparable between runs that share what is scored (``scoring``) and the test images of a seed (``test_set``).
 Seeds may be averaged where a method ran with the same settings for all of them (``configuration``). The three are
-digests in results.json, see :mod:`identity`.
+digests in results.json, see ``identity``.
 """
 
 from __future__ import annotations

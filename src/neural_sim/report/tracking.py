@@ -73,7 +73,7 @@ class Run:
 
     @property
     def where(self) -> str:
-        """How to look at it, see :func:`where`."""
+        """How to look at it, see ``where``."""
         return where(self.uri, self.experiment_id, self.run_id)
 
     def log(self, metrics: Mapping[str, float], step: int = 0) -> None:
@@ -170,7 +170,7 @@ def opened(
     """Open a run that is RUNNING inside and then FINISHED; FAILED after an exception, KILLED after SIGTERM or Ctrl-C.
 
     A new SQLite store is created, and every store written to, under a lock, so that workers of a sweep can share it.
-    Runs that a killed process of this machine left open are closed first, see :func:`close_abandoned`.
+    Runs that a killed process of this machine left open are closed first, see ``close_abandoned``.
 
     Args:
         uri: of the store.
@@ -365,7 +365,7 @@ def experiments(uri: str) -> list[str]:
 
 
 def where_runs(uri: str, experiment: str) -> str:
-    """Return how to look at an experiment's table of runs, see :func:`where`.
+    """Return how to look at an experiment's table of runs, see ``where``.
 
     Raises:
         ValueError: no experiment of that name.

@@ -1,6 +1,6 @@
 """A page in the browser that shows an object's field, the cameras of its bins, and renders with detections.
 
-Needs viser (the extra ``viewer``). What is shown is computed by :class:`Shots`, which does not need it.
+Needs viser (the extra ``viewer``). What is shown is computed by ``Shots``, which does not need it.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ class TrainedStage(Stage[TrainedDetector]):
 class DetectorStage(TrainedStage):
     """A detector trained from scratch on images drawn from psi, with the same budget for every method.
 
-    ``probabilities`` is the digest of p, see :meth:`SceneDistribution.digest_of`; ``phase`` is that of the run which
+    ``probabilities`` is the digest of p, see ``SceneDistribution.digest_of``; ``phase`` is that of the run which
     needs the detector, ``called`` describes psi in messages. ``targets`` are the sets whose photographs train too,
     where ``training.real`` combines both (None: it does not).
     """

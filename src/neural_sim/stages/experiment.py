@@ -41,7 +41,7 @@ _OBJECTIVES = {"AP": ("smooth_ap", SmoothAP), "accuracy": ("smooth_accuracy", Sm
 class Run:
     """What a run is called and where it works.
 
-    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of :data:`SCORES`; with ``resume``
+    ``score_at`` are parts of a method's iterations, in (0, 1]; ``task`` is one of ``SCORES``; with ``resume``
     unfinished work of killed runs is taken up. ``workers`` processes make independent results side by side.
 
     Raises:

@@ -44,7 +44,7 @@ _STATE = (
     Average, Certificate, FactorEstimate, ImplicitQuality, IterationRecord, Stay, TakenBack, UnrolledQuality,
     UpdateState, Verdict,
 )  # fmt: skip
-"""What a loop's state holds, see :meth:`OuterLoop.state`."""
+"""What a loop's state holds, see ``OuterLoop.state``."""
 Method = Fixed | LabelShift | HypergradientLoop | Response | RewardMethod
 
 

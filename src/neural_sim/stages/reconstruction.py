@@ -21,7 +21,7 @@ from neural_sim.synthesis.subjects import MeshSubject
 
 @dataclass(frozen=True)
 class ReconstructionStage(Stage[trimesh.Trimesh]):
-    """The mesh of all views but the held-out ones, see :func:`reconstruct`."""
+    """The mesh of all views but the held-out ones, see ``reconstruct``."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "reconstruction"

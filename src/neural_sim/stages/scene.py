@@ -106,7 +106,7 @@ class PictureSubjectStage(SubjectStage[PictureSubject]):
 
 
 class TrainingImages(Protocol):
-    """What gives a detector its training images: a :class:`Scene`, or :class:`LoadedImages`."""
+    """What gives a detector its training images: a ``Scene``, or ``LoadedImages``."""
 
     def training_set(
         self, psi: Float[Tensor, "objects K"], count: int, generator: torch.Generator
@@ -116,7 +116,7 @@ class TrainingImages(Protocol):
 
 
 class TrainingImagesStage(Stage[Any]):
-    """What gives a detector its training images (:class:`TrainingImages`)."""
+    """What gives a detector its training images (``TrainingImages``)."""
 
     phase: ClassVar[str] = "field"
     kind: ClassVar[str] = "scene"

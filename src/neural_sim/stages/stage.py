@@ -45,10 +45,10 @@ class Stage(ABC, Generic[T]):
         return False
 
     def check(self) -> None:
-        """Refuse now what :meth:`make` would refuse, as far as that shows without results of other stages.
+        """Refuse now what ``make`` would refuse, as far as that shows without results of other stages.
 
         Raises:
-            ValueError: as :meth:`make`.
+            ValueError: as ``make``.
         """
 
     @property
@@ -97,7 +97,7 @@ class Stage(ABC, Generic[T]):
 
     @property
     def needed(self) -> Iterator[Stage[Any]]:
-        """The inputs whose results :meth:`make` reads: all of them, unless a stage says otherwise."""
+        """The inputs whose results ``make`` reads: all of them, unless a stage says otherwise."""
         return self.inputs
 
     @cached_property
@@ -151,7 +151,7 @@ class Results:
         self._seen.add(entry)
 
     def checkpoint(self, stage: Stage[Any], classes: Sequence[type] = (), every: float = 0.0) -> Checkpoint:
-        """Return where the work of a stage that is being made stands, see :class:`Checkpoint` and :class:`Store`.
+        """Return where the work of a stage that is being made stands, see ``Checkpoint`` and ``Store``.
 
         Args:
             stage: the stage.
@@ -189,7 +189,7 @@ class Results:
         """Refuse now what evaluating the stages would refuse, perhaps after minutes of work on other results.
 
         Returns:
-            The stages that would be computed, see :meth:`missing`; those that are to be made early are made already.
+            The stages that would be computed, see ``missing``; those that are to be made early are made already.
 
         Raises:
             ValueError: as evaluating them.

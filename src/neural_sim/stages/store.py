@@ -190,7 +190,7 @@ def _lock(path: Path) -> FileLock:
 
 
 def _read(path: Path) -> Entry | None:
-    """Return an entry, None where there is none. Raises :class:`_Damage`."""
+    """Return an entry, None where there is none. Raises ``_Damage``."""
     stored = _content(path)
     if stored is None:
         return None
@@ -200,7 +200,7 @@ def _read(path: Path) -> Entry | None:
 
 
 def _content(path: Path, classes: Sequence[type] = ()) -> Any:
-    """Return what a file holds, None where there is none. Raises :class:`_Damage`."""
+    """Return what a file holds, None where there is none. Raises ``_Damage``."""
     try:
         with path.open("rb") as file, torch.serialization.safe_globals(list(classes)):
             file.seek(_checked_header(file))
@@ -215,7 +215,7 @@ def _content(path: Path, classes: Sequence[type] = ()) -> Any:
 
 
 def _checked_header(file: BinaryIO) -> int:
-    """Return the length of an entry's first line, of which the rest is found true. Raises :class:`_Damage`."""
+    """Return the length of an entry's first line, of which the rest is found true. Raises ``_Damage``."""
     header = file.readline(len(_header("", 0)))
     if not header.startswith(_HEADER[:16].encode()):
         raise _Damage("it has no sum of its content, as entries of older versions")
@@ -298,5 +298,5 @@ def to_bytes(images: Tensor) -> Tensor:
 
 
 def from_bytes(images: Tensor) -> Tensor:
-    """Return what :func:`to_bytes` stored, as float32."""
+    """Return what ``to_bytes`` stored, as float32."""
     return images.to(torch.float32) / 255

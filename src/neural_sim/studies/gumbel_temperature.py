@@ -58,7 +58,7 @@ class Truth:
     """One object's derivative over hard bins.
 
     ``length`` is its norm, ``noise`` its standard error, ``spread`` the stratified estimator's with as many images as a
-    row of :class:`AtTemperature`. ``probabilities`` are p, the expected frequencies of draws.
+    row of ``AtTemperature``. ``probabilities`` are p, the expected frequencies of draws.
     """
 
     object: str
@@ -143,7 +143,7 @@ def _estimator(context: Context) -> PathwiseEstimator:
 def against(
     estimates: Float[Tensor, "rounds k"], truth: Float[Tensor, "k"], truth_errors: Float[Tensor, "k"]
 ) -> tuple[float, float, float, float]:
-    """Return bias, its standard error, spread and cosine of independent estimates, see :class:`AtTemperature`."""
+    """Return bias, its standard error, spread and cosine of independent estimates, see ``AtTemperature``."""
     mean, variance = estimates.mean(0), estimates.var(0)
     off = mean - truth
     noise = variance / len(estimates) + truth_errors.square()

@@ -47,7 +47,7 @@ class Interpolation(Task):
         ends: numbers of the two anchor lights, from 1.
         steps: number of images, the ends included.
         image_size: in pixels.
-        phi_deg: the camera's first angle in degrees, see :func:`neural_sim.cameras.orbit`.
+        phi_deg: the camera's first angle in degrees, see ``neural_sim.cameras.orbit``.
         rho_deg: its second angle in degrees.
         distance: its distance in object radii.
     """

@@ -75,7 +75,7 @@ class Layout:
 def draw_layout(
     own: Int[Tensor, "n"], classes: int, count: ObjectCount, generator: torch.Generator, present: bool = False
 ) -> Layout:
-    """Of images whose own classes are ``own``; see :meth:`ObjectCount.draw` for ``present``.
+    """Of images whose own classes are ``own``; see ``ObjectCount.draw`` for ``present``.
 
     Raises:
         ValueError: for more objects an image than classes.

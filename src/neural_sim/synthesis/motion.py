@@ -43,7 +43,7 @@ def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"
 
     The matrix takes a pixel's direction into the world. At a camera of focal length m, a longer one narrows that
     direction's x and y as a matrix with shorter axes would, d(x/m)/dm = -(x/m)/m, but for the direction's length, which
-    :func:`~neural_sim.cameras.ray_rates` keeps.
+    ``ray_rates`` keeps.
 
     Raises:
         ValueError: no name, or one that no camera follows.

@@ -58,7 +58,7 @@ class PooledSubject:
         generator: torch.Generator,
         how: Draws = HARD,
     ) -> RenderedObject:
-        """See :class:`Subject`."""
+        """See ``Subject``."""
         if not isinstance(how, HardDraws):
             raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
         noise = how.noise(distribution, count, generator, torch.float32)
@@ -74,7 +74,7 @@ class PooledSubject:
         psi: Float[Tensor, "K"],
         generator: torch.Generator,
     ) -> RenderedObject:
-        """See :class:`Subject`."""
+        """See ``Subject``."""
         size = distribution.factor(factor).size
         bins, scenes = torch.arange(size).repeat_interleave(per_bin), torch.arange(per_bin).repeat(size)
         chosen = bins[:, None]

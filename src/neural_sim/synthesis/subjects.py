@@ -32,8 +32,8 @@ CPU = torch.device("cpu")
 class Subject(Protocol):
     """One object of a scene, which draws itself from p_psi alone; the scene composes it with others and a background.
 
-    Every kind gives exact draws. Draws with derivatives by psi (:class:`RelaxedDraws`) come from a
-    :class:`FieldSubject` only; the other kinds refuse them with a ``ValueError`` that names the object.
+    Every kind gives exact draws. Draws with derivatives by psi (``RelaxedDraws``) come from a
+    ``FieldSubject`` only; the other kinds refuse them with a ``ValueError`` that names the object.
     """
 
     @property
@@ -145,7 +145,7 @@ class RenderedSubject(ABC):
         generator: torch.Generator,
         how: Draws = HARD,
     ) -> RenderedObject:
-        """See :class:`Subject`."""
+        """See ``Subject``."""
         if isinstance(how, RelaxedDraws):
             raise not_differentiable(self.name, how)
         noise = how.noise(distribution, count, generator, self.dtype)
@@ -161,7 +161,7 @@ class RenderedSubject(ABC):
         psi: Float[Tensor, "K"],
         generator: torch.Generator,
     ) -> RenderedObject:
-        """See :class:`Subject`."""
+        """See ``Subject``."""
         psi = psi.detach().to(self.dtype)
         return self.render(
             camera, distribution, distribution.probes(factor, per_bin, psi, generator, self.dtype)
@@ -181,7 +181,7 @@ class FieldSubject(RenderedSubject):
 
     Args:
         name: name of the object.
-        radius: see :class:`RenderedSubject`.
+        radius: see ``RenderedSubject``.
         field: the field, which may have appearance codes.
         renderer: its renderer; one that weighs lights where the field has appearance codes.
     """
@@ -231,7 +231,7 @@ class FieldSubject(RenderedSubject):
         camera_to_world: Float[Tensor, "n 4 4"],
         weights: Float[Tensor, "n lights"] | None = None,
     ) -> tuple[Maps, Float[Tensor, "n h w"]]:
-        """Render the maps and the depth along the view axis, see :meth:`NerfRenderer.render_surface`."""
+        """Render the maps and the depth along the view axis, see ``NerfRenderer.render_surface``."""
         poses = camera_to_world.to(self.device, self.dtype)
         if weights is None:
             rgb, opacity, depth = self.renderer.render_surface(self.field, camera, poses)
@@ -242,7 +242,7 @@ class FieldSubject(RenderedSubject):
     def render_rays(
         self, rays: Rays, weights: Float[Tensor, "lights"] | None = None
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-        """Render rays under one light, differentiably, see :meth:`NerfRenderer.render_rays`."""
+        """Render rays under one light, differentiably, see ``NerfRenderer.render_rays``."""
         if weights is None:
             return self.renderer.render_rays(self.field, rays)
         return self.lit_renderer.render_rays(self.field, rays, weights=weights)
@@ -303,7 +303,7 @@ class PhotographedField(RenderedSubject):
 
     Args:
         name: name of the object.
-        radius: see :class:`RenderedSubject`.
+        radius: see ``RenderedSubject``.
         field: the field; None for targets that render no object.
         renderer: its renderer.
     """
@@ -335,7 +335,7 @@ class MeshSubject(RenderedSubject):
 
     Args:
         name: name of the object.
-        radius: see :class:`RenderedSubject`.
+        radius: see ``RenderedSubject``.
         mesh: the mesh in its normalised frame.
         renderer: its renderer, with the light of images whose lights have no weights.
         rig: lights whose weights draws may have; None where the light is fixed.

@@ -66,14 +66,14 @@ class Target(ABC):
             seed: of all random choices.
 
         Returns:
-            ``val``, ``test`` and, if the target :attr:`trains`, ``train``; float32 on the CPU. They share no image.
+            ``val``, ``test`` and, if the target ``trains``, ``train``; float32 on the CPU. They share no image.
 
         Raises:
             ValueError: files that cannot be used, or classes that are no objects.
         """
 
     def training_count(self, seed: int) -> int | None:
-        """Return the number of images in ``train``, None if only :meth:`sets` can tell."""
+        """Return the number of images in ``train``, None if only ``sets`` can tell."""
         return None
 
     def camera(self) -> PinholeCamera:
@@ -102,7 +102,7 @@ class Photographs(Target):
         train_fraction: of the photographs that are not scored, the fraction for training (``training.real``), whole
             groups too; the others are for validation. None: all of them are.
         split_by: what belongs together and so lies in one part, as frames of one video must, see
-            :func:`neural_sim.target.split.groups_of`; None: what the data set says, else every photograph is a group of
+            ``neural_sim.target.split.groups_of``; None: what the data set says, else every photograph is a group of
             its own, and near-duplicates in two parts are warned of.
         limit: at most this number of photographs; subclasses say of what, and which; None: all.
         unmatched: what becomes of a class of the data set that is no object: ``refuse`` the data set, or ``leave_out``
@@ -145,8 +145,8 @@ class Photographs(Target):
 class AnnotatedPhotographs(Photographs):
     """Photographs with labels of their own, parted by groups and by their pixels: equal ones lie in one part.
 
-    A subclass says what there is to read: :attr:`source`, :meth:`files` and :meth:`photographs`. For the arguments see
-    :class:`Photographs`.
+    A subclass says what there is to read: ``source``, ``files`` and ``photographs``. For the arguments see
+    ``Photographs``.
     """
 
     @property
@@ -173,7 +173,7 @@ class AnnotatedPhotographs(Photographs):
         """Read all photographs; labels are positions in ``objects``.
 
         Raises:
-            ValueError: as of :meth:`photographs`, or a file that cannot be read.
+            ValueError: as of ``photographs``, or a file that cannot be read.
         """
         return read(self.photographs(objects), height, width, self.minimum_side, self.source)[0]
 

@@ -73,7 +73,7 @@ def _bins(images: LabelledImages, row: int) -> list[int]:
 
 
 def most(p: Sequence[float], available: Sequence[int], generator: torch.Generator) -> list[int] | None:
-    """Return the largest :func:`apportioned` number of photographs that is available; None where not even one is."""
+    """Return the largest ``apportioned`` number of photographs that is available; None where not even one is."""
     for total in range(sum(available), 0, -1):
         counts = apportioned(p, total, available, generator)
         if counts is not None:

@@ -52,7 +52,7 @@ class BopTarget(PosedTarget):
         test: the folder of scenes that are scored: the images of ``test_targets_bop19.json`` where present and the
             folder is ``test``, else one in ``every`` photographs of each scene.
 
-    See :class:`PosedTarget` for the other arguments.
+    See ``PosedTarget`` for the other arguments.
     """
 
     val: str | None = None

@@ -85,7 +85,7 @@ class TargetCamera(CameraSource):
         width: of the detector's images, in pixels, with the height in proportion; null: the photographs' own.
 
     Raises:
-        ValueError: a width below 1; from :meth:`camera`, a target that knows no camera.
+        ValueError: a width below 1; from ``camera``, a target that knows no camera.
     """
 
     width: PositiveInt | None = None

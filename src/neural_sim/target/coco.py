@@ -51,10 +51,10 @@ class CocoTarget(AnnotatedPhotographs):
             from 1 as ``dominant`` of a distribution is; dots lead into entries of entries (``attributes.pose``). Boxes
             without one have no bin. None: no box has.
         match_bins: in all parts take those photographs alone with which each object's bins are distributed as the
-            ``target`` of the first parameter with bins says, see :func:`neural_sim.target.bin_matching.matching`. Wants
+            ``target`` of the first parameter with bins says, see ``neural_sim.target.bin_matching.matching``. Wants
             photographs of one object.
 
-    See :class:`Photographs` for the other arguments.
+    See ``Photographs`` for the other arguments.
 
     Raises:
         ValueError: no such file, one that is not in COCO form, a number out of its range, ``match_bins`` without
@@ -189,7 +189,7 @@ class CocoTarget(AnnotatedPhotographs):
 
     @override
     def camera(self) -> PinholeCamera:
-        """Return the camera of the file's entry ``camera``, see :func:`neural_sim.target.camera.camera_of_entry`.
+        """Return the camera of the file's entry ``camera``, see ``neural_sim.target.camera.camera_of_entry``.
 
         Raises:
             ValueError: a file without one, or photographs whose listed size is another one.

@@ -286,7 +286,7 @@ class CocoFile:
         """Refuse categories that are no objects; those without annotations are counted in the log instead.
 
         Raises:
-            ValueError: as :meth:`ClassMap.refuse` does.
+            ValueError: as ``ClassMap.refuse`` does.
         """
         used = self.used_names
         classes.refuse(used, objects)
@@ -310,7 +310,7 @@ class CocoFile:
         ]  # fmt: skip
 
     def rows_by_image(self, labels: Mapping[Any, int | None]) -> dict[Any, list[int]]:
-        """Return the places of :attr:`usable` annotations of objects by image id.
+        """Return the places of ``usable`` annotations of objects by image id.
 
         Args:
             labels: label by category id, None for a category that is no object.

@@ -34,7 +34,7 @@ class FolderTarget(AnnotatedPhotographs):
         classes: folder's name -> object name, null to leave a folder out. Names not listed stand for themselves.
         border: pixels that are cut off each side of every photograph, such as ObjectNet's frame of 2.
 
-    See :class:`Photographs` for the other arguments; ``minimum_side`` is of no matter.
+    See ``Photographs`` for the other arguments; ``minimum_side`` is of no matter.
 
     Raises:
         ValueError: no such folder, no folder with photographs in it, one that ``classes`` names and that is not there,

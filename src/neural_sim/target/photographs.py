@@ -73,7 +73,7 @@ class PhotoFiles:
         return Path(os.path.commonpath([path.parent for path in self.paths]))
 
     def name(self, path: Path) -> str:
-        """Return a photograph's path below :attr:`root`, with ``/``."""
+        """Return a photograph's path below ``root``, with ``/``."""
         return path.relative_to(self.root).as_posix()
 
     def read(self, path: Path) -> Image.Image:
@@ -101,7 +101,7 @@ class Letterbox:
         return torch.minimum(boxes.clamp_min(0.0), size) * (inner / size) + offset
 
     def of_photo(self, boxes: Float[Tensor, "b 4"]) -> Float[Tensor, "b 4"]:
-        """Bring (x0, y0, x1, y1) of the new image into the photograph, clipped to it: the inverse of :meth:`boxes`."""
+        """Bring (x0, y0, x1, y1) of the new image into the photograph, clipped to it: the inverse of ``boxes``."""
         size, inner, offset = self._sides(boxes)
         return torch.minimum(((boxes - offset) * (size / inner)).clamp_min(0.0), size)
 

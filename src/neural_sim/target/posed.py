@@ -37,7 +37,7 @@ Radii = Mapping[str, float | None]
 class PosedTarget(Photographs):
     """Photographs with poses, which are parted by scenes before any of them is read.
 
-    A subclass says which photographs there are (:meth:`listed`) and who reads them (:attr:`reader`). ``split_by`` is
+    A subclass says which photographs there are (``listed``) and who reads them (``reader``). ``split_by`` is
     searched for in ``<scene>/<number>``; None: the photographs of a scene belong together. Of more photographs in a
     part than ``limit``, evenly spaced ones are taken.
 
@@ -48,7 +48,7 @@ class PosedTarget(Photographs):
         every: keep every n-th photograph of a scene, where no list of the data set says which.
         min_visibility: objects of which a smaller fraction is visible have no box.
 
-    See :class:`Photographs` for the other arguments.
+    See ``Photographs`` for the other arguments.
 
     Raises:
         ValueError: no such folder, a list or a scene that is missing, a number out of its range, fewer than two groups
@@ -200,7 +200,7 @@ class PosedTarget(Photographs):
         """Read any photographs of the data set; labels are positions in ``objects``.
 
         With ``distribution`` each box has the bin that its pose falls in, see
-        :func:`neural_sim.target.viewpoint.bins_of_poses`, which ``radii`` (metres, by object) are for.
+        ``neural_sim.target.viewpoint.bins_of_poses``, which ``radii`` (metres, by object) are for.
 
         Raises:
             ValueError: files that are missing or contradict each other, a class that is no object.

@@ -65,7 +65,7 @@ class Split:
     Args:
         val_fraction: the part for validation, as near to it as whole groups come; the rest is scored.
         train_fraction: of the photographs that are not scored, the part for training, whole groups too; None: none.
-        split_by: what belongs together, see :func:`groups_of`; None: what the data set says.
+        split_by: what belongs together, see ``groups_of``; None: what the data set says.
     """
 
     val_fraction: PartOfAll = 0.3
@@ -79,7 +79,7 @@ class Split:
             Rows of ``val``, ``test`` and, with a ``train_fraction``, ``train``. No group is in two of them.
 
         Raises:
-            ValueError: see :func:`split`.
+            ValueError: see ``split``.
         """
         val, test = (part.tolist() for part in split(groups, self.val_fraction, generator))
         return {**self.unscored(val, groups, generator), "test": test}
@@ -126,7 +126,7 @@ class Split:
             source: their file or folder, for messages.
 
         Returns:
-            Rows as of :meth:`parts`.
+            Rows as of ``parts``.
         """
         pixels = [hashlib.sha256(look.image.numpy().tobytes()).digest() for look in looks]
         parts = self.parts(joined([look.group for look in looks], pixels), generator)

@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Cameras as :func:`neural_sim.cameras.orbit` places them, float64.
+    """Cameras as ``neural_sim.cameras.orbit`` places them, float64.
 
     ``phi`` and ``rho`` are its angles in radians, ``distance`` is that from the object's centre, in the unit of the
     poses. ``roll`` in [-pi, pi] turns the orbit's camera about its own backward axis, anticlockwise seen from behind:
@@ -91,7 +91,7 @@ def bins_of_poses(
     radius: float | None,
     centre: Float[Tensor, "#n 3"] | None = None,
 ) -> Int[Tensor, "n"]:
-    """Return the bin of each pose by the first binned factor of p_psi, from 0, as :attr:`LabelledImages.bins` has it.
+    """Return the bin of each pose by the first binned factor of p_psi, from 0, as ``LabelledImages.bins`` has it.
 
     Poses are in metres; ``radius`` is that of the object's sphere, None where nobody knows it. -1 where the factor is
     not told by a pose: a focal length, a distance in radii of an object of unknown size, no binned factor. A distance

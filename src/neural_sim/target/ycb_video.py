@@ -58,7 +58,7 @@ class YcbVideoTarget(PosedTarget):
         test_list: the list that is scored, all of it; None: ``keyframe`` where present, else scenes without another
             part.
 
-    See :class:`PosedTarget` for the other arguments.
+    See ``PosedTarget`` for the other arguments.
     """
 
     val_list: str | None = None

@@ -186,7 +186,7 @@ class ExportTask(Task):
 
 
 def _lock_of(root: Path) -> Path:
-    """Return the path that :func:`locked` takes for a data set."""
+    """Return the path that ``locked`` takes for a data set."""
     return root.with_name(f".{root.name}")
 
 

@@ -2,10 +2,10 @@
 
     estimate(scene, validation, psi, settings, generator, groups, whole) -> Estimate
 
-Renders of all bins, from a pool that is rendered once, train a small classifier of bins (:mod:`.network`) and one by
-the size of boxes alone (:mod:`.calibration`); both read the target's boxes. Expectation maximisation over their
-calibrated posterior (:mod:`mixture`) gives the distribution of every object and factor, with an interval for each bin,
-a test against where psi stands, and a test of fit (:mod:`evidence`). ``Estimate.psi`` moves only where both tests allow
+Renders of all bins, from a pool that is rendered once, train a small classifier of bins (``network``) and one by
+the size of boxes alone (``calibration``); both read the target's boxes. Expectation maximisation over their
+calibrated posterior (``mixture``) gives the distribution of every object and factor, with an interval for each bin,
+a test against where psi stands, and a test of fit (``evidence``). ``Estimate.psi`` moves only where both tests allow
 it.
 """
 
@@ -79,7 +79,7 @@ def estimate(
     """Read psi off the boxes of ``validation``.
 
     Args:
-        scene: of pooled renders (:func:`~neural_sim.synthesis.pool.pool_of`), or of fields, of which a pool is rendered
+        scene: of pooled renders (``pool_of``), or of fields, of which a pool is rendered
             here.
         validation: labelled images of the target.
         psi: where it stands.

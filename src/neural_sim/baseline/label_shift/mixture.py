@@ -173,7 +173,7 @@ def posterior(
 ) -> Probabilities:
     """Draw mixtures from their posterior by Gibbs sampling: cells of the boxes given p, then p given their numbers.
 
-    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, p is on average what :func:`maximise` makes
+    The Dirichlet prior has the parameter ``prior``: given the boxes' cells, p is on average what ``maximise`` makes
     of them. (With 1 more, whose mode that is, a bin that has nearly all boxes would be drawn too rarely.) Where the
     likelihood is uncertain, its ``samples`` share the chains.
 
@@ -221,7 +221,7 @@ def ratio_test(
         cells: the combinations of bins.
         null: the distributions that are tested, by the position of their factor.
         known: boxes of known cells: their likelihoods, and their cells. Every cell has one at least.
-        prior: see :func:`maximise`.
+        prior: see ``maximise``.
         draws: of the bootstrap; the smallest p-value is 1 / (``draws`` + 1).
         generator: of all draws.
     """

@@ -55,7 +55,7 @@ class _Bank:
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> Float[Tensor, "n 3 height width"]:
-        """See :class:`Background`; of the bank's own size alone."""
+        """See ``Background``; of the bank's own size alone."""
         images = self.images[torch.randint(len(self.images), (n,), generator=generator)]
         for axis in (2, 3):
             mirrored = torch.rand((n, 1, 1, 1), generator=generator) < 0.5

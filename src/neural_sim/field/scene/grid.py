@@ -71,7 +71,7 @@ class SceneGrid:
         return functional.softplus(GAIN * raw) / self.edge
 
     def in_occupied(self, contracted: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie in cells that :meth:`mark` has left."""
+        """Whether points lie in cells that ``mark`` has left."""
         return self.occupied[cells_of(contracted, self.resolution)]
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:

@@ -35,7 +35,7 @@ class Frame:
         return points * (other.unit / self.unit) + moved
 
     def out(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Inverse of :meth:`into`."""
+        """Inverse of ``into``."""
         return points * self.unit + np.array(self.centre)
 
 
@@ -46,7 +46,7 @@ def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
 
 
 def expand(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Inverse of :func:`contract`; what is outside of the ball of radius 2 goes far away."""
+    """Inverse of ``contract``; what is outside of the ball of radius 2 goes far away."""
     length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
     return points / (length * (2.0 - length).clamp_min(1e-6))
 

@@ -114,7 +114,7 @@ def _row(entries: Sequence[Mapping[str, Any]] = (), **row: Any) -> Measured:
 
 
 def write_measured(file: Path, budget: Mapping[str, Any], rows: Mapping[str, Measured]) -> None:
-    """Write what :func:`read_measured` reads."""
+    """Write what ``read_measured`` reads."""
     write_json(
         file, {"budget": budget, "rows": {name: dataclasses.asdict(row) for name, row in rows.items()}}
     )

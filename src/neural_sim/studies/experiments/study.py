@@ -99,7 +99,7 @@ class Experiments(Task):
     """Write the page of experiments; ``+experiment=experiments_table``.
 
     Args:
-        rows: the constructor arguments of each :class:`Row`, by a name of its own.
+        rows: the constructor arguments of each ``Row``, by a name of its own.
         paper: ``claims`` and ``tables`` of conf/paper/numbers.yaml.
         only: names of the rows to read runs of; null: all.
         page: where the page goes besides the run's folder, with all rows; null: nowhere.

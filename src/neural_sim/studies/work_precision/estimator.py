@@ -68,7 +68,7 @@ class Estimators:
         default: images of the project's own, the stratified one: 24 probes of each of 8 bins.
         repeats: estimates from the largest N; there are more from fewer.
         truth_per_bin: images of every bin for the reference.
-        pathwise: variants of the pathwise estimator, of :data:`PATHWISE`.
+        pathwise: variants of the pathwise estimator, of ``PATHWISE``.
 
     Raises:
         ValueError: an unknown variant, or numbers of images that are no multiples of the first.

@@ -1,6 +1,6 @@
 """The hypergradient of the training that was run, by each adjoint, against the response of training.
 
-The response (:mod:`outer.response`) repeats the training with part of an object's images moved to one bin, under common
+The response (``outer.response``) repeats the training with part of an object's images moved to one bin, under common
 random numbers, and takes no derivative. Derivatives are compared with it as vectors over an object's bins.
 """
 

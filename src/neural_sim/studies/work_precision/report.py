@@ -239,9 +239,9 @@ def _families(held: Mapping[str, Any]) -> list[str]:
 
 
 def write_docs(held: Mapping[str, Any], page: Path, command: str) -> None:
-    """Rewrite a section of ``page`` for each family, see :func:`neural_sim.documents.replace_section`.
+    """Rewrite a section of ``page`` for each family, see ``neural_sim.documents.replace_section``.
 
-    The page has :func:`brief` tables; the whole ones go to the JSON file of the same name.
+    The page has ``brief`` tables; the whole ones go to the JSON file of the same name.
     """
     file = page.with_suffix(".json")
     whole = read_json(file) if file.is_file() else {}

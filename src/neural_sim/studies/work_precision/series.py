@@ -93,7 +93,7 @@ class Series:
 
     @property
     def pareto(self) -> tuple[bool, ...]:
-        """Whether each point is Pareto-optimal, see :func:`pareto`."""
+        """Whether each point is Pareto-optimal, see ``pareto``."""
         return pareto([(point.error, point.seconds) for point in self.points])
 
     def overtaken(self) -> Iterator[tuple[Point, Point]]:

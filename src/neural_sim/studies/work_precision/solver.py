@@ -32,7 +32,7 @@ TIGHT = 1e-12
 
 @dataclass(frozen=True)
 class Product:
-    """How a Hessian product is computed; the fields of :class:`AdjointSolver`."""
+    """How a Hessian product is computed; the fields of ``AdjointSolver``."""
 
     mode: str
     retain_graph: bool

@@ -62,7 +62,7 @@ class DataSet:
     """``count`` images of ``source`` in ``root``, in ``formats``.
 
     Images that are there already stay, with their ids; one with a number of ``count`` or more stays in the set, too.
-    ``identity`` is what all images depend on, see :class:`ExportFolder`; ``models`` are the objects as BOP has them.
+    ``identity`` is what all images depend on, see ``ExportFolder``; ``models`` are the objects as BOP has them.
     """
 
     source: ImageSource

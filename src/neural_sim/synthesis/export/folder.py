@@ -74,7 +74,7 @@ class ExportFolder:
         write_json(self.root / MANIFEST, {"identity": dict(self.identity), "images": images})
 
     def check(self) -> None:
-        """Raise what :meth:`opened` raises, and write nothing."""
+        """Raise what ``opened`` raises, and write nothing."""
         path = self.root / MANIFEST
         if self.root.exists() and not self.root.is_dir():
             raise ValueError(f"export.folder: {self.root} is a file, want a folder")

@@ -78,7 +78,7 @@ class ImageSource:
 
     ``scene`` says how images are made, ``psi`` [objects, K] is what they are drawn from, ``camera`` has their size.
     ``millimetres`` is each object's radius. The own class of image i is i modulo the classes. The synthesizer's shift
-    turns the camera (:func:`cameras.turned`), so that every object has an exact pose under the image's one camera.
+    turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera.
     """
 
     scene: Scene

@@ -20,7 +20,7 @@ def run_lengths(mask: Bool[np.ndarray, "height width"]) -> dict[str, Any]:
 
 
 def mask_of(encoded: dict[str, Any]) -> Bool[np.ndarray, "height width"]:
-    """Inverse of :func:`run_lengths`."""
+    """Inverse of ``run_lengths``."""
     return coco_mask.decode(encoded).astype(bool)
 
 

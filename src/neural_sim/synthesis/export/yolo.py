@@ -48,6 +48,6 @@ def box_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
 
 
 def polygon_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
-    """Class, and the corners of a polygon along the edges of the visible mask's pixels, see :func:`masks.polygon`."""
+    """Class, and the corners of a polygon along the edges of the visible mask's pixels, see ``masks.polygon``."""
     corners = polygon(mask_of(item["mask_visible"])) / (size["width"], size["height"])
     return " ".join([str(item["label"]), *(f"{value:.9f}" for value in corners.flatten().tolist())])
