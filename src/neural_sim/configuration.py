@@ -73,7 +73,7 @@ GONE: dict[str, str] = {
     "outer.certify": "the reference is the response of training; outer.certify_every alone asks for it",
     "outer.certify_per_bin": "it belonged to outer.certify=retrained, which is a reference of the tests now",
     "baseline.max_step": "baseline=lts draws settings of psi now; want baseline.deviation or baseline.learning_rate",
-    "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/numerics.md); boxes are fixed labels",
+    "synthesis.label_gradient": "derivatives of boxes gained nothing (docs/paper.md); boxes are fixed labels",
 }
 """The message for each key or choice (``key=value``) that no longer exists. A key stands for all keys below it, too."""
 
