@@ -8,7 +8,13 @@ import pytest
 import torch
 from scipy.stats import chi2, mannwhitneyu
 
-from neural_sim.baseline.label_shift.evidence import FactorEstimate, Strangeness, estimates_of, part_farther
+from neural_sim.baseline.label_shift.evidence import (
+    FactorEstimate,
+    Span,
+    Strangeness,
+    estimates_of,
+    part_farther,
+)
 
 MOVES = FactorEstimate(
     "mug", "pose", 40, (0.25,) * 4, (0.45, 0.05, 0.45, 0.05), (0.4, 0.0, 0.4, 0.0), (0.5, 0.1, 0.5, 0.1),
@@ -21,6 +27,12 @@ def test_an_estimate_comes_back_from_json():
     assert estimates_of(stored) == (MOVES,)
 
 
+def test_doubt_is_the_mean_total_variation_of_the_draws():
+    p = torch.tensor([0.5, 0.5]).double()
+    drawn = torch.tensor([[0.5, 0.5], [0.8, 0.2], [0.1, 0.9]]).double()
+    assert Span.of(p, drawn, 0.9).doubt == pytest.approx((0.0 + 0.3 + 0.4) / 3)
+
+
 def test_a_sentence_names_groups_with_the_interval_of_their_sum():
     assert MOVES.sentence == "your target shows the mug from pose bins 1/3 (0.80 to 1.00)"
 
@@ -29,13 +41,14 @@ def test_a_sentence_names_groups_with_the_interval_of_their_sum():
     "finding, said",
     [
         ("stays", "psi stays, it may be right"),
+        ("uncertain", "may be off by 0.40 in total variation), so psi stays"),
         ("too few boxes", "40 boxes are too few"),
         ("fits no render", "look like no renders of it (less than held-out ones do in 5% of all pairs"),
         ("not told apart", "90% of held-out ones are read right, 0% by chance, so psi stays"),
     ],
 )
 def test_a_sentence_says_why_psi_does_not_move(finding, said):
-    assert said in dataclasses.replace(MOVES, finding=finding).sentence
+    assert said in dataclasses.replace(MOVES, finding=finding, doubt=0.4).sentence
 
 
 def test_a_search_that_did_not_end_is_said():

@@ -10,23 +10,27 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Finding = Literal["moves", "stays", "not told apart", "fits no render", "too few boxes"]
+from neural_sim.parameter.distributions import total_variation
+
+Finding = Literal["moves", "stays", "uncertain", "not told apart", "fits no render", "too few boxes"]
 
 
 @dataclass(frozen=True)
 class Span:
-    """Probabilities ``p`` with the ends of their intervals."""
+    """Probabilities ``p`` with the ends of their intervals, and how far from ``p`` the target's are expected."""
 
     p: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
+    doubt: float
 
     @staticmethod
     def of(p: Float[Tensor, "k"], drawn: Float[Tensor, "draws k"], covered: float) -> Span:
         """Return intervals that cover this part of the draws."""
         tail = 0.5 * (1.0 - covered)
-        ends = (p, drawn.quantile(tail, 0), drawn.quantile(1.0 - tail, 0))
-        return Span(*(tuple(end.tolist()) for end in ends))
+        low, high = (tuple(drawn.quantile(part, 0).tolist()) for part in (tail, 1.0 - tail))
+        doubt = total_variation(drawn, p.expand_as(drawn)).mean()
+        return Span(tuple(p.tolist()), low, high, float(doubt))
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,10 @@ class FactorEstimate:
         accuracy: part of held-out renders whose group of bins is told right; of lights, the part of the guesses'
             variance that weights explain.
         finding: whether psi ``moves`` to it; ``stays``, since the target may be where psi stands; or does not move
-            because renders themselves are not told apart, boxes look like no render, or there are too few.
+            because the estimate is uncertain, renders themselves are not told apart, boxes look like no render, or
+            there are too few.
         chance: accuracy without looking.
+        doubt: total variation that is expected between the estimate and the target's distribution.
         converged: whether the search for the mixture ended; it does not where the likelihood is flat.
     """
 
@@ -66,6 +72,7 @@ class FactorEstimate:
     accuracy: float
     finding: Finding
     chance: float = 0.0
+    doubt: float = 0.0
     converged: bool = True
 
     @property
@@ -83,6 +90,11 @@ class FactorEstimate:
             if not self.converged:
                 why = f"the likelihood is flat ({why})"
             return f"{self.name}: renders do not tell its {self.factor}: {why}, so psi stays"
+        if self.finding == "uncertain":
+            return (
+                f"{self.name}: its boxes leave open which {self.factor} they show (the estimate may be off by "
+                f"{self.doubt:.2f} in total variation), so psi stays"
+            )
         shown = ", ".join(
             f"{_called(group)} ({_sum(self.low, group):.2f} to {_sum(self.high, group):.2f})"
             for group in self._largest

@@ -151,6 +151,8 @@ class _Object:
     def _judged(self, factor: Factor, read: _Read, strange: float) -> FactorEstimate:
         settings, boxes = self.reader.settings, len(self.seen)
         finding: Finding = "moves" if read.p_value <= settings.level else "stays"
+        if finding == "moves" and read.span.doubt > settings.doubt:
+            finding = "uncertain"
         if not read.converged or read.accuracy - read.chance < settings.skill * (1.0 - read.chance):
             finding = "not told apart"
         if strange > (settings.strange if self.reader.distribution.binned else BEYOND_ALL):
@@ -162,7 +164,7 @@ class _Object:
         span = read.span
         return FactorEstimate(
             self.name, factor.name, boxes, start, span.p, span.low, span.high, own, read.p_value, strange,
-            read.accuracy, finding, read.chance, read.converged,
+            read.accuracy, finding, read.chance, span.doubt, read.converged,
         )  # fmt: skip
 
     def _binned(self) -> tuple[dict[str, _Read], Float[Tensor, "held"]]:

@@ -30,6 +30,8 @@ class LabelShift:
         interval: probability that an interval covers.
         strange: largest probability that a box may look less like the renders than a held-out render does; above, its
             object's psi does not move.
+        doubt: largest total variation that is expected between an estimate and the target's distribution; above, psi
+            does not move.
         skill: smallest accuracy on held-out renders, from 0 of chance to 1; below, psi does not move.
         fewest: boxes of an object, below which it does not move.
         name: in reports.
@@ -46,6 +48,7 @@ class LabelShift:
     draws: Annotated[int, Ge(19)] = 199
     interval: Annotated[float, Gt(0), Lt(1)] = 0.9
     strange: PositiveFraction = 0.7
+    doubt: Fraction = 0.35
     skill: Fraction = 0.15
     fewest: PositiveInt = 8
     name: str = "label_shift"
