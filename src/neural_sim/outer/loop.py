@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from statistics import fmean
+from time import perf_counter
 from typing import Any
 
 import lightning.pytorch as pl
@@ -24,6 +26,7 @@ from neural_sim.devices import placed, trainer_on
 from neural_sim.gradient.hypergradient import Hypergradient
 from neural_sim.outer.certificate import Certificate, line
 from neural_sim.outer.inner import InnerLoop, Numbers, Trained, timed
+from neural_sim.outer.progress import iteration_line
 from neural_sim.outer.records import Cost, IterationRecord, LearnedPsi, Outcome
 
 logger = logging.getLogger(__name__)
@@ -53,6 +56,7 @@ class OuterLoop(pl.LightningModule):
         self.checkpoint: Checkpoint | None = None
         self._cost, self._seconds = Cost(), {"pool": inner.preparation.seconds}
         self._cpu = time.process_time() - inner.preparation.cpu_seconds
+        self._since, self._durations = perf_counter(), list[float]()
 
     @override
     def configure_optimizers(self) -> None:
@@ -166,11 +170,12 @@ class OuterLoop(pl.LightningModule):
         )
         self.records.append(last)
         self._cost, self._seconds, self._cpu = Cost(), {}, cpu
-        number = len(self.records)
-        if certificate is None:
-            logger.info("round %d/%d val %.4f%s", number, self.rounds, last.validation_loss, _outcomes(last))
-        else:
-            logger.info(line(certificate, number, self.rounds, last.validation_loss) + _outcomes(last))
+        now = perf_counter()
+        self._durations.append(now - self._since)
+        self._since, left = now, fmean(self._durations) * (self.rounds - len(self.records))
+        logger.info(iteration_line(self.records, self.rounds, self._durations[-1], left))
+        if certificate is not None:
+            logger.debug(line(certificate, len(self.records), self.rounds, last.validation_loss))
         return last
 
     def _lengths(self, values: Mapping[str, Tensor]) -> list[float]:
@@ -245,13 +250,3 @@ def learn_psi(
             # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
             trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)
-
-
-def _outcomes(record: IterationRecord) -> str:
-    """Name accepted and rejected steps of objects, and those that were taken back at the end, for the log."""
-    text = ""
-    for outcome, accepted in (("accepted", True), ("rejected", False)):
-        names = [name for name, verdict in record.verdicts.items() if verdict.accepted == accepted]
-        text += f"; {outcome} {', '.join(names)}" if names else ""
-    backs = [f"{name} (keeps {b.kept} of {b.accepted} steps)" for name, b in record.taken_back.items()]
-    return text + (f"; taken back {', '.join(backs)}" if backs else "")
