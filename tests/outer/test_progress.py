@@ -12,12 +12,17 @@ from neural_sim.outer.way import TakenBack
 
 
 def record(loss, **more):
-    empty = dict.fromkeys(
-        ("probabilities", "entropies", "seconds", "verdicts", "taken_back"), {}
-    ) | dict.fromkeys(("gradient_norms", "gradient_errors", "scores"), [])
+    empty = {key: {} for key in ("probabilities", "entropies", "seconds", "verdicts", "taken_back")}
+    lists = {key: [] for key in ("gradient_norms", "gradient_errors", "scores")}
     numbers = dict.fromkeys(("images", "detector_steps", "products", "images_without_box"), 0)
     plain = IterationRecord(
-        **empty, **numbers, validation_loss=loss, training_loss=0.1, certificate=None, cpu_seconds=1.0
+        **empty,
+        **lists,
+        **numbers,
+        validation_loss=loss,
+        training_loss=0.1,
+        certificate=None,
+        cpu_seconds=1.0,
     )
     return replace(plain, **more)
 

@@ -75,7 +75,9 @@ def test_a_sweep_gets_the_ap_on_val_of_the_detector_trained_on_the_learned_distr
 
 def test_two_processes_make_the_same_bit_for_bit(folder, returned, tmp_path, monkeypatch):
     shutil.copytree(folder / "store" / "views", tmp_path / "store" / "views")
-    monkeypatch.setattr("neural_sim.stages.field.FieldStage.make", lambda *_: pytest.fail("not by this process"))
+    monkeypatch.setattr(
+        "neural_sim.stages.field.FieldStage.make", lambda *_: pytest.fail("not by this process")
+    )
     one, (two, _) = _context(folder)[0], _context(tmp_path, "workers=2")
     fields = zip(one.graph.fields, two.together(two.graph.fields), strict=True)
     for alone, together in [(one.results(a).field, two.results(b).field) for a, b in fields]:
