@@ -109,6 +109,12 @@ VERBS = {
         ("viewer.psi", "viewer.port", "viewer.seconds"),
         "+experiment=pose_gap",
     ),
+    "box": Verb(
+        "set the box about a photographed object by hand, where the scene's masks miss it",
+        ("stages=[box]", "objects=photos"),
+        ("objects.root", "objects/poses", "box.object", "box.port", "box.seconds"),
+        "objects.root=/data/captures objects/poses=colmap",
+    ),
     "compare": Verb(
         "set the finished runs of an experiment side by side",
         ("+experiment=compare",),

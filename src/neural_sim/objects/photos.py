@@ -26,6 +26,7 @@ from neural_sim.objects.pictures import (
 from neural_sim.objects.pictures import (
     MADE,
     Box,
+    Corners,
     Direction,
     Masks,
     Pictures,
@@ -37,6 +38,7 @@ from neural_sim.objects.pictures import (
     mask_of,
     refuse_shared,
     refuse_size,
+    saved_box,
 )
 from neural_sim.objects.placing import AXES, Placement, mean_up, nearest_to_axes, place, upright
 from neural_sim.objects.resampling import pixels_per_pixel, resample
@@ -92,7 +94,8 @@ class Photos:
         size: the diameter of the object's bounding sphere in metres, or a mapping by object's name; null: unknown, so
             that distances are in object radii.
         box: with ``masks="scene"``: two corners of a box about the object, along the axes of the capture's frame and in
-            its unit, or a mapping by object's name; null: the object is looked for where the cameras look.
+            its unit, or a mapping by object's name; null: that of ``box.json`` in the capture's folder, else the object
+            is looked for where the cameras look.
         scene: what computes masks where ``masks="scene"``.
         refinement: what corrects the cameras' poses; null: they stay as they are.
         poor: what happens where a field does not show its object: nothing trains on it (``refuse``), or ``use``.
@@ -260,6 +263,16 @@ class Photos:
         size = self.size.get(name) if isinstance(self.size, Mapping) else self.size
         return None if size is None else 0.5 * float(size)
 
+    def box_of(self, name: str) -> Corners | None:
+        """Return an object's box where one says what the object is: as set, else as saved beside its capture."""
+        if self.masks != "scene":
+            return None
+        return box_of(self.box, name) or saved_box(self._folders[name])
+
+    def folder(self, name: str) -> Path:
+        """Return the folder of an object's capture."""
+        return self._folders[name]
+
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
         """At most ``count`` training frames and ``held_out`` test frames, evenly spread.
 
@@ -284,7 +297,7 @@ class Photos:
         """Compute a mask for each frame of an object's capture where ``masks="scene"``, else none."""
         if self.scene is None or self.masks != "scene":
             return ()
-        return self.scene.masks(self.captures[name], self._up(name), box_of(self.box, name))
+        return self.scene.masks(self.captures[name], self._up(name), self.box_of(name))
 
     def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
         """Return an object's photographs.
@@ -299,7 +312,7 @@ class Photos:
 
     def placement(self, name: str, pictures: Pictures | None = None) -> Placement:
         """Compute an object's pose and radius in its capture's frame."""
-        return place(pictures or self.pictures(name), self._up(name), box_of(self.box, name))
+        return place(pictures or self.pictures(name), self._up(name), self.box_of(name))
 
     def views(
         self, name: str, count: int, held_out: int, image_size: int, pictures: Pictures | None = None
@@ -326,7 +339,7 @@ class Photos:
         No photograph is read: masks would move the centre a little, and the directions by some degrees.
         """
         poses = np.stack([frame.camera_to_world for frame in self.captures[name].frames])
-        box = box_of(self.box, name)
+        box = self.box_of(name)
         centre = nearest_to_axes(poses) if box is None else np.array(box).mean(0)
         away = (poses[:, :3, 3] - centre) @ upright(np.array(self.up_of(name)), name).T
         return away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -346,9 +359,7 @@ class Photos:
         capture, folder = self.captures[name], self._folders[name]
         masks = () if self.masks in MADE else (mask_of(frame, capture.source) for frame in capture.frames)
         files = _named([*capture.files, *(path for path in masks if path is not None)], folder)
-        options = (
-            f"{self.masks} {self._up(name)} {box_of(self.box, name)} {self._value(name)} {self.command} "
-        )
+        options = f"{self.masks} {self._up(name)} {self.box_of(name)} {self._value(name)} {self.command} "
         if self.poses is not None:
             options += "".join(f"{frame.camera_to_world.tolist()} {frame.lens}" for frame in capture.frames)
         return content_digest({options: Path(), **files})

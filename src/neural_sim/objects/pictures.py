@@ -15,10 +15,11 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
+from neural_sim.documents import read_json
 from neural_sim.masks import read_mask
 from neural_sim.objects.capture import Capture, Frame
 from neural_sim.pictures import Size, alpha_of, by, read_header, read_picture
-from neural_sim.ranges import Matching, validated
+from neural_sim.ranges import Matching, check, validated
 
 Masks = Literal["auto", "alpha", "files", "scene", "command"]
 MADE = ("scene", "command")
@@ -33,6 +34,8 @@ Box = Annotated[
         "[[x0, y0, z0], [x1, y1, z1]] with x0 < x1, y0 < y1 and z0 < z1",
     ),
 ]
+BOX_FILE = "box.json"
+"""Beside a capture: the object's box, as the page of ``stages=[box]`` saves it."""
 FOLDER = "masks"
 SHARPNESS = 4.0
 """Slope of the masks' opacity about a half, where a computed mask has its edge: an object is opaque, fog is nothing."""
@@ -60,6 +63,21 @@ def box_of(box: Box | Mapping[str, Box | None] | None, name: str) -> Corners | N
         return None
     (x0, y0, z0), (x1, y1, z1) = given
     return (float(x0), float(y0), float(z0)), (float(x1), float(y1), float(z1))
+
+
+def saved_box(folder: Path) -> Corners | None:
+    """Read the box that was saved beside a capture, None without one.
+
+    Raises:
+        ValueError: a file that is no box, with its path.
+    """
+    file = folder / BOX_FILE
+    if not file.is_file():
+        return None
+    document = read_json(file)
+    given = document.get("box") if isinstance(document, dict) else None
+    check(given, Box, f"{file}: box")
+    return box_of(given, "")
 
 
 @validated

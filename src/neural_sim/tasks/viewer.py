@@ -49,15 +49,9 @@ class ViewerTask(Task):
         viewer = Viewer(self.shots(context), self.port, self.psi)
         print(f"open {viewer.address} (Ctrl-C ends it)", flush=True)
         try:
-            self._wait()
+            keep_open(self.seconds)
         finally:
             viewer.server.stop()
-
-    def _wait(self) -> None:
-        ends = None if self.seconds is None else time.monotonic() + self.seconds
-        with suppress(KeyboardInterrupt), ctrl_c_as_exception():
-            while ends is None or time.monotonic() < ends:
-                time.sleep(0.2)
 
     def shots(self, context: Context) -> Shots:
         """Return the scene, the known distributions, and the detector trained on ``psi``.
@@ -82,3 +76,11 @@ class ViewerTask(Task):
                 Path(self.psi).expanduser(), distribution, graph.names, "viewer.psi"
             )
         return known
+
+
+def keep_open(seconds: float | None) -> None:
+    """Wait until Ctrl-C, or for some seconds."""
+    ends = None if seconds is None else time.monotonic() + seconds
+    with suppress(KeyboardInterrupt), ctrl_c_as_exception():
+        while ends is None or time.monotonic() < ends:
+            time.sleep(0.2)

@@ -1,0 +1,152 @@
+"""A page on which the box about a photographed object is dragged, and seen in the photographs.
+
+Needs viser (the extra ``viewer``).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw
+from scipy.spatial.transform import Rotation
+
+from neural_sim.objects.capture import Capture, Frame
+from neural_sim.objects.pictures import Corners
+from neural_sim.objects.placing import nearest_to_axes
+from neural_sim.pictures import read_picture
+
+SHOWN = 640
+"""Pixels along a shown photograph's longer side."""
+SMALL = 64
+"""Along that of one at its camera."""
+FIRST_SIZE = 0.25
+"""Half a side of the box that is shown first, in distances of the cameras from where they look."""
+ORANGE = (230, 120, 0)
+EDGES = tuple(
+    (a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1
+)  # of corners whose numbers' bits say low or high
+
+
+def corners_of(box: Corners) -> Float[np.ndarray, "8 3"]:
+    """Return the eight corners; bit k of a corner's number says whether it is high along axis k."""
+    return np.array([[box[number >> axis & 1][axis] for axis in range(3)] for number in range(8)])
+
+
+def first_box(capture: Capture) -> Corners:
+    """Return a box about where the cameras look."""
+    poses = np.stack([frame.camera_to_world for frame in capture.frames])
+    centre = nearest_to_axes(poses)
+    half = FIRST_SIZE * float(np.median(np.linalg.norm(poses[:, :3, 3] - centre, axis=1)))
+    return _sorted(centre - half, centre + half)
+
+
+def drawn(frame: Frame, box: Corners) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw the edges of a box into a photograph; an edge with an end behind the camera is left out."""
+    picture = read_picture(frame.image, upright=False).convert("RGB")
+    picture.thumbnail((SHOWN, SHOWN))
+    lens = frame.lens.resized(*picture.size)
+    world_to_camera = np.linalg.inv(frame.camera_to_world)
+    local = corners_of(box) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    pixels, seen = lens.project(torch.from_numpy(local))
+    pen = ImageDraw.Draw(picture)
+    for a, b in EDGES:
+        if seen[a] and seen[b]:
+            pen.line([*pixels[a].tolist(), *pixels[b].tolist()], fill=ORANGE, width=2)
+    return np.asarray(picture)
+
+
+@dataclass
+class BoxPage:
+    """The cameras with their photographs, a box with two corners to drag, and the box in a chosen photograph.
+
+    Args:
+        capture: the photographs and their cameras.
+        box: the box that is shown first.
+        save: is given the box when the button is pressed, and says what became of it.
+        port: of the page, on this machine's own address alone; the next free one where it is taken.
+
+    Raises:
+        ValueError: viser is missing.
+    """
+
+    capture: Capture
+    box: Corners
+    save: Callable[[Corners], str]
+    port: int
+
+    def __post_init__(self) -> None:
+        try:
+            import viser
+        except ImportError as error:
+            raise ValueError("stages=[box] wants viser: pip install 'neural-sim[viewer]'") from error
+        self.server = viser.ViserServer(
+            host="127.0.0.1", port=self.port, label=self.capture.name, verbose=False
+        )
+        gui, frames = self.server.gui, self.capture.frames
+        gui.add_markdown(
+            "Drag the two corners until the box holds the object and nothing else, in several photographs."
+        )
+        self.number = gui.add_slider("photograph", 1, max(len(frames), 2), 1, 1)
+        self.image = gui.add_image(drawn(frames[0], self.box))
+        self.button = gui.add_button("save")
+        self.told = gui.add_markdown("")
+        reach = float(np.abs(np.subtract(*self.box)).max())
+        self.handles = [
+            self.server.scene.add_transform_controls(
+                f"/corner/{name}", scale=0.4 * reach, disable_rotations=True, position=np.array(corner)
+            )
+            for name, corner in zip(("low", "high"), self.box, strict=True)
+        ]
+        self._show_cameras(0.3 * reach)
+        self.number.on_update(lambda _: self.show())
+        for handle in self.handles:
+            handle.on_update(lambda _: self.moved())
+        self.button.on_click(lambda _: self.saved())
+        self.show()
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://127.0.0.1:{self.server.get_port()}"
+
+    def moved(self) -> None:
+        """Take the box from the corners."""
+        self.box = _sorted(*(np.asarray(handle.position) for handle in self.handles))
+        self.show()
+
+    def show(self) -> None:
+        """Show the box in the scene and in the chosen photograph."""
+        corners = corners_of(self.box)
+        lines = np.array([[corners[a], corners[b]] for a, b in EDGES], dtype=np.float32)
+        self.server.scene.add_line_segments("/box", lines, np.array(ORANGE))
+        number = min(self.number.value, len(self.capture.frames))
+        self.image.image = drawn(self.capture.frames[number - 1], self.box)
+
+    def saved(self) -> None:
+        """Save the box."""
+        self.told.content = self.save(self.box)
+
+    def _show_cameras(self, scale: float) -> None:
+        for number, frame in enumerate(self.capture.frames):
+            picture = read_picture(frame.image, upright=False).convert("RGB")
+            picture.thumbnail((SMALL, SMALL), Image.Resampling.BOX)
+            turn = frame.camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # viser looks along +z, y down
+            lens = frame.lens
+            handle: Any = self.server.scene.add_camera_frustum(
+                f"/cameras/{number}", 2.0 * math.atan(0.5 * lens.height / lens.fy), lens.width / lens.height,
+                scale=scale, wxyz=Rotation.from_matrix(turn).as_quat(scalar_first=True),
+                position=frame.camera_to_world[:3, 3], image=np.asarray(picture),
+            )  # fmt: skip
+            handle.on_click(lambda _, number=number: setattr(self.number, "value", number + 1))
+
+
+def _sorted(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> Corners:
+    low, high = np.minimum(one, other).tolist(), np.maximum(one, other).tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
