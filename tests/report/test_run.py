@@ -9,7 +9,7 @@ from mlflow import MlflowClient
 
 from neural_sim.baseline.label_shift.evidence import FactorEstimate
 from neural_sim.report import tracking
-from neural_sim.report.figures import image_grid, psi_figure, write_figures
+from neural_sim.report.figures import image_grid, psi_figure, strip_figure, write_figures
 from neural_sim.report.run import Learned, RunResults, write_results
 from neural_sim.report.run_tracking import live_run
 from neural_sim.types import LabelledImages
@@ -175,9 +175,33 @@ def test_figures_are_written(results, tmp_path):
         "scores": torch.tensor([0.9]),
         "labels": torch.tensor([1]),
     }
-    made = write_figures(results, images, images, [found, nothing, found], tmp_path)
-    assert {path.name for path in made} == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}
+    made = write_figures(results, images, images, [found, nothing, found], tmp_path, (images, images))
+    names = {"psi_pose.png", "ap.png", "training_images.png", "detections.png", "strip.png"}
+    assert {path.name for path in made} == names
     assert all(path.read_bytes()[:4] == b"\x89PNG" and path.stat().st_size > 5000 for path in made)
+
+
+def test_the_strip_shows_each_object_before_and_after_with_its_score(results):
+    def flat(colour):
+        """Three images of each of both objects, all of one colour, object 1's darker."""
+        images = torch.full((6, 3, 16, 16), colour)
+        images[3:] *= 0.5
+        labels = torch.tensor([0, 0, 0, 1, 1, 1])
+        return LabelledImages(images, torch.zeros(6, 1, 4), labels[:, None], torch.zeros(6).long())
+
+    named = dataclasses.replace(results, names=("a", "b"), biased=("b",))
+    figure = strip_figure(named, flat(0.2), flat(0.4), flat(0.8))
+    (axes,) = figure.axes
+    canvas = axes.get_images()[0].get_array()
+    starts, rows = (0, 2 * 16 + 4, 5 * 16 + 8), (3 + 8, 3 + 16 + 8)
+    shown = [[float(canvas[row, start + 8, 0]) for start in starts] for row in rows]
+    assert shown == [
+        pytest.approx([0.1, 0.2, 0.4]),
+        pytest.approx([0.2, 0.4, 0.8]),
+    ]  # the biased object first
+    words = [text.get_text() for text in axes.texts]
+    assert words[:3] == ["the target", "rendered at first", "rendered now"]
+    assert words[3].startswith("b: AP\n") and " before\n" in words[3] and " now" in words[3]
 
 
 def live(uri, results):

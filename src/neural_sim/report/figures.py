@@ -194,6 +194,59 @@ def image_grid(
     return figure
 
 
+STRIP = {"the target": 2, "rendered at first": 3, "rendered now": 3}
+"""Images of each object in each part of the strip."""
+
+
+def strip_figure(
+    results: RunResults, target: LabelledImages, before: LabelledImages, after: LabelledImages, rows: int = 2
+) -> Figure:
+    """Draw what a run did in one look: target images, training images before and after, and AP, for a few objects.
+
+    Args:
+        results: of the run.
+        target: the test images.
+        before: training images from the initial distribution, an equal number of every object in the order of labels.
+        after: the same from the learned one.
+        rows: most objects; those that start from another distribution than the target's come first.
+    """
+    height, width = target.images.shape[-2:]
+    head, gap, inch = round(0.2 * height), round(0.25 * width), width  # an image is an inch wide
+    chosen = [*results.biased, *(name for name in results.names if name not in results.biased)][:rows]
+    across = sum(STRIP.values()) * width + len(STRIP) * gap + 2 * inch  # two inches of words
+    canvas = np.ones((head + len(chosen) * height, across, 3), dtype=np.float32)
+    figure = Figure(figsize=(across / inch, len(canvas) / inch))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    left = 0
+    for (part, count), images in zip(STRIP.items(), (target, before, after), strict=True):
+        axes.text(left, 0.5 * head, part, fontsize=9, color=MUTED, va="center")
+        for row, name in enumerate(chosen):
+            top = head + row * height
+            showing = (images.labels == results.names.index(name)).any(1).nonzero()[:, 0]
+            for column, index in enumerate(showing[_spread(showing, count)].tolist()):
+                place = left + column * width
+                pixels = images.images[index].permute(1, 2, 0).clamp(0, 1).cpu().numpy()
+                canvas[top : top + height - 2, place : place + width - 2] = pixels[:-2, :-2]
+        left += count * width + gap
+    for row, name in enumerate(chosen):
+        middle = head + (row + 0.5) * height
+        axes.text(left, middle, _gained(results, name), fontsize=9, color=INK, va="center", linespacing=1.5)
+    axes.imshow(canvas)
+    axes.set_axis_off()
+    return figure
+
+
+def _gained(results: RunResults, name: str) -> str:
+    """Write what an object's score was, is, and would be."""
+    words = {"ns": "before", "learned": "now", "matched": "if the target were known"}
+    values = {
+        said: 100 * results.ap[which]["per_class"].get(name, float("nan"))
+        for which, said in words.items()
+        if which in results.ap
+    }
+    return "\n".join([f"{name}: {results.score}", *(f"{value:.0f} {said}" for said, value in values.items())])
+
+
 def _best_prediction(
     axes: Any, prediction: Mapping[str, torch.Tensor], origin: tuple[int, int], class_names: Sequence[str]
 ) -> str:
@@ -222,6 +275,7 @@ def write_figures(
     test: LabelledImages,
     detections: Sequence[Mapping[str, torch.Tensor]],
     folder: Path,
+    before_and_after: tuple[LabelledImages, LabelledImages] | None = None,
 ) -> list[Path]:
     """Write a run's figures as PNG files.
 
@@ -231,8 +285,11 @@ def write_figures(
         test: the test images.
         detections: on these, of the detector trained on the learned distribution; empty without.
         folder: where the files go.
+        before_and_after: a few training images of every object, see ``strip_figure``; None: without that figure.
     """
     made: dict[str, Figure] = {}
+    if before_and_after is not None and results.ap:
+        made["strip"] = strip_figure(results, test, *before_and_after)
     names = list(results.names)
     for factor in results.factors if results.moved else ():
         title = f"{results.experiment}: learned {factor}, {results.method}, seed {results.seed}"
@@ -249,6 +306,6 @@ def write_figures(
     return [save(figure, folder / f"{name}.png") for name, figure in made.items()]
 
 
-def _spread(images: LabelledImages, count: int) -> torch.Tensor:
+def _spread(images: LabelledImages | torch.Tensor, count: int) -> torch.Tensor:
     """Return indices of up to ``count`` images spread over the set."""
     return torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
