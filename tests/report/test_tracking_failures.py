@@ -2,6 +2,8 @@
 
 import logging
 import sqlite3
+import subprocess
+import sys
 
 import pytest
 
@@ -77,6 +79,29 @@ def test_an_older_database_is_upgraded_after_a_copy(uri, tmp_path, caplog):
         assert connection.execute("select version_num from alembic_version").fetchone() == (before,)
         assert connection.execute("select count(*) from runs").fetchone() == (1,)
     assert len(tracking.logged_runs(uri, "gap")) == 2
+
+
+HALF_WRITTEN = """
+import os, signal, sqlite3, sys
+connection = sqlite3.connect(sys.argv[1])
+connection.execute("pragma cache_size = 1")
+connection.execute("create table large (content blob)")
+connection.executemany("insert into large values (zeroblob(5000))", [()] * 100)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_half_written_is_undone(uri, tmp_path):
+    with opened(uri):
+        pass
+    file = tmp_path / "mlflow.db"
+    subprocess.run([sys.executable, "-c", HALF_WRITTEN, str(file)], check=False)
+    assert file.with_name("mlflow.db-journal").stat().st_size
+    with opened(uri) as run:
+        run.log({"a": 1.0})
+    assert len(tracking.logged_runs(uri, "gap")) == 2
+    with sqlite3.connect(file) as connection:
+        assert connection.execute("select count(*) from large").fetchone() == (0,)
 
 
 def test_a_database_that_another_program_holds_is_not_called_damaged(uri, tmp_path, monkeypatch):

@@ -66,7 +66,10 @@ def test_what_killed_runs_left_is_counted(tmp_path):
     path = entry(tmp_path)
     path.with_name(".b.pt.0123abcd").write_bytes(b"half")
     path.with_name("c.damaged").write_bytes(b"set aside")
-    assert findings(tmp_path)["results in the store", "note"]["found"].startswith("2 files")
+    path.with_name("d.checkpoint").write_bytes(b"unfinished")
+    found = findings(tmp_path)
+    assert found["results in the store", "note"]["found"].startswith("2 files")
+    assert found["checkpoints in the store", "note"]["found"].startswith("1 of unfinished work")
 
 
 def test_a_store_that_is_a_file_is_bad(tmp_path):

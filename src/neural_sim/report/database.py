@@ -46,7 +46,8 @@ def check_database(database: Path) -> None:
             if file.read(len(_SQLITE)) != _SQLITE:
                 raise ValueError(f"paths.mlflow: {database} is no SQLite database; {todo}")
         with closing(
-            sqlite3.connect(database.as_uri() + "?mode=ro", uri=True, timeout=_PATIENCE)
+            # Not read-only: what a killed process left half written is undone now, by the journal beside the file.
+            sqlite3.connect(database.as_uri() + "?mode=rw", uri=True, timeout=_PATIENCE)
         ) as connection:
             connection.execute("select count(*) from sqlite_master").fetchone()
     except OSError as error:

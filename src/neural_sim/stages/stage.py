@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -17,6 +18,7 @@ from neural_sim.stages.version import code_version
 
 T = TypeVar("T")
 
+_log = logging.getLogger(__name__)
 
 UNKEYED = {"key": False}
 """Metadata of a dataclass field that the key leaves out."""
@@ -164,6 +166,21 @@ class Results:
         return Checkpoint(
             lambda: store.state(kind, key, classes), lambda state: store.keep(kind, key, state), every
         )
+
+    def free_first(self, stages: Iterable[Stage[T]]) -> Iterator[Stage[T]]:
+        """Yield the stages, those whose results another run is making now last: it may have made them by then.
+
+        So runs that begin together share the work, instead of each waiting for the same result first.
+        """
+        later: list[Stage[T]] = []
+        for stage in stages:
+            known = f"{stage.kind} {stage.key}" in self._kept or self._store.has(stage.kind, stage.key)
+            if stage.stored and not known and self._store.busy(stage.kind, stage.key):
+                _log.info("%s: another run is making it; it comes later", stage.title)
+                later.append(stage)
+            else:
+                yield stage
+        yield from later
 
     def missing(self, stages: Iterable[Stage[Any]]) -> list[Stage[Any]]:
         """Return the stages whose results would be computed in order to evaluate these, inputs first."""

@@ -141,6 +141,14 @@ class Store:
         """Whether there is a file of the result; it is not read."""
         return self._path(kind, key).is_file()
 
+    def busy(self, kind: str, key: str) -> bool:
+        """Whether another run is making the result ``key``."""
+        path = self._path(kind, key)
+        if not path.with_suffix(".lock").exists():
+            return False
+        with locked(path, wait=False) as ours:
+            return not ours
+
     def audit(self) -> Audit:
         """Check the content of every entry against its sum, and list what is no entry; nothing is changed."""
         sound, damaged, size = [], [], 0

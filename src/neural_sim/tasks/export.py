@@ -132,7 +132,7 @@ class ExportTask(Task):
             **self._look(renderer, synthesis),
         }
         ExportFolder(root, identity).check()  # before fields are fitted, which may take minutes
-        for stage in context.shown(stages, "field"):
+        for stage in context.results.free_first(context.shown(stages, "field")):
             context.results(stage)
         source = ImageSource(context.results(scene), psi, camera, millimetres, x.run.seed)
         return DataSet(

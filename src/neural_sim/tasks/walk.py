@@ -46,7 +46,8 @@ class Phase(Task):
 
     @override
     def run(self, context: Context) -> None:
-        for stage in context.shown(context.together(self.stages(context.graph)), self.name):
+        stages = context.together(self.stages(context.graph))
+        for stage in context.results.free_first(context.shown(stages, self.name)):
             result = context.results(stage)
             if context.live and self.log:
                 self.log(context.live, stage, result)
@@ -95,7 +96,8 @@ class EvaluateTask(Task):
     @override
     def run(self, context: Context) -> None:
         learned = context.results(context.graph.learned)
-        for stage in context.shown(context.together(context.graph.evaluated(learned)), "evaluate"):
+        stages = context.together(context.graph.evaluated(learned))
+        for stage in context.results.free_first(context.shown(stages, "evaluate")):
             context.results(stage)
 
 

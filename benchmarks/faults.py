@@ -1,0 +1,298 @@
+"""Kill a run at random moments, damage its files, count what is lost: `python benchmarks/faults.py --out faults.json`.
+
+One small run, from objects to a report and a data set, is the reference. Then the same command is killed and started
+again, in chains on one store, until it ends; every chain must leave the reference's results, bit for bit. At last bits
+of the store's files are flipped and files cut off, and none may be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import hashlib
+import json
+import logging
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import torch
+
+from neural_sim.documents import write_json
+from neural_sim.stages.psi import _STATE
+from neural_sim.stages.store import CHECKPOINT, Store
+
+SMALL = [
+    "+experiment=pose_gap", "scale=smoke", "progress=false", "detector=micro", "objects.names=[pitcher,drill]",
+    "views.count=8", "views.held_out=2", "budget.grid.steps=150", "budget.grid.resolution=64",
+    "budget.outer.iterations=6", "outer.epochs=4", "target.val_per_object=4",
+    "stages=[views,field,target_sets,warm_start,psi,evaluate,report,export]",
+    "export.count=12", "export.workers=0", "export.detail=run",
+]  # fmt: skip
+LOADED = ["neural_sim.main", "neural_sim.tasks.walk", "mlflow", "faster_coco_eval", "matplotlib.pyplot"]
+"""What processes have imported when they begin, so that they are killed at work."""
+ITERATION = re.compile(r"(?:round|psi) (\d+)/\d+ (?:val|\|)|psi (\d+)/\d+")
+TAKEN_UP = re.compile(r"psi loop: goes on after round (\d+)/")
+FIELD_EVERY = 0.5
+"""Seconds between checkpoints of a field, which takes seconds here and a day at most."""
+
+
+def run_command(arguments: list[str], log: str) -> None:
+    """Run the program in this process, which writes what it says to a file."""
+    from neural_sim import main
+    from neural_sim.stages import field as fields
+
+    fields.EVERY = FIELD_EVERY
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    sys.argv = ["neural-sim", *arguments]
+    main.main()
+
+
+@dataclass
+class Place:
+    """A store, a database and the folders of runs on them."""
+
+    root: Path
+    runs: int = 0
+
+    @property
+    def store(self) -> Store:
+        """The store."""
+        return Store(self.root / "store")
+
+    @property
+    def run(self) -> Path:
+        """The folder of the last run."""
+        return self.root / f"run{self.runs}"
+
+    @property
+    def log(self) -> str:
+        """What the last run said."""
+        path = Path(f"{self.run}.log")
+        return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+
+    def start(self) -> Any:
+        """Start the command in a process and a folder of its own."""
+        self.runs += 1
+        paths = [f"paths.store={self.root}/store", f"paths.mlflow={self.root}/mlflow.db"]
+        arguments = [*SMALL, *paths, f"hydra.run.dir={self.run}"]
+        process = _processes().Process(target=run_command, args=(arguments, f"{self.run}.log"))
+        process.start()
+        return process
+
+    def bits(self) -> dict[str, str]:
+        """Return digests of all results, without times, and of the data set."""
+        found = {}
+        for path in sorted(self.store.root.glob("*/[!.]*.pt")):
+            entry = self.store.fetch(path.parent.name, path.stem, {}, functools.partial(_missing, path))
+            found[f"{path.parent.name}/{path.stem}"] = _digest(entry.value)
+        for path in sorted((self.run / "dataset").rglob("*")):
+            if path.is_file():
+                found[str(path.relative_to(self.run))] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return found
+
+    def at_work_on(self) -> str:
+        """Return the kind of the result that a killed process was making."""
+        locks = sorted(self.store.root.glob("*/*.lock"), key=lambda path: path.stat().st_mtime)
+        if locks and not locks[-1].with_suffix(".pt").exists():
+            return locks[-1].parent.name
+        return "export" if (self.run / "dataset").exists() else "between results"
+
+
+def _processes() -> Any:
+    """Return what makes processes that have imported the program already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(LOADED)
+    return context
+
+
+def _missing(path: Path) -> Any:
+    raise RuntimeError(f"{path} is not what was written")
+
+
+def _digest(value: Any) -> str:
+    total = hashlib.sha256()
+
+    def add(tree: Any) -> None:
+        if isinstance(tree, torch.Tensor):
+            total.update(f"{tree.dtype}{tuple(tree.shape)}".encode() + tree.contiguous().numpy().tobytes())
+        elif isinstance(tree, Mapping):
+            for key, item in tree.items():
+                if "seconds" not in str(key):
+                    total.update(str(key).encode())
+                    add(item)
+        elif isinstance(tree, (list, tuple)):
+            for item in tree:
+                add(item)
+        else:
+            total.update(repr(tree).encode())
+
+    add(value)
+    return total.hexdigest()
+
+
+@dataclass
+class Ends:
+    """What became of processes that were ended, by SIGKILL or SIGTERM."""
+
+    at: Counter[str] = field(default_factory=Counter)
+    statuses: Counter[int] = field(default_factory=Counter)
+    chains: int = 0
+    same: int = 0
+    different: list[str] = field(default_factory=list)
+    taken_up: int = 0
+    iterations_lost: int = 0
+    slowest_end: float = 0.0
+    left_running: int = 0
+
+
+def chains(
+    signum: signal.Signals,
+    count: int,
+    reference: Mapping[str, str],
+    seconds: float,
+    work: Path,
+    random: Random,
+) -> tuple[Ends, Path | None]:
+    """End processes ``count`` times, at moments of a whole run of ``seconds``, and let every chain come to its end.
+
+    Returns:
+        What became of them, and a checkpoint that was met on the way.
+    """
+    ends, ended, checkpoint = Ends(), 0, None
+    while ended < count:
+        place, done = Place(work / f"{signum.name}{ends.chains}"), 0
+        place.root.mkdir()
+        shutil.copy(work / "empty.db", place.root / "mlflow.db")
+        while True:
+            process = place.start()
+            process.join(random.uniform(0.0, seconds / 2) if ended < count else None)
+            if process.is_alive():
+                ended += 1
+                begun = time.monotonic()
+                os.kill(process.pid, signum)
+                process.join()
+                ends.slowest_end = max(ends.slowest_end, time.monotonic() - begun)
+                ends.at[place.at_work_on()] += 1
+                ends.statuses[process.exitcode] += 1
+                found = sorted(place.store.root.glob(f"psi/*{CHECKPOINT}"))
+                if found and checkpoint is None:
+                    checkpoint = shutil.copy(found[0], work / found[0].name)
+            done = _iterations(place.log, done, ends)
+            if process.exitcode == 0:
+                break
+            if process.exitcode not in (-signum, 128 + signum):
+                raise SystemExit(f"a run failed with status {process.exitcode}:\n{place.log[-3000:]}")
+        found = place.bits()
+        ends.chains += 1
+        wrong = sorted(key for key in {*reference, *found} if reference.get(key) != found.get(key))
+        ends.same += not wrong
+        ends.different += wrong
+        ends.left_running += _running(place.root / "mlflow.db")
+        shutil.rmtree(place.root)
+    return ends, checkpoint
+
+
+def _iterations(log: str, done: int, ends: Ends) -> int:
+    """Return how many iterations had ended in a chain, and note those that a run did again."""
+    if (taken := TAKEN_UP.search(log)) is not None:
+        ends.taken_up += 1
+        ends.iterations_lost = max(ends.iterations_lost, done - int(taken[1]))
+    elif done and ITERATION.search(log):
+        ends.iterations_lost = max(ends.iterations_lost, done)
+    return max([done, *(int(match[1] or match[2]) for match in ITERATION.finditer(log))])
+
+
+def _running(database: Path) -> int:
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{database}")
+    ids = [experiment.experiment_id for experiment in client.search_experiments()]
+    return len(client.search_runs(ids, "attributes.status = 'RUNNING'"))
+
+
+def damages(place: Place, checkpoint: Path | None, count: int, random: Random) -> dict[str, Any]:
+    """Flip bits of results and of a checkpoint, and cut them off; count what is read nevertheless."""
+    kinds: Mapping[str, Callable[[bytes], bytes]] = {
+        "flipped bit": functools.partial(_flipped, random=random),
+        "truncation": lambda content: content[: random.randrange(len(content))],
+    }
+    paths, used, times = sorted(place.store.root.glob("*/[!.]*.pt")), 0, Counter[str]()
+    if checkpoint is not None:
+        paths.append(Path(shutil.copy(checkpoint, place.store.root / "psi")))
+    for number in range(count):
+        path, kind = random.choice(paths), list(kinds)[number % len(kinds)]
+        whole = path.read_bytes()
+        path.write_bytes(kinds[kind](whole))
+        if path.suffix == CHECKPOINT:
+            used += place.store.state(path.parent.name, path.stem, _STATE) is not None
+        else:
+            used += place.store.fetch(path.parent.name, path.stem, {}, lambda: "again").value != "again"
+        path.write_bytes(whole)
+        times[f"{kind} of a {'checkpoint' if path.suffix == CHECKPOINT else 'result'}"] += 1
+    return {"count": count, "used": used, **times}
+
+
+def _flipped(content: bytes, random: Random) -> bytes:
+    at, bit = random.randrange(len(content)), random.randrange(8)
+    return content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :]
+
+
+def main() -> None:
+    """Run all, and write the document."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=50, help="by SIGKILL")
+    parser.add_argument("--terms", type=int, default=20, help="by SIGTERM")
+    parser.add_argument("--damages", type=int, default=1000, help="of files")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="a JSON file")
+    given, random = parser.parse_args(), Random(0)
+    random.seed(given.seed)
+    with tempfile.TemporaryDirectory(prefix="faults") as folder:
+        work = Path(folder)
+        from neural_sim.report.tracking import connect, tracking_uri
+
+        connect(tracking_uri(str(work / "empty.db")))
+        place = Place(work / "reference")
+        place.root.mkdir()
+        shutil.copy(work / "empty.db", place.root / "mlflow.db")
+        first = _processes().Process(target=time.sleep, args=(0,))
+        first.start()
+        first.join()
+        begun = time.monotonic()
+        process = place.start()
+        process.join()
+        seconds = time.monotonic() - begun
+        if process.exitcode != 0:
+            raise SystemExit(f"the reference failed:\n{place.log[-3000:]}")
+        reference = place.bits()
+        document: dict[str, Any] = {"results": len(reference), "seconds": round(seconds, 1)}
+        checkpoint = None
+        for name, signum, count in (
+            ("kills", signal.SIGKILL, given.kills), ("terms", signal.SIGTERM, given.terms),
+        ):  # fmt: skip
+            ends, met = chains(signum, count, reference, seconds, work, random)
+            checkpoint = checkpoint or met
+            document[name] = {"count": count, **vars(ends)}
+        logging.getLogger("neural_sim.stages.store").setLevel(logging.ERROR)
+        document["damages"] = damages(place, checkpoint, given.damages, random)
+    print(json.dumps(document, indent=1))
+    if given.out is not None:
+        write_json(given.out, document)
+
+
+if __name__ == "__main__":
+    main()
