@@ -43,6 +43,8 @@ SMALL = [
 LOADED = ["neural_sim.main", "neural_sim.tasks.walk", "mlflow", "faster_coco_eval", "matplotlib.pyplot"]
 """What processes have imported when they begin, so that they are killed at work."""
 ITERATION = re.compile(r"(?:round|psi) (\d+)/\d+ (?:val|\|)|psi (\d+)/\d+")
+ENDS = {"report": "results.json", "export": "dataset"}
+"""What is no result in the store, by the file or folder that shows its beginning."""
 TAKEN_UP = re.compile(r"psi loop: goes on after round (\d+)/")
 FIELD_EVERY = 0.5
 """Seconds between checkpoints of a field, which takes seconds here and a day at most."""
@@ -104,12 +106,17 @@ class Place:
                 found[str(path.relative_to(self.run))] = hashlib.sha256(path.read_bytes()).hexdigest()
         return found
 
-    def at_work_on(self) -> str:
-        """Return the kind of the result that a killed process was making."""
-        locks = sorted(self.store.root.glob("*/*.lock"), key=lambda path: path.stat().st_mtime)
-        if locks and not locks[-1].with_suffix(".pt").exists():
-            return locks[-1].parent.name
-        return "export" if (self.run / "dataset").exists() else "between results"
+    def at_work_on(self, kind: str) -> bool:
+        """Whether a process is making a result of a kind now, or is in that part of the run's end."""
+        if kind in ENDS:
+            return (self.run / ENDS[kind]).exists()
+        held = Path("/proc/locks").read_text()
+        locks = self.store.root.glob(f"{kind}/*.lock")
+        return any(re.search(rf":{path.stat().st_ino} ", held) for path in locks)
+
+    def has_done(self, kind: str, count: int) -> bool:
+        """Whether all results of a kind are there."""
+        return kind not in ENDS and len(list(self.store.root.glob(f"{kind}/[!.]*.pt"))) >= count
 
 
 def _processes() -> Any:
@@ -160,37 +167,38 @@ class Ends:
 
 
 def chains(
-    signum: signal.Signals,
-    count: int,
-    reference: Mapping[str, str],
-    seconds: float,
-    work: Path,
-    random: Random,
+    signum: signal.Signals, count: int, reference: Place, bits: Mapping[str, str], random: Random
 ) -> tuple[Ends, Path | None]:
-    """End processes ``count`` times, at moments of a whole run of ``seconds``, and let every chain come to its end.
+    """End processes ``count`` times, each at a moment of a kind of work that is left, and let every chain end.
 
     Returns:
         What became of them, and a checkpoint that was met on the way.
     """
-    ends, ended, checkpoint = Ends(), 0, None
+    ends, ended, checkpoint, work = Ends(), 0, None, reference.root.parent
+    parts = _parts(reference)
     while ended < count:
         place, done = Place(work / f"{signum.name}{ends.chains}"), 0
         place.root.mkdir()
         shutil.copy(work / "empty.db", place.root / "mlflow.db")
         while True:
             process = place.start()
-            process.join(random.uniform(0.0, seconds / 2) if ended < count else None)
+            if ended < count:
+                left = [kind for kind, (number, _) in parts.items() if not place.has_done(kind, number)]
+                kind = random.choice(left)
+                _wait(process, place, kind, random.uniform(0.0, parts[kind][1]))
+            else:
+                process.join()
             if process.is_alive():
                 ended += 1
                 begun = time.monotonic()
                 os.kill(process.pid, signum)
                 process.join()
                 ends.slowest_end = max(ends.slowest_end, time.monotonic() - begun)
-                ends.at[place.at_work_on()] += 1
+                ends.at[kind] += 1
                 ends.statuses[process.exitcode] += 1
                 found = sorted(place.store.root.glob(f"psi/*{CHECKPOINT}"))
                 if found and checkpoint is None:
-                    checkpoint = shutil.copy(found[0], work / found[0].name)
+                    checkpoint = Path(shutil.copy(found[0], work / found[0].name))
             done = _iterations(place.log, done, ends)
             if process.exitcode == 0:
                 break
@@ -198,12 +206,34 @@ def chains(
                 raise SystemExit(f"a run failed with status {process.exitcode}:\n{place.log[-3000:]}")
         found = place.bits()
         ends.chains += 1
-        wrong = sorted(key for key in {*reference, *found} if reference.get(key) != found.get(key))
+        wrong = sorted(key for key in {*bits, *found} if bits.get(key) != found.get(key))
         ends.same += not wrong
         ends.different += wrong
         ends.left_running += _running(place.root / "mlflow.db")
         shutil.rmtree(place.root)
     return ends, checkpoint
+
+
+def _parts(reference: Place) -> dict[str, tuple[int, float]]:
+    """Return the number of results of each kind, and the seconds that the longest takes."""
+    found: dict[str, tuple[int, float]] = {}
+    for path in reference.store.root.glob("*/[!.]*.pt"):
+        entry = reference.store.fetch(path.parent.name, path.stem, {}, functools.partial(_missing, path))
+        count, longest = found.get(path.parent.name, (0, 0.0))
+        found[path.parent.name] = (count + 1, max(longest, entry.seconds))
+    return {**found, **{kind: (1, _seconds(reference, kind)) for kind in ENDS}}
+
+
+def _seconds(reference: Place, phase: str) -> float:
+    said = re.search(rf"^{phase} +([\d.]+) s$", reference.log, re.MULTILINE)
+    return 1.0 if said is None else float(said[1])
+
+
+def _wait(process: Any, place: Place, kind: str, seconds: float) -> None:
+    """Wait until a process is at work on a kind of result, and for some seconds more, or to its end."""
+    while process.is_alive() and not place.at_work_on(kind):
+        time.sleep(0.01)
+    process.join(seconds)
 
 
 def _iterations(log: str, done: int, ends: Ends) -> int:
@@ -284,7 +314,7 @@ def main() -> None:
         for name, signum, count in (
             ("kills", signal.SIGKILL, given.kills), ("terms", signal.SIGTERM, given.terms),
         ):  # fmt: skip
-            ends, met = chains(signum, count, reference, seconds, work, random)
+            ends, met = chains(signum, count, place, reference, random)
             checkpoint = checkpoint or met
             document[name] = {"count": count, **vars(ends)}
         logging.getLogger("neural_sim.stages.store").setLevel(logging.ERROR)

@@ -348,6 +348,7 @@ def _refuse(error: Exception) -> NoReturn:
 
 def main() -> None:
     """Entry point of ``neural-sim`` and ``python -m src.main``."""
+    logging.raiseExceptions = False  # a log on a full disk would print a stack for each of its lines
     with interruptible():
         layout = layout_of(sys.argv[1:], conf_directory())
         if layout is not None and (said := answer(sys.argv[1:], layout)) is not None:
