@@ -174,8 +174,8 @@ class Results:
         """
         later: list[Stage[T]] = []
         for stage in stages:
-            known = f"{stage.kind} {stage.key}" in self._kept or self._store.has(stage.kind, stage.key)
-            if stage.stored and not known and self._store.busy(stage.kind, stage.key):
+            known = stage.entry in self._kept or self.store.has(stage.kind, stage.key)
+            if stage.stored and not known and self.store.busy(stage.kind, stage.key):
                 _log.info("%s: another run is making it; it comes later", stage.title)
                 later.append(stage)
             else:
