@@ -5,8 +5,12 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
-import torch
-from pretend_device import pretend_device, register
+import shape_checking
+
+shape_checking.install()  # before anything imports the package
+
+import torch  # noqa: E402
+from pretend_device import pretend_device, register  # noqa: E402
 
 register()
 
