@@ -134,6 +134,20 @@ def test_a_disk_that_fills_while_the_configuration_is_written_is_refused_in_one_
         raise AssertionError("was opened")
 
 
+def test_a_disk_that_is_read_only_is_told_as_such(uri, monkeypatch):
+    def refuse(_):
+        raise OSError(30, "Read-only file system", "mlflow.db.lock")
+
+    monkeypatch.setattr(tracking, "guard", refuse)
+    with (
+        pytest.raises(
+            ValueError, match=r"cannot be written to \(Read-only file system\); set paths\.mlflow$"
+        ),
+        opened(uri),
+    ):
+        raise AssertionError("was opened")
+
+
 def test_a_database_of_other_tables_is_refused(uri, tmp_path):
     with sqlite3.connect(tmp_path / "mlflow.db") as connection:
         connection.execute("create table alembic_version (version_num varchar(32))")

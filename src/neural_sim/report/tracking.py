@@ -264,6 +264,8 @@ def quiet() -> Iterator[None]:
         warnings.simplefilter("ignore")
         for noisy in ("mlflow", "alembic", "sqlalchemy"):
             logging.getLogger(noisy).setLevel(logging.WARNING)
+        # It logs the stack of each error that it raises, which is told here in one line.
+        logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
         yield
 
 
@@ -287,6 +289,9 @@ def connect(uri: str) -> Any:
             client.search_experiments(max_results=1)  # creates the tables of a new database
     except MlflowException:
         raise
+    except OSError as error:  # of the lock beside the database
+        why = error.strerror or error
+        raise ValueError(f"paths.mlflow: {uri} cannot be written to ({why}); set paths.mlflow") from error
     except (
         Exception
     ) as error:  # of SQLAlchemy and Alembic, on databases that are not what MLflow's version made
