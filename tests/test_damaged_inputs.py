@@ -30,7 +30,10 @@ from neural_sim.detector.saved import DOCUMENT, WEIGHTS, SavedDetector
 from neural_sim.detector.settings import Anchors, Backbone, Head, Losses
 from neural_sim.masks import read_mask
 from neural_sim.objects.photos import Photos
+from neural_sim.parameter.pose import Pose
+from neural_sim.parameter.product import SceneDistribution
 from neural_sim.pictures import read_header, read_picture
+from neural_sim.stages.psi_file import psi_of_file
 from neural_sim.target.bop import BopScenes
 from neural_sim.target.coco import CocoTarget
 from neural_sim.target.frames import FrameName, FrameReader
@@ -241,6 +244,18 @@ def model(root: Path) -> Kind:
     return Kind(root, [root / DOCUMENT, root / WEIGHTS], read)
 
 
+def psi(root: Path) -> Kind:
+    bins = np.random.default_rng(3).dirichlet(np.ones(8), 2).round(12).tolist()
+    document = {"psi": {"mug": {"pose": {"initial": bins[1], "learned": bins[0]}}, "can": {"pose": bins[1]}}}
+    (root / "results.json").write_text(json.dumps(document))
+    distribution = SceneDistribution.of([Pose()])
+
+    def read() -> Result:
+        return [psi_of_file(root, distribution, ["mug", "can"]).numpy()]
+
+    return Kind(root, [root / "results.json"], read)
+
+
 def same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and np.array_equal(a, b)
@@ -264,6 +279,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
         **pictures(folder("pictures")), "coco": coco(folder("coco")), "transforms": transforms(folder("transforms")),
         "colmap_text": colmap(folder("colmap_text"), False), "colmap_binary": colmap(folder("colmap_binary"), True),
         **data_sets(folder("sets")), "model": model(folder("model")),
+        "psi": psi(folder("psi")),
     }  # fmt: skip
 
 

@@ -44,10 +44,12 @@ def psi_of_file(
         parts = []
         for factor, numbers in zip(distribution.factors, row, strict=True):
             p = torch.tensor(numbers, dtype=torch.float64)
-            if p.shape != (factor.size,) or not bool(p.isfinite().all()) or abs(float(p.sum()) - 1.0) > 1e-4:
-                raise ValueError(
-                    f"{key}: {file}: {name}.{factor.name}: want {factor.size} numbers that add up to 1, got {numbers}"
-                )
+            fits = (
+                p.shape == (factor.size,) and bool(p.isfinite().all()) and abs(float(p.sum()) - 1.0) <= 1e-4
+            )
+            if not fits or (not factor.lights and bool((p < 0.0).any())):  # weights of lights may be negative
+                want = f"{factor.size} {'numbers' if factor.lights else 'probabilities'} that add up to 1"
+                raise ValueError(f"{key}: {file}: {name}.{factor.name}: want {want}, got {numbers}")
             parts.append(factor.psi_of(p, factor.closed(name)))
         psi.append(torch.cat(parts))
     return torch.stack(psi)
