@@ -167,7 +167,7 @@ REFUSED = [
      r"export\.psi: .*results\.json has no psi of drill; want objects \['pitcher', 'drill'\] with \['pose'\]"),
     (lambda path: [results(path, {"psi": {name: {"pose": [0.5] * 2} for name in ("pitcher", "drill")}})],
      r"results\.json: pitcher\.pose: want 8 probabilities that add up to 1, got \[0\.5, 0\.5\]"),
-    (lambda path: [results(path, {"psi": dict.fromkeys(("pitcher", "drill"), {"pose": [1.2, -0.2] + [0.0] * 6})})],
+    (lambda path: [results(path, {"psi": {n: {"pose": [1.2, -0.2, *[0.0] * 6]} for n in ("pitcher", "drill")}})],
      r"results\.json: pitcher\.pose: want 8 probabilities that add up to 1, got \[1\.2, -0\.2"),
     (["parameter=[pose,zoom]", "parameter.zoom.by=focal_length", "parameter.zoom.range=[0.5,2.0]",
       "export.formats=[bop]", "synthesis.objects_per_image=[1,2]"],
