@@ -56,7 +56,8 @@ def checked(function):
 
     @functools.wraps(function)
     def wrapper(*arguments, **named):
-        if jaxtyping.config.jaxtyping_disable:
+        # Exports trace what is computed, with sizes that are symbols.
+        if jaxtyping.config.jaxtyping_disable or torch.compiler.is_compiling():
             return function(*arguments, **named)
         if (key := _key(places, arguments, named)) is not None and (key, None) in right:
             result = function(*arguments, **named)

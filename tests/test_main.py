@@ -58,7 +58,7 @@ def test_one_run_from_objects_to_a_report(tmp_path):
     poses = results["psi"]["pitcher"]["pose"]
     assert (poses["learned"] != poses["initial"]) == any(verdict["accepted"] for verdict in verdicts)
     figures = {path.name for path in (tmp_path / "run" / "figures").glob("*.png")}
-    assert figures == {"psi_pose.png", "ap.png", "training_images.png", "detections.png"}
+    assert figures == {"strip.png", "psi_pose.png", "ap.png", "training_images.png", "detections.png"}
     coco = json.loads((tmp_path / "run" / "training_set" / "annotations.json").read_text())
     assert coco["images"] and "phi" in coco["images"][0]["poses"][0]
 

@@ -63,7 +63,7 @@ def test_an_unknown_stage_is_one_line_with_those_that_there_are(tmp_path, plugin
     with pytest.raises(UserError) as caught:
         context(tmp_path, "+count={_target_: my_task.Count}", "stages=[views,fields]")
     known = "views, field, target_sets, warm_start, psi, evaluate, report"
-    more = "preflight, repeat, predict, export, viewer, doctor, count"
+    more = "preflight, repeat, predict, export, box, viewer, doctor, count"
     assert str(caught.value) == f"stages: unknown stage 'fields', want some of {known}, {more}"
 
 

@@ -297,6 +297,6 @@ def test_a_run_that_fails_or_is_interrupted_says_so(folder, returned, uri, monke
     for act, expected, status in ((broken, RuntimeError, "FAILED"), (interrupted, SystemExit, "KILLED")):
         monkeypatch.setattr(LiveRun, "iteration", act)
         with pytest.raises(expected):
-            walk(*_context(folder, *WHOLE, "seed=2"))
+            walk(*_context(folder, *WHOLE, "seed=2", "resume=false"))
         assert _seen(uri)[0].status == status
     assert signal.getsignal(signal.SIGINT) == handler
