@@ -34,12 +34,14 @@ def make_together(results: Results, stages: Iterable[Stage[Any]], workers: int) 
     Raises:
         ValueError: as making the stages one after another.
     """
+    if workers < 2:
+        return
     missing = {stage.entry: stage for stage in results.missing(stages) if stage.stored}
     waiting = {name: set(_needed(stage, missing)) for name, stage in missing.items() if _can_be_sent(stage)}
     # What needs a stage that stays here stays here, too.
     while kept := {name for name, needed in waiting.items() if not needed <= waiting.keys()}:
         waiting = {name: needed for name, needed in waiting.items() if name not in kept}
-    if workers < 2 or _most_at_once(waiting) < 2:
+    if _most_at_once(waiting) < 2:
         return
     make = _Make(results.store.root, results.resume)
     _log.info("%d results, made by up to %d processes", len(waiting), workers)
