@@ -112,7 +112,7 @@ VERBS = {
     "box": Verb(
         "set the box about a photographed object by hand, where the scene's masks miss it",
         ("stages=[box]", "objects=photos"),
-        ("objects.root", "objects/poses", "box.object", "box.port", "box.seconds"),
+        ("objects.root", "box.object", "box.port", "box.seconds"),
         "objects.root=/data/captures objects/poses=colmap",
     ),
     "compare": Verb(
