@@ -41,10 +41,10 @@ SMALL = [
     "export.count=12", "export.workers=0", "export.detail=run",
 ]  # fmt: skip
 LOADED = ["neural_sim.main", "neural_sim.tasks.walk", "mlflow", "faster_coco_eval", "matplotlib.pyplot"]
-"""What processes have imported when they begin, so that they are killed at work."""
-ITERATION = re.compile(r"(?:round|psi) (\d+)/\d+ (?:val|\|)|psi (\d+)/\d+")
+"""Modules that processes import before they begin, so that they are killed while they work."""
+ITERATION = re.compile(r"psi (\d+)/\d+:")
 ENDS = {"report": "results.json", "export": "dataset"}
-"""What is no result in the store, by the file or folder that shows its beginning."""
+"""Parts of a run that leave no result in the store; each has begun when this file or folder is there."""
 TAKEN_UP = re.compile(r"psi loop: goes on after round (\d+)/")
 FIELD_EVERY = 0.5
 """Seconds between checkpoints of a field, which takes seconds here and a day at most."""
@@ -82,7 +82,7 @@ class Place:
 
     @property
     def log(self) -> str:
-        """What the last run said."""
+        """The output of the last run."""
         path = Path(f"{self.run}.log")
         return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
 
@@ -107,7 +107,7 @@ class Place:
         return found
 
     def at_work_on(self, kind: str) -> bool:
-        """Whether a process is making a result of a kind now, or is in that part of the run's end."""
+        """Tell whether a process is making a result of a kind now, or has begun that part of the run."""
         if kind in ENDS:
             return (self.run / ENDS[kind]).exists()
         held = Path("/proc/locks").read_text()
@@ -115,7 +115,7 @@ class Place:
         return any(re.search(rf":{path.stat().st_ino} ", held) for path in locks)
 
     def has_done(self, kind: str, count: int) -> bool:
-        """Whether all results of a kind are there."""
+        """Tell whether all results of a kind are there."""
         return kind not in ENDS and len(list(self.store.root.glob(f"{kind}/[!.]*.pt"))) >= count
 
 
@@ -153,7 +153,7 @@ def _digest(value: Any) -> str:
 
 @dataclass
 class Ends:
-    """What became of processes that were ended, by SIGKILL or SIGTERM."""
+    """Counts of the processes that were ended by SIGKILL or SIGTERM, and of what followed."""
 
     at: Counter[str] = field(default_factory=Counter)
     statuses: Counter[int] = field(default_factory=Counter)
@@ -243,7 +243,7 @@ def _iterations(log: str, done: int, ends: Ends) -> int:
         ends.iterations_lost = max(ends.iterations_lost, done - int(taken[1]))
     elif done and ITERATION.search(log):
         ends.iterations_lost = max(ends.iterations_lost, done)
-    return max([done, *(int(match[1] or match[2]) for match in ITERATION.finditer(log))])
+    return max([done, *(int(match[1]) for match in ITERATION.finditer(log))])
 
 
 def _running(database: Path) -> int:

@@ -1,4 +1,4 @@
-"""Where long work stands, written now and then, so that a later run goes on from there if this one is killed."""
+"""Checkpoints: long work writes its state now and then, and a later run continues from it if this one is killed."""
 
 from __future__ import annotations
 

@@ -85,9 +85,7 @@ class SavedDetector:
         document["weights"] = {"file": WEIGHTS, "sha256": hashlib.sha256(weights).hexdigest()}
         text = json.dumps(document, indent=1, allow_nan=False)
         for name, content in ((WEIGHTS, weights), (DOCUMENT, text.encode())):
-            write_whole(
-                folder / name, content
-            )  # by Python, so that it has the permissions that new files have
+            write_whole(folder / name, content)
         return folder / WEIGHTS
 
     @staticmethod

@@ -21,7 +21,7 @@ class Fitting(ABC):
     """One field with its training rays. Calls: ``start`` once, then ``loss`` and ``advance`` in each step."""
 
     checkpoint: Checkpoint | None = None
-    """Where an earlier run left the fit, and this one writes where it stands; None: nowhere."""
+    """The checkpoint that the fit is taken up from and writes to; None: neither."""
 
     def __init__(self, field: RadianceField, batch_rays: int) -> None:
         self.field = field
@@ -57,7 +57,7 @@ class Fitting(ABC):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a ``state``, just after ``start`` on the same views."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} returns a state, and wants restore to take it up")
 
     @abstractmethod
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
