@@ -27,8 +27,8 @@ logger = logging.getLogger(__name__)
 class Adjoint:
     """The solution and its damping.
 
-    ``damping_raises`` counts the increases of lambda; ``doubled`` is the vector at twice the final lambda, None unless
-    asked for. The solution's ``products`` are those of all these solves.
+    ``damping_raises`` counts the increases of lambda. ``doubled`` is the vector at twice the final lambda, or None if
+    it was not requested. The solution's ``products`` include those of every solve that was needed.
     """
 
     solution: Solution
@@ -54,7 +54,7 @@ class AdjointSolver:
         mode: how Hessian products are computed, see ``HessianOperator``.
         rtol, max_steps: passed to the linear solver.
         retain_graph: keep the first pass of all chunks between products: faster, memory of all chunks at once.
-        max_raises: most increases of lambda after solves that met negative curvature (a fixed lambda has none).
+        max_raises: limit on the increases of lambda after negative curvature was met (a fixed lambda is never raised).
         sensitivity: also solve at 2 lambda, to measure the influence of the damping: up to ``max_steps`` more products.
     """
 
@@ -97,7 +97,7 @@ class AdjointSolver:
     def _solve(
         self, operator: Matvec, damped: Damped, b: Tensor, x0: Tensor | None, times: float = 1.0
     ) -> Solution:
-        """Solve at ``times`` lambda, from the search by the damping's products where there is one, else from ``x0``."""
+        """Solve at ``times`` lambda, starting from the damping's Krylov search if there is one, else from ``x0``."""
         searched = damped.search(times)
         start = x0 if searched is None else searched
         return self.linear.solve(Shifted(operator, times * damped.value), b, start, self.rtol, self.max_steps)
@@ -108,5 +108,5 @@ class AdjointSolver:
 
 
 def _after(other: Solution, solution: Solution) -> Solution:
-    """Add the products of another solve to the solution's own."""
+    """Add the products of another solve to those of the solution."""
     return replace(solution, products=other.products + solution.products)

@@ -1,4 +1,4 @@
-"""Base of all solvers: scaling, warm start, recomputed residual, and a result that says how far to trust it."""
+"""Base class of all solvers: scaling, warm start, recomputed residual, and a result that says how far to trust it."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class Iterate:
 class Search:
     """State of a search by conjugate directions, to be continued.
 
-    ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next one. Solvers other than conjugate
-    gradients use the iterate ``value`` alone.
+    ``residual`` is ``b - A value`` by the recurrence, ``direction`` the next search direction. Solvers other than
+    conjugate gradients use only the iterate, ``value``.
     """
 
     value: Float[Tensor, "n"]
@@ -88,10 +88,10 @@ class Search:
 
 @dataclass(frozen=True)
 class System:
-    """``operator x = rhs`` as a solver's iteration gets it: ``rhs`` has a norm in [1, 2), ``tolerance`` is absolute.
+    """``operator x = rhs`` as passed to a solver's iteration: ``rhs`` has norm in [1, 2), ``tolerance`` is absolute.
 
-    ``residual`` is that at ``start``. It comes from a product where it meets the tolerance. Above, it may be a
-    search's recurrence, whose next ``direction`` is then given.
+    ``residual`` is the residual at ``start``. Where it meets the tolerance, it comes from a fresh product; otherwise it
+    may come from a search's recurrence, and then ``direction`` is the search's next direction.
     """
 
     operator: Watched
@@ -105,11 +105,11 @@ class System:
 
 @dataclass(frozen=True)
 class LinearSolver(abc.ABC):
-    """Solves ``A x = b`` for symmetric A given by its products. Subclasses hold typed hyper-parameters."""
+    """Solves ``A x = b`` for symmetric A, given by its products. Subclasses hold typed hyper-parameters."""
 
     @property
     def largest(self) -> int | None:
-        """The most unknowns that it takes; None: any number."""
+        """Largest number of unknowns that the solver accepts; None: no limit."""
         return None
 
     @abc.abstractmethod
@@ -129,15 +129,15 @@ class LinearSolver(abc.ABC):
         Args:
             matvec: products with A.
             b: the right-hand side.
-            x0: where to start, a vector or a search to continue; None: at zero.
+            x0: where to start: a vector, or a search to continue; None: zero.
             rtol: relative residual at which to stop.
-            max_steps: most steps; what a step costs depends on the solver.
+            max_steps: step limit; the cost of a step depends on the solver.
 
         Returns:
-            The solution and its status. Bad numbers give a status, never a NaN.
+            The solution and its status. Non-finite input gives a status, never a NaN.
 
         Raises:
-            ValueError: shapes or settings that make no sense.
+            ValueError: inconsistent shapes or invalid settings.
         """
         _check(b, x0.value if isinstance(x0, Search) else x0, rtol, max_steps)
         operator = Watched(matvec)
@@ -163,7 +163,7 @@ class LinearSolver(abc.ABC):
                 failed.value, Status.NON_FINITE, 0, 1.0, operator.curvature, operator.products, False
             )
         if residual > 1.0 and end.status is not Status.APPROXIMATE:
-            # By rounding, the recursion has diverged from the true residual: zero is the better answer.
+            # Rounding made the recursion diverge from the true residual: zero is the better answer.
             logger.warning("%s: the true residual is %.3g; zero is returned", type(self).__name__, residual)
             end, residual = Iterate(torch.zeros_like(rhs), _lost(end.status), end.steps), 1.0
         value = end.value * unit * scale
@@ -177,14 +177,14 @@ class LinearSolver(abc.ABC):
 
 
 def _verified(claimed: Status, residual: float, rtol: float) -> Status:
-    """Reduce a claimed status to what the recomputed residual supports."""
+    """Downgrade a claimed status to what the recomputed residual supports."""
     if residual <= rtol and claimed is not Status.SINGULAR:
         return Status.CONVERGED
     return Status.STAGNATED if claimed is Status.CONVERGED else claimed
 
 
 def _power_of_two(size: float) -> float:
-    """Find the power of two below ``size``: scaling by it is exact, so the scaled residual is the original one's."""
+    """Find the power of two below ``size``. Scaling by it is exact, so relative residuals do not change."""
     return 2.0 ** (math.frexp(size)[1] - 1)
 
 
@@ -205,7 +205,7 @@ def _started(
     tolerance: float,
     max_steps: int,
 ) -> System:
-    """Start the system at the guess where its residual beats that of zero (which is 1), else at zero."""
+    """Start the system at the guess if its relative residual is below 1, that of zero; else start at zero."""
     cold = System(operator, rhs, torch.zeros_like(rhs), rhs, None, tolerance, max_steps)
     value = guess.value if isinstance(guess, Search) else guess
     if value is None or not bool(torch.isfinite(value).all()) or not bool(value.any()):

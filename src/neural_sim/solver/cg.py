@@ -17,8 +17,8 @@ from neural_sim.solver.operator import dot, in_range, norm, numbers, plain_dot, 
 class ConjugateGradient(LinearSolver):
     """Conjugate gradients, for positive definite operators.
 
-    ``restart_gain``: where the recursion's residual converges and the recomputed one does not, iteration restarts from
-    the latter, as long as each restart shrinks it by this factor.
+    ``restart_gain``: when the recursion's residual has converged and the recomputed one has not, the iteration restarts
+    from the recomputed residual, as long as each restart shrinks it by this factor.
     """
 
     restart_gain: RestartGain = 0.5
@@ -31,7 +31,7 @@ class ConjugateGradient(LinearSolver):
         confirmed = best_norm = norm(residual)
         if confirmed <= tolerance:
             return Iterate(best, Status.CONVERGED, 0, confirmed)
-        # A direction given is that of a search to go on with.
+        # A given direction continues an earlier search.
         direction = residual if system.direction is None else system.direction
         energy = dot(residual, residual)
         for step in range(1, system.max_steps + 1):

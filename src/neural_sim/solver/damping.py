@@ -24,9 +24,9 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Damped:
-    """``value`` is lambda >= 0; ``spectrum`` is that of the undamped operator, None where it was not estimated.
+    """``value`` is lambda >= 0; ``spectrum`` is the undamped operator's, or None if it was not estimated.
 
-    ``krylov`` is the space that the estimate searched, where that is the right-hand side's.
+    ``krylov`` is the space that the estimate searched, if that space starts from the right-hand side.
     """
 
     value: float
@@ -39,7 +39,7 @@ class Damped:
         return math.nan if self.spectrum is None else self.spectrum.condition(self.value)
 
     def search(self, times: float = 1.0) -> Search | None:
-        """Solve at ``times`` lambda from the estimate's own products; None without them."""
+        """Solve at ``times`` lambda from the products that the estimate already took; None without them."""
         return None if self.krylov is None else self.krylov.search(times * self.value)
 
 
@@ -74,15 +74,15 @@ class FixedDamping(Damping):
 @validated
 @dataclass(frozen=True)
 class LanczosDamping(Damping):
-    """A lambda past the most negative curvature, and large enough for a wanted condition number.
+    """A lambda that exceeds the most negative curvature and keeps the condition number below a bound.
 
-    With the Ritz value lowered by its own error bound, ``m = smallest - error``:
+    Let ``m = smallest - error`` be the smallest Ritz value less its own error bound. Then
     ``lambda = max(minimum, (1 + margin) max(0, -m), (largest - max_condition m) / (max_condition - 1))``; the
     last term makes ``(largest + lambda) / (m + lambda) <= max_condition``.
 
-    The Krylov space is the right-hand side's, in which conjugate gradients begin: with lambda past its smallest Ritz
-    value these first steps cannot break down. (From a random start few steps miss a detector's few negative
-    eigenvalues among many near zero: on a tiny RetinaNet 12 steps gave -0.01, lambda_min was -2.4.) Where a longer
+    The Krylov space starts from the right-hand side, as conjugate gradients do: with lambda past its smallest Ritz
+    value, their first steps cannot break down. (A few steps from a random start miss the few negative eigenvalues of a
+    detector among many near zero: on a tiny RetinaNet 12 steps gave -0.01, where lambda_min was -2.4.) If a longer
     solve still meets negative curvature, lambda is raised past it.
     """
 

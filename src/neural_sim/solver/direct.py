@@ -19,10 +19,10 @@ from neural_sim.solver.operator import eigenpairs, norm
 @validated
 @dataclass(frozen=True)
 class Exact(LinearSolver):
-    """The dense solve by eigenvalues, an oracle for small problems: every column of the matrix costs one product.
+    """A dense eigenvalue solve, the reference for small problems: every column of the matrix costs one product.
 
-    It solves any symmetric system (by minimum norm on the range of a singular one). The extreme eigenvalues are the
-    curvature. ``max_steps`` does not bind. Systems above ``max_size`` raise ``ValueError``.
+    It solves any symmetric system (a singular one by minimum norm on its range). The extreme eigenvalues are reported
+    as the curvature. ``max_steps`` does not apply. Systems above ``max_size`` raise ``ValueError``.
     """
 
     max_size: PositiveInt = 5000
@@ -40,7 +40,7 @@ class Exact(LinearSolver):
                 f"exact: got {size} unknowns, max_size is {self.max_size}; use an iterative solver"
             )
         matrix = operator.dense(rhs)
-        # Products may be unsymmetric by rounding. Halves first: a sum of entries near the largest float overflows.
+        # Rounding may leave the products unsymmetric. Halve first: two entries near the largest float overflow.
         matrix = 0.5 * matrix + 0.5 * matrix.T
         scale = float(matrix.abs().max())
         if scale == 0.0:
@@ -65,7 +65,7 @@ class Exact(LinearSolver):
 def _refined(
     inverse: Callable[[Tensor], Tensor], matrix: Float[Tensor, "n n"], rhs: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
-    """Refine the factorisation's answer by one iteration, kept if it lowers the residual."""
+    """Refine the factorisation's answer once, and keep the result if its residual is lower."""
     value = inverse(rhs)
     better = value + inverse(rhs - matrix @ value)
     return better if norm(rhs - matrix @ better) < norm(rhs - matrix @ value) else value

@@ -1,7 +1,7 @@
 """Products with the Hessian of a training loss, without the matrix (Pearlmutter 1994).
 
-The loss is a sum of terms, one a chunk of images; a product differentiates one term at a time, so that memory
-is that of one chunk. Cost in gradients of the same chunk: about 2 to 3 in every mode.
+The loss is a sum of terms, one for each chunk of images. A product differentiates one term at a time, so that only one
+chunk is in memory. In every mode it costs about 2 to 3 gradients of the same chunks.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class HessianOperator:
     """The operator ``vector -> H vector``, H the Hessian of ``sum(term(params) for term in terms)`` at ``params``.
 
     Args:
-        terms: of the loss.
-        params: the point; vectors are flattened in this order.
+        terms: the terms of the loss.
+        params: where the Hessian is taken; vectors are flattened in this order.
         mode: ``reverse_over_reverse`` (exact) or ``central_difference`` (two gradients at ``theta +- h v``; error of
             relative order eps^(2/3)).
-        retain_graph: keep the first gradient's graph of all terms for reverse_over_reverse: a product falls to one
-            backward pass, memory grows to all chunks.
+        retain_graph: keep the first gradient's graph of all terms for reverse_over_reverse: a product then costs one
+            backward pass, but all chunks are in memory.
 
     Raises:
         ValueError: no terms, or an unknown mode.
@@ -86,7 +86,7 @@ class HessianOperator:
         return total
 
     def _gradient_graphs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield for each term a leaf point, and the gradient there with its graph."""
+        """Yield, for each term, a leaf point and the gradient there with its graph."""
         for term in self._terms:
             point = self._point.clone().requires_grad_()
             with torch.enable_grad():
@@ -113,9 +113,10 @@ class HessianOperator:
 
 
 def difference_length(point: Float[Tensor, "n"], vector: Float[Tensor, "n"]) -> float:
-    """Choose h of the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
+    """Choose the h of the difference between ``point + h vector`` and ``point - h vector``; 0 for the zero vector.
 
-    Truncation (h |vector|)^2 and rounding eps / (h |vector|) balance at eps^(1/3), relative to the point's own size.
+    The truncation error (h |vector|)^2 and the rounding error eps / (h |vector|) balance at eps^(1/3), relative to the
+    size of the point.
     """
     size = norm(vector)
     reach = torch.finfo(vector.dtype).eps ** (1 / 3) * (1.0 + norm(point) / point.numel() ** 0.5)

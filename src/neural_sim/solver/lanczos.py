@@ -25,9 +25,9 @@ from neural_sim.solver.operator import (
 
 @dataclass(frozen=True)
 class Krylov:
-    """The Krylov space of a start vector b of norm ``size``: orthonormal rows of ``basis``, and A in that basis.
+    """The Krylov space of a start vector b of norm ``size``: orthonormal rows ``basis``, and A in that basis.
 
-    ``beyond`` is what the last product has outside the space: its norm is the recurrence's next off-diagonal entry.
+    ``beyond`` is the part of the last product outside the space: its norm is the recurrence's next off-diagonal entry.
     """
 
     basis: Float[Tensor, "m n"]
@@ -36,13 +36,13 @@ class Krylov:
     beyond: Float[Tensor, "n"]
 
     def search(self, shift: float) -> Search | None:
-        """Find where m steps of conjugate gradients from zero on ``(A + shift I) x = b`` end, without a product.
+        """Compute where m conjugate-gradient steps from zero on ``(A + shift I) x = b`` end, without any product.
 
         Krylov spaces do not depend on the shift. None where the shifted matrix is not positive definite on this space.
 
-        With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m: the value is Q y, its residual r = -y_m
-        times ``beyond``, and Q z the only direction in the space that is conjugate to all others before it, which
-        makes r + |beyond|^2 y_m Q z conjugate to the whole space.
+        With T the shifted tridiagonal matrix, T y = |b| e_1 and T z = e_m, the value is Q y and its residual r is -y_m
+        times ``beyond``. Q z is the only direction in the space that is conjugate to all earlier ones; hence
+        r + |beyond|^2 y_m Q z is conjugate to the whole space.
         """
         shifted = self.tridiagonal + shift * torch.eye(len(self.tridiagonal), dtype=torch.float64)
         found = cast(tuple[Tensor, Tensor], torch.linalg.cholesky_ex(shifted))  # pyright: ignore[reportUnknownMemberType]
@@ -63,7 +63,7 @@ class Krylov:
 class Spectrum:
     """Extreme Ritz values: some eigenvalue lies within ``smallest_error`` of ``smallest`` (likewise the largest).
 
-    ``finite`` is False where the operator returned inf or nan; the values are those found until then (0 if
+    ``finite`` is False if the operator returned inf or nan; the values are then those found before (0 if
     none). ``krylov`` is the space that was searched, None if no product was finite.
     """
 
@@ -76,16 +76,16 @@ class Spectrum:
     krylov: Krylov | None = None
 
     def condition(self, shift: float = 0.0) -> float:
-        """Condition number of A + shift I if that is positive definite on what was seen, else inf."""
+        """Condition number of A + shift I if the Ritz values show it positive definite, else inf."""
         low, high = self.smallest + shift, self.largest + shift
         return high / low if low > 0.0 else math.inf
 
 
 def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
-    """Find Ritz values of a symmetric operator by at most ``steps`` products from ``start``, any non-zero vector.
+    """Find extreme Ritz values of a symmetric operator by at most ``steps`` products from a non-zero ``start``.
 
-    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue that the start
-    vector has a part in. Memory: ``steps`` vectors.
+    Ritz values lie inside the spectrum, so ``smallest`` is an upper bound of the smallest eigenvalue among those whose
+    eigenvectors contribute to the start vector. Memory: ``steps`` vectors.
 
     Raises:
         ValueError: a start that is zero or not finite, or fewer steps than 1.
@@ -135,7 +135,7 @@ def lanczos(matvec: Matvec, start: Float[Tensor, "n"], steps: int) -> Spectrum:
 def random_start(
     size: int, generator: torch.Generator, *, dtype: torch.dtype, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Draw a Gaussian start vector, which almost surely has a part in every eigenvector."""
+    """Draw a Gaussian start vector, which almost surely has a component along every eigenvector."""
     return torch.randn(size, generator=generator, dtype=dtype, device=generator.device).to(device)
 
 

@@ -20,8 +20,8 @@ from neural_sim.solver.operator import Watched, dot, norm
 class MinimumResidual(LinearSolver):
     """Minimum residuals, for any symmetric operator.
 
-    The residual falls monotonically. On an inconsistent singular system it ends at a least-squares solution and says
-    so. ``restart_gain`` as in ``ConjugateGradient``.
+    The residual falls monotonically. On an inconsistent singular system it ends at a least-squares solution and reports
+    that. ``restart_gain`` as in ``ConjugateGradient``.
     """
 
     restart_gain: RestartGain = 0.5
@@ -56,8 +56,8 @@ class MinimumResidual(LinearSolver):
 def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
     """Whether ``|A r| <= 10 sqrt(eps) |A| |r|`` for the true residual.
 
-    The recurrence's own estimate is of a residual that rounding no longer lets it reach where the condition number
-    exceeds 1 / sqrt(eps).
+    The recurrence has an estimate of its own, but where the condition number exceeds 1 / sqrt(eps) rounding keeps the
+    true residual from reaching it.
     """
     limit = 10.0 * torch.finfo(residual.dtype).eps ** 0.5 * max(abs(end) for end in operator.curvature)
     return norm(operator(residual)) <= limit * norm(residual)
@@ -65,7 +65,7 @@ def _minimises(operator: Watched, residual: Float[Tensor, "n"]) -> bool:
 
 @dataclass(frozen=True)
 class _Cycle:
-    """One run from a residual. ``least`` is the iterate whose residual was all but orthogonal to the range, if any."""
+    """One run from a residual. ``least`` is an iterate whose residual was nearly orthogonal to the range, if any."""
 
     value: Float[Tensor, "n"]
     converged: bool
@@ -76,7 +76,7 @@ class _Cycle:
 
 def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, budget: int) -> _Cycle:
     """Run Lanczos' recurrence with Givens rotations on the tridiagonal matrix, until ``|r| <= tolerance``."""
-    eta = norm(residual)  # the signed residual norm: last entry of the rotated right-hand side
+    eta = norm(residual)  # the residual norm with its sign: last entry of the rotated right-hand side
     basis, before = residual / eta, torch.zeros_like(residual)
     direction, older = torch.zeros_like(residual), torch.zeros_like(residual)
     value = torch.zeros_like(residual)
@@ -92,8 +92,8 @@ def _cycle(operator: Watched, residual: Float[Tensor, "n"], tolerance: float, bu
         carried = cosine_before * beta
         diagonal = cosine * alpha - sine * carried
         upper, upper_two = cosine * carried + sine * alpha, sine_before * beta
-        # |A r| / |r| of the iterate so far (Choi, Paige and Saunders 2011). Where it all but vanishes, what is left of
-        # the right-hand side lies outside the range, or on eigenvalues below half the digits: going on tells which.
+        # |A r| / |r| of the iterate so far (Choi, Paige and Saunders 2011). Where it nearly vanishes, the rest of the
+        # right-hand side lies outside the range or on eigenvalues below half the digits; more steps tell which.
         slope = math.hypot(diagonal, cosine * beta_next) / largest if largest > 0.0 else 0.0
         if slope <= min(half_digits, lowest):
             least, least_norm, lowest = value, abs(eta), slope

@@ -1,4 +1,4 @@
-"""Vectors and linear operators: flat parameters, norms, the shift, a wrapper that counts and checks products."""
+"""Vectors and linear operators: flat parameters, norms, a shift, and a wrapper that counts and checks products."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Matvec = Callable[[Tensor], Tensor]
 
 
 def flatten(params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
-    """Join all entries of parameters in one vector, in the dictionary's own order; differentiable.
+    """Join all parameters into one vector, in the dictionary's order; differentiable.
 
     Raises:
-        ValueError: an empty dictionary.
+        ValueError: the dictionary is empty.
     """
     if not params:
         raise ValueError("flatten: got no parameters, want at least one")
@@ -26,10 +26,10 @@ def flatten(params: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
 
 
 def unflatten(vector: Float[Tensor, "n"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Split a vector as ``flatten`` joined it, by names and shapes of ``like``; views, differentiable.
+    """Split a vector as ``flatten`` joined it, by the names and shapes of ``like``; the parts are differentiable views.
 
     Raises:
-        ValueError: a vector of another length.
+        ValueError: the vector has another length.
     """
     wanted = sum(tensor.numel() for tensor in like.values())
     if vector.shape != (wanted,):
@@ -59,7 +59,7 @@ class Shifted:
 
 
 def numbers(*scalars: Shaped[Tensor, ""]) -> list[float]:
-    """Read several scalars as Python numbers by one transfer: the host waits for the device once."""
+    """Read several scalars as Python numbers in one transfer, so that the host waits for the device only once."""
     stacked = torch.stack([scalar.double() for scalar in scalars])
     return cast(list[float], stacked.tolist())  # pyright: ignore[reportUnknownMemberType]
 
@@ -75,15 +75,15 @@ def plain_dot(left: Float[Tensor, "n"], right: Float[Tensor, "n"]) -> Float[Tens
 
 
 def norm(vector: Tensor) -> float:
-    """Take the Euclidean norm in float64, of float32 entries up to 1e38 and float64 entries of any size."""
+    """Take the Euclidean norm in float64, for float32 entries up to 1e38 and float64 entries of any size."""
     return in_range(float(plain_norm(vector)), vector)
 
 
 def in_range(size: float, vector: Tensor) -> float:
-    """Correct the ``plain_norm`` of a vector, ``size``: measured again only where it left float64's range."""
+    """Recompute the ``plain_norm`` of a vector, ``size``, if it left float64's range; else return ``size``."""
     if 1e-140 < size < 1e150 or not bool(torch.isfinite(vector).all()):
         return size
-    # Squares leave the range of float64: the same after scaling by a power of two, which is exact.
+    # Squares leave the range of float64. Scaling by a power of two, which is exact, avoids that.
     exponent = math.frexp(float(vector.abs().max()))[1]
     scaled = torch.ldexp(vector.double(), torch.tensor(-exponent))
     return math.ldexp(float(plain_norm(scaled)), exponent)
@@ -110,7 +110,7 @@ class Product:
 
 
 class Watched:
-    """Counts an operator's products, keeps the range of their Rayleigh quotients, raises ``NonFiniteProduct``."""
+    """Counts an operator's products and tracks their Rayleigh quotients' range; raises ``NonFiniteProduct``."""
 
     def __init__(self, matvec: Matvec) -> None:
         self._matvec = matvec
@@ -127,11 +127,11 @@ class Watched:
         return self.measured(vector).value
 
     def measured(self, vector: Float[Tensor, "n"]) -> Product:
-        """Multiply a vector; its energy and norms come by one transfer to the host.
+        """Multiply a vector, and compute the product's energy and norms in one transfer to the host.
 
         Raises:
-            NonFiniteProduct: a product that is not finite.
-            ValueError: a product of another shape.
+            NonFiniteProduct: the product is not finite.
+            ValueError: the product has another shape.
         """
         product = self._matvec(vector)
         if product.shape != vector.shape:
@@ -151,10 +151,10 @@ class Watched:
         return Product(product, energy, size, length)
 
     def dense(self, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-        """Build the operator's matrix, by its own ``dense`` where it has one; counted as a product a column.
+        """Build the operator's matrix, by the operator's own ``dense`` if it has one; counts one product a column.
 
         Raises:
-            NonFiniteProduct: a matrix that is not finite.
+            NonFiniteProduct: the matrix is not finite.
         """
         matrix = _own_matrix(self._matvec)
         if matrix is None:
@@ -166,12 +166,12 @@ class Watched:
         return matrix
 
     def observe(self, low: float, high: float) -> None:
-        """Widen the curvature range by values known otherwise, for instance eigenvalues."""
+        """Widen the curvature range by values known from elsewhere, such as eigenvalues."""
         self._low, self._high = min(self._low, low), max(self._high, high)
 
 
 def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
-    """Build an operator's matrix, one product a column, for small problems. Type and device are those of ``like``."""
+    """Build a small operator's matrix from one product a column, with the type and device of ``like``."""
     matrix = like.new_empty(like.numel(), like.numel())
     basis = torch.zeros_like(like)
     for column in range(like.numel()):
@@ -182,7 +182,7 @@ def columns(matvec: Matvec, like: Float[Tensor, "n"]) -> Float[Tensor, "n n"]:
 
 
 def _own_matrix(matvec: Matvec) -> Tensor | None:
-    """Build the matrix of an operator that has a faster way to it than column by column, else None."""
+    """Build the matrix by the operator's own ``dense``, which is faster than column by column; None without one."""
     if isinstance(matvec, Shifted):
         matrix = _own_matrix(matvec.matvec)
         return None if matrix is None else matrix + matvec.shift * torch.eye(len(matrix)).to(matrix)
