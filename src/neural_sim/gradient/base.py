@@ -1,6 +1,6 @@
 """Inputs and result of the estimators of ``d/dpsi <dL_train/dtheta, v>``.
 
-The implicit function theorem's minus sign is not theirs: it is applied once, in ``implicit.py``.
+Estimators leave out the minus sign of the implicit function theorem: ``implicit.py`` applies it once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Params = dict[str, Tensor]
 
 
 class IndexedLoss(Protocol):
-    """Losses of training images by row, from cached features of a frozen backbone."""
+    """Losses of training images by row, computed from cached features of a frozen backbone."""
 
     def __call__(self, params: Params, index: Int[Tensor, "n"], /) -> Float[Tensor, "n"]:
         """Compute the losses of these rows."""
@@ -28,7 +28,7 @@ class IndexedLoss(Protocol):
 
 
 class ImageLoss(Protocol):
-    """Losses of training images, twice differentiable in parameters and images; targets by row ``index``."""
+    """Losses of training images, twice differentiable in parameters and images. Row ``index`` selects the targets."""
 
     def __call__(
         self, params: Params, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], /
@@ -39,7 +39,7 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class Probes:
-    """Probes of one object: images of every bin of one factor. ``index`` are their rows among all probes."""
+    """One object's stratified samples: images of every bin of one factor. ``index`` are their rows among all probes."""
 
     index: Int[Tensor, "m"]
     bins: Int[Tensor, "m"]
@@ -47,7 +47,7 @@ class Probes:
 
 @dataclass(frozen=True)
 class Losses:
-    """Per-image losses of the training images (from cached features, and from the images), and of the probes."""
+    """Per-image losses of the training images (from cached features, and from pixels) and of the probes."""
 
     cached: IndexedLoss
     from_images: ImageLoss
@@ -56,12 +56,12 @@ class Losses:
 
 @dataclass(frozen=True)
 class RenderedPath:
-    """How one object's images were computed from psi, to be computed again with derivatives.
+    """How one object's images were computed from psi, so that they can be computed again with derivatives.
 
-    ``relaxed`` maps psi to the draw with its noise bound (replayed). ``render_rays`` maps rays to premultiplied colour
-    [r, 3] and opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images with the
-    nuisance bound. ``rgb`` and ``opacity`` are the first render's. ``tangents`` (forward mode only) are the maps'
-    derivatives by the draw's numbers that depend on psi, from that same render.
+    ``relaxed`` maps psi to the draw, with its noise fixed. ``render_rays`` maps rays to premultiplied colour [r, 3] and
+    opacity [r], differentiable in the rays. ``compose`` maps colour and opacity maps to images, with all other random
+    choices fixed. ``rgb`` and ``opacity`` come from the first render. ``tangents`` (forward mode only) are the
+    derivatives of these maps by those numbers of the draw that depend on psi, from the same render.
     """
 
     relaxed: Callable[[Float[Tensor, "K"]], SceneDraw]
@@ -77,9 +77,9 @@ class RenderedPath:
 class ObjectImages:
     """One object's training images at one psi step.
 
-    ``psi`` is the object's part of all factors of ``distribution``, p_psi. ``index`` are the images' rows in
-    the training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws).
-    ``draw`` is where they were rendered. ``images`` and ``path`` are needed by the pathwise estimator only.
+    ``psi`` is the object's psi, all factors of ``distribution`` (p_psi) joined. ``index`` are the images' rows in the
+    training set and ``weights`` their weights in ``L_train = sum_i w_i l_i`` (1 / N for plain draws). ``draw`` holds
+    the scene parameters they were rendered with. Only the pathwise estimator needs ``images`` and ``path``.
     """
 
     psi: Float[Tensor, "K"]
@@ -95,9 +95,9 @@ class ObjectImages:
 class MixedDerivative:
     """``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign.
 
-    ``standard_error`` is that of ``value`` over draws of the images at fixed v; inf where it is unknown. ``p_values``,
-    by factor of psi, are those of the null that all components of that factor are zero, over the same draws; empty
-    where nothing was tested.
+    ``standard_error`` is the error of ``value`` over draws of the images at fixed v; inf if unknown. ``p_values`` has,
+    for each factor of psi, the p-value of the null hypothesis that all its components are zero, over the same draws; it
+    is empty if nothing was tested.
     """
 
     value: Float[Tensor, "K"]
@@ -106,7 +106,7 @@ class MixedDerivative:
 
 
 def from_contributions(contributions: Float[Tensor, "n K"]) -> MixedDerivative:
-    """Sum the independent contributions of images, and estimate the sum's standard error."""
+    """Sum the images' independent contributions, and estimate the standard error of the sum."""
     value, count = contributions.sum(0), len(contributions)
     if count < 2:
         return MixedDerivative(value, torch.full_like(value, torch.inf))

@@ -1,4 +1,4 @@
-"""Estimators of the derivative by psi from scores of images: stratified, which is the default, and REINFORCE."""
+"""Estimators of the derivative by psi from image scores: stratified (the default) and REINFORCE."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LogProbabilities = Callable[[Float[Tensor, "k"]], Float[Tensor, "k"]]
 class Estimator(Protocol):
     """An estimator of the derivative by psi from images.
 
-    ``wanted`` is what ``accumulated`` reads of the sums over a training's steps.
+    ``wanted`` names the sums over a training's steps that ``accumulated`` reads.
     """
 
     wanted: ClassVar[Wanted]
@@ -44,7 +44,7 @@ class Estimator(Protocol):
 
     @property
     def probes_per_bin(self) -> int:
-        """Number of further images of every stratum of every factor; 0: none."""
+        """Number of additional images in each stratum of each factor; 0: none."""
         ...
 
     def estimate(
@@ -58,34 +58,34 @@ class Estimator(Protocol):
         """Estimate ``d/dpsi <dL_train/dtheta, v>`` of one object, without the minus sign of Eq. 2.
 
         Args:
-            losses: of ``images`` and ``probes``, as functions of ``params``.
+            losses: losses of ``images`` and ``probes`` as functions of ``params``.
             params: the trained parameters.
             vector: v.
             images: the object's training images.
-            probes: its probes, by factor.
+            probes: the object's probes, by factor.
         """
         ...
 
     def accumulated(
         self, sums: Accumulated, images: ObjectImages, probes: Mapping[str, Probes]
     ) -> MixedDerivative:
-        """Estimate ``dL_val/dpsi`` of one object through the training that was run, sign included."""
+        """Estimate ``dL_val/dpsi`` of one object through the recorded training, sign included."""
         ...
 
 
 @validated
 @dataclass(frozen=True)
 class StratifiedEstimator:
-    """Stratified sampling: the derivative over hard bins, from mean scores of probes of every bin of every factor.
+    """Stratified sampling: the derivative over hard bins, from the mean scores of probes of every bin of every factor.
 
-    With ``E = sum_b p_b s_b`` (s_b the mean score of bin b) it is ``dE/dpsi = sum_b (dp_b/dpsi) s_b``, for logits
-    without a floor ``p_i (s_i - sum_j p_j s_j)``. For lights, differences of mean scores take its place, see
-    ``across_lights``.
+    With ``E = sum_b p_b s_b`` (s_b the mean score of bin b) the derivative is ``dE/dpsi = sum_b (dp_b/dpsi) s_b``,
+    which for logits without a floor is ``p_i (s_i - sum_j p_j s_j)``. Lights use differences of mean scores instead,
+    see ``across_lights``.
 
-    Only mean scores are estimated: every bin is sampled by itself, whatever p, and the renderer is never
-    differentiated. All bins show the same scenes, with the same random numbers for all that is not the bin, so that
-    differences between bins owe nothing to backgrounds and distances. An outer iteration costs one Jacobian-vector
-    product over the predictor for its probes, computed by ``theta_mode`` (see ``gradient.mixed.scores``).
+    Only mean scores are estimated: every bin is sampled separately, whatever p is, and the renderer is never
+    differentiated. Every bin shows the same scenes: all random numbers other than the bin are shared, so that
+    backgrounds and distances cancel in differences between bins. An outer iteration costs one Jacobian-vector product
+    over the predictor for its probes, computed by ``theta_mode`` (see ``gradient.mixed.scores``).
     """
 
     wanted: ClassVar[Wanted] = "probes"
@@ -108,12 +108,12 @@ class StratifiedEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        Null hypothesis of the p-values: a factor's bins, or lights, have equal mean scores, so that the derivative is
-        zero.
+        The p-values test the null hypothesis that a factor's bins, or lights, have equal mean scores, so that the
+        derivative is zero.
         """
         scored = losses.probes
         if scored is None:
-            raise ValueError("stratified: wants losses of probes, got none")
+            raise ValueError("stratified: want losses of probes, got none")
         return self._over_strata(
             lambda index: scores(scored, params, vector, index, self.chunk_size, self.theta_mode),
             images,
@@ -155,29 +155,29 @@ def stratified(
     log_probabilities: LogProbabilities,
     weight: float = 1.0,
 ) -> MixedDerivative:
-    """Estimate ``weight * dE/dpsi`` from the scores of ``n`` scenes, each with the object in every bin.
+    """Estimate ``weight * dE/dpsi`` from the scores of ``n`` scenes, each rendered with the object in every bin.
 
-    Scenes are independent, so that the standard error is that of the mean over scenes of each one's derivative. What a
-    scene adds to its scores in all bins alike adds nothing to it. Infinite for one scene.
+    Scenes are independent: the standard error is that of the mean of their derivatives, infinite for a single scene. An
+    offset that a scene adds to its scores in all bins cancels.
 
     Raises:
-        ValueError: another shape, or no scene.
+        ValueError: the table has another shape, or no scene.
     """
     if table.ndim != 2 or table.shape[0] != psi.numel() or table.shape[1] == 0:
         raise ValueError(
             f"stratified: want scores [{psi.numel()} bins, at least one scene], got shape {tuple(table.shape)}"
         )
-    # An offset common to all bins moves nothing. Subtracted first, equal scores give exactly 0 instead of a rounding
-    # error.
+    # A common offset of all bins has no effect. It is subtracted first, so that equal scores give exactly 0 and not
+    # a rounding error.
     return _mean((table - table[:1]).T @ _jacobian(log_probabilities, psi), weight)
 
 
 def by_strata(
     scores: Float[Tensor, "n"], factor: Factor, psi: Float[Tensor, "k"], weight: float = 1.0
 ) -> MixedDerivative:
-    """Estimate the derivative by one factor's psi from the scores of its probes, stratum after stratum.
+    """Estimate the derivative by one factor's psi from the scores of its probes, given stratum after stratum.
 
-    For bins it is that of ``stratified``, for lights of ``across_lights``.
+    Bins use ``stratified``, lights ``across_lights``.
     """
     table = scores.view(factor.size, -1)
     if isinstance(factor, BinnedFactor):
@@ -188,16 +188,16 @@ def by_strata(
 def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDerivative:
     """Estimate ``weight * (s_i - mean_j s_j)``, s_i the mean score under anchor light i: differences between lights.
 
-    What is common to all lights is subtracted, since the projection onto the constraint removes it.
+    What all lights have in common is subtracted, because the projection onto the constraint removes it.
 
     This is not the derivative of the training loss by psi, whose weights blend the lights in every image
-    (``gradient=pathwise`` computes that one). It is the derivative for another training set: images under single
-    lights, a fraction w_i of them under light i. It replaces the derivative by the blend, which says little about a
-    large change of light: a detector that never saw a light gains nothing from a trace of it (docs/numerics.md, Lights,
-    compares both with the truth). ``table`` has the scores of ``n`` scenes under each light.
+    (``gradient=pathwise`` computes that one). It is the derivative for another training set: images each under a single
+    light, a fraction w_i of them under light i. The derivative by the blend says little about a large change of light:
+    a detector that never saw a light gains nothing from a trace of it (docs/numerics.md, Lights, compares both with the
+    finite-difference response). ``table`` has the scores of ``n`` scenes under each light.
 
     Raises:
-        ValueError: no scene.
+        ValueError: there is no scene.
     """
     if table.numel() == 0:
         raise ValueError(
@@ -209,24 +209,24 @@ def across_lights(table: Float[Tensor, "k n"], weight: float = 1.0) -> MixedDeri
 def importance_weights(
     probabilities: Float[Tensor, "k"], bins: Int[Tensor, "n"], weight: float = 1.0
 ) -> Float[Tensor, "n"]:
-    """Compute weights ``weight p_b / n_b`` under which images of prescribed bins train as if drawn from p.
+    """Compute weights ``weight p_b / n_b``, under which images of given bins train as if drawn from p.
 
-    ``weight`` is the object's fraction of the training set. The weights sum to it when every bin of positive p was
-    drawn; the mass of other bins is missing, not redistributed.
+    ``weight`` is the object's fraction of the training set. The weights sum to it if every bin with positive p was
+    drawn; the mass of bins that were not drawn is missing, not redistributed.
     """
     counts = torch.bincount(bins, minlength=probabilities.numel())
     return weight * (probabilities / counts.clamp_min(1))[bins]
 
 
 def _mean(by_scene: Float[Tensor, "n k"], weight: float) -> MixedDerivative:
-    """Take the mean over independent scenes; of one scene the standard error is infinite."""
+    """Take the mean over independent scenes; the standard error of a single scene is infinite."""
     count = len(by_scene)
     error = by_scene.std(0) / count**0.5 if count > 1 else torch.full_like(by_scene[0], torch.inf)
     return MixedDerivative(weight * by_scene.mean(0), weight * error)
 
 
 def _jacobian(log_probabilities: LogProbabilities, psi: Tensor) -> Float[Tensor, "k k"]:
-    """Compute ``dp_b/dpsi_i`` at row b, column i."""
+    """Compute dp_b/dpsi_i, at row b and column i."""
     leaf = psi.detach().requires_grad_()
     with torch.enable_grad():
         p = log_probabilities(leaf).exp()
@@ -243,7 +243,7 @@ class ReinforceEstimator:
 
     @property
     def draws(self) -> HardDraws:
-        """Samples of p_psi with a density."""
+        """Exact samples of p_psi that have a density."""
         return HardDraws(explore=True)
 
     @property
@@ -261,7 +261,7 @@ class ReinforceEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        Null hypothesis of the p-values: scores do not depend on the bins, or lights, that a factor drew.
+        The p-values test the null hypothesis that scores do not depend on the bins, or lights, that a factor drew.
         """
         return self._by_score_function(
             scores(losses.cached, params, vector, images.index, self.chunk_size), images

@@ -1,6 +1,6 @@
-"""The hypergradient ``dL_val/dpsi``, and a record of the adjoint that it was computed by.
+"""The hypergradient ``dL_val/dpsi``, and a record of the adjoint that it was computed with.
 
-``gradient.implicit`` computes it at a stationary point (Eq. 2), ``gradient.unrolled`` of the training that was
+``gradient.implicit`` computes it at a stationary point (Eq. 2), ``gradient.unrolled`` for the training that was
 run.
 """
 
@@ -23,12 +23,12 @@ class ImplicitAdjoint:
 
     Attributes:
         solution: v, and how the solve ended.
-        damping: lambda, and the spectrum that it was chosen by.
+        damping: lambda, and the spectrum from which it was chosen.
         damping_raises: increases of lambda after solves that met negative curvature.
         stationarity: ``|dL_train/dtheta|``, 0 at a minimiser, which the implicit function theorem assumes.
         validation_norm: ``|dL_val/dtheta|``.
-        sensitivity: ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` of the psi gradients g of all objects together, None
-            unless the solver was asked for it. Not a bias: an indefinite H has poles in lambda.
+        sensitivity: ``|g(2 lambda) - g(lambda)| / |g(lambda)|`` for the psi gradients g of all objects joined; None
+            unless the solver was asked for it. This is not a bias: with an indefinite H, g has poles in lambda.
     """
 
     solution: Solution
@@ -40,17 +40,17 @@ class ImplicitAdjoint:
 
     @property
     def products(self) -> int:
-        """Hessian products of the solve and of the damping before it."""
+        """Hessian products of the solve and of the choice of the damping before it."""
         spectrum = self.damping.spectrum
         return self.solution.products + (spectrum.products if spectrum else 0)
 
 
 @dataclass(frozen=True)
 class UnrolledAdjoint:
-    """The reversed training.
+    """Summary of a reversed training.
 
     Attributes:
-        steps: reversed steps, each of which takes one Hessian product.
+        steps: number of reversed steps; each takes one Hessian product.
         finite: whether all sums over the steps are finite.
         validation_norm: ``|dL_val/dtheta|`` after the last step.
     """
@@ -61,7 +61,7 @@ class UnrolledAdjoint:
 
     @property
     def products(self) -> int:
-        """Hessian products: one a step."""
+        """Number of Hessian products: one a step."""
         return self.steps
 
 
@@ -70,12 +70,12 @@ Adjoint_co = TypeVar("Adjoint_co", bound=ImplicitAdjoint | UnrolledAdjoint | Non
 
 @dataclass(frozen=True)
 class Hypergradient(Generic[Adjoint_co]):
-    """``dL_val/dpsi`` by object, with everything needed to judge it.
+    """``dL_val/dpsi`` by object, and what is needed to judge it.
 
     Attributes:
         gradients: the derivatives.
         errors: standard errors of their components.
-        adjoint: how it was computed; None where trainings were compared and no adjoint was needed.
+        adjoint: how it was computed; None if trainings were compared and no adjoint was needed.
         p_values: by object and factor, see ``MixedDerivative``; empty where nothing was tested.
         seconds: by phase: validation, solve or unrolled, mixed.
     """
@@ -88,5 +88,5 @@ class Hypergradient(Generic[Adjoint_co]):
 
     @property
     def products(self) -> int:
-        """Hessian products."""
+        """Number of Hessian products."""
         return 0 if self.adjoint is None else self.adjoint.products

@@ -29,13 +29,13 @@ FAILED = (Status.NEGATIVE_CURVATURE, Status.NON_FINITE)
 @validated
 @dataclass(frozen=True)
 class Implicit:
-    """``outer.adjoint``: the hypergradient of a stationary point, by the group ``solver``.
+    """``outer.adjoint``: the hypergradient at a stationary point, with the solver from the group ``solver``.
 
     Args:
-        curvature_images: training images of the Hessian products; 0: all.
-        max_residual: largest relative residual of the solve that is trusted; None: no limit, as for the others.
-        max_stationarity: largest ``|dL_train/dtheta|``.
-        max_sensitivity: largest relative change from lambda to 2 lambda; wants ``solver.sensitivity``.
+        curvature_images: number of training images in the Hessian products; 0: all.
+        max_residual: largest trusted relative residual of the solve; None here and below: no limit.
+        max_stationarity: largest trusted ``|dL_train/dtheta|``.
+        max_sensitivity: largest trusted relative change from lambda to 2 lambda; needs ``solver.sensitivity``.
     """
 
     curvature_images: NonNegativeInt = 64
@@ -70,13 +70,13 @@ class InnerProblem:
         losses: l_i by row.
         weights: w_i of rows 0..N-1 of ``losses``; 1 / N each for independent draws.
         chunk_size: images in memory at a time.
-        proximal: weight of the proximal term, with which ``(H + proximal I)^-1`` is the problem's exact derivative.
+        proximal: weight of the proximal term; with it, ``(H + proximal I)^-1`` is the exact derivative of the problem.
         anchor: the fixed theta_0 of the proximal term.
-        subset: rows of the Hessian products (not of the stationarity), None: all.
-        subset_weights: weights of those rows; None: their own, scaled up to the sum of all.
+        subset: rows used in Hessian products (the stationarity uses all rows); None: all.
+        subset_weights: weights of those rows; None: their own weights, scaled up to the sum of all.
 
     Raises:
-        ValueError: no weights, a chunk of no image, or a proximal term that is negative or lacks its anchor.
+        ValueError: no weights, a chunk of no images, or a proximal term that is negative or lacks its anchor.
     """
 
     params: Params
@@ -103,7 +103,7 @@ class InnerProblem:
     def terms(
         self, subset: Int[Tensor, "n"] | None = None, subset_weights: Float[Tensor, "n"] | None = None
     ) -> list[Term]:
-        """Return the loss as a sum over chunks and the proximal term, of all rows or a subset that stands for them."""
+        """Return the loss as a sum of chunks and the proximal term, over all rows or a subset that represents them."""
         index = torch.arange(self.weights.numel(), device=self.weights.device) if subset is None else subset
         weights = self.weights[index] if subset_weights is None else subset_weights
         if subset is not None and subset_weights is None:
@@ -133,9 +133,9 @@ def hypergradient(
         inner: the inner problem at its minimiser.
         validation: the terms of L_val as functions of the parameters.
         estimates: by object, the function from v to ``d/dpsi <dL_train/dtheta, v>``.
-        solver: of v. A failed solve gives the best iterate: read ``adjoint.solution.status``.
-        generator: of the damping's random start.
-        previous: the solve's initial guess.
+        solver: solves for v. If it fails, the best iterate is used: read ``adjoint.solution.status``.
+        generator: random numbers of the damping's start vector.
+        previous: initial guess of the solve.
     """
     began = time.perf_counter()
     right_hand_side = gradient(validation, inner.params)
@@ -180,8 +180,8 @@ def curvature_rows(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Choose rows of the training set for Hessian products, and their weights in them.
 
-    ``wanted`` random ones (0: all), of the first ``drawn``, which were drawn from p_psi, and of the others, which are
-    photographs, in proportion to the weight of each part, which its rows keep.
+    ``wanted`` rows are drawn at random (0: all). The first ``drawn`` rows were drawn from p_psi, the others are
+    photographs; both parts are sampled in proportion to their weights, so that each keeps its weight.
     """
     count = len(weights)
     if not 0 < wanted < count:

@@ -1,6 +1,6 @@
 """The mixed second derivative of the training loss, contracted with v first (paper, Tool 2).
 
-That leaves one number per image, its score ``s_i = <dl_i/dtheta, v>``, and one image-sized array,
+Contracting first leaves one number for each image, its score ``s_i = <dl_i/dtheta, v>``, and one image-sized array,
 ``d/dx sum_i w_i s_i``; the m x d matrix of Eq. 3 is never formed.
 """
 
@@ -30,13 +30,14 @@ def scores(
     chunk_size: int = 32,
     mode: ThetaMode = "forward",
 ) -> Float[Tensor, "n"]:
-    """Compute ``s_i = <dl_i/dtheta, v>`` of the images in ``index``, ``chunk_size`` of them in memory at a time.
+    """Compute ``s_i = <dl_i/dtheta, v>`` of the images in ``index``, with ``chunk_size`` of them in memory at a time.
 
     ``forward``: one Jacobian-vector product gives a chunk's scores. ``central_difference``: the losses at
-    ``theta +- h v``, two plain passes instead of forward mode's four, with an error of relative order eps^(2/3).
+    ``theta +- h v``, at the cost of two plain passes, where forward mode costs four; its error is of relative order
+    eps^(2/3).
 
     Raises:
-        ValueError: an unknown mode, or a chunk of no image.
+        ValueError: an unknown mode, or a chunk of no images.
     """
     _check(mode, chunk_size)
     along = _ALONG[mode]
@@ -58,10 +59,10 @@ def image_cotangents(
 ) -> Float[Tensor, "n 3 h w"]:
     """Compute ``d/dx <d(sum_i w_i l_i)/dtheta, v>``: the images' cotangents (left factor of Eq. 3 times v).
 
-    The inner derivative, in theta, is taken in forward mode, the outer one, in the images, in reverse mode.
+    The inner derivative, by theta, is taken in forward mode; the outer one, by the images, in reverse mode.
 
     Raises:
-        ValueError: a chunk of no image.
+        ValueError: a chunk of no images.
     """
     _check("forward", chunk_size)
     if not len(index):
@@ -108,7 +109,7 @@ _ALONG = {"forward": _forward_scores, "central_difference": _differenced_scores}
 
 
 def _device(params: Params) -> torch.device:
-    """Say where losses are computed: rows and weights, which are on the CPU, are moved there once."""
+    """Find the device of the losses. Rows and weights, which are on the CPU, are moved there once."""
     return next(iter(params.values())).device
 
 

@@ -1,10 +1,10 @@
 """The paper's estimator: relaxed draws, differentiated through the renderer (Sec. 3.1, Tools 1 to 3, Eqs. 3 to 6).
 
-Reverse mode is the paper's. The first forward pass renders images without derivatives. Then v and the images'
-cotangents are computed. The second forward pass renders rays of one patch at a time from the same draw, each patch
-followed by its backward pass into the draw's few numbers per image. Forward mode: V has a few numbers per image and an
-image has thousands, so the first render also computes the maps' derivatives by those numbers, and the cotangents are
-contracted with them; there is no second render and no patch. Either way the draw is differentiated by psi once, at the
+Reverse mode is the paper's. The first forward pass renders images without derivatives; then v and the images'
+cotangents are computed. The second forward pass renders rays of the same draw, one patch at a time, each followed by
+its backward pass into the few numbers that the draw has for each image. Forward mode uses that an image has thousands
+of numbers and V only a few: the first render also computes the maps' derivatives by those few, and the cotangents are
+contracted with them, without a second render or patches. In both modes the draw is differentiated by psi once, at the
 end.
 """
 
@@ -49,9 +49,9 @@ class PathwiseEstimator:
     """Relaxed draws, differentiated through the renderer.
 
     Args:
-        mode: how images are differentiated by V. ``forward``: along with the first render; ``reverse``: the paper's
-            second forward, patch by patch.
-        patch_size: rays in a patch of the reverse mode.
+        mode: how images are differentiated by V. ``forward``: during the first render; ``reverse``: the paper's
+            second forward pass, patch by patch.
+        patch_size: number of rays in a patch of the reverse mode.
         chunk_size: images whose losses are differentiated at a time.
 
     Raises:
@@ -83,8 +83,8 @@ class PathwiseEstimator:
     ) -> MixedDerivative:
         """See ``Estimator``.
 
-        Tangents of the first render are used in either mode. p-values are those of ``significance.zero_mean`` for
-        the images' contributions.
+        Both modes use the tangents of the first render. p-values come from ``significance.zero_mean`` of the images'
+        contributions.
 
         Raises:
             ValueError: images without a path.
@@ -115,12 +115,12 @@ class PathwiseEstimator:
         maps = map_cotangents(path, cotangents)
         along_draw = contract(path.tangents or {}, maps)
         if set(moved_by(path.relaxed, images.psi)) - set(along_draw):
-            # The first render computes derivatives by lights in any mode, those by the camera in forward mode only.
+            # The first render always computes derivatives by the lights, but those by the camera only in forward mode.
             along_draw |= draw_cotangents(path.render_rays, path.camera, images.draw, maps, self.patch_size)
-        # From here on a few numbers per image, on the CPU like psi and the draws.
+        # From here on there are only a few numbers per image; they are on the CPU, like psi and the draws.
         along_draw = dict(zip(along_draw, moved(list(along_draw.values()), images.psi.device), strict=True))
         contributions = psi_contributions(path.relaxed, images.psi, along_draw)
-        # An offset common to a factor's components changes neither its distribution nor its weights of lights.
+        # An offset common to all components of a factor changes neither its probabilities nor its weights of lights.
         parts = images.distribution.split(contributions).items()
         p_values = {name: zero_mean(part - part.mean(-1, keepdim=True)) for name, part in parts}
         return replace(from_contributions(contributions), p_values=p_values)
@@ -128,12 +128,12 @@ class PathwiseEstimator:
 
 def _path(images: ObjectImages) -> RenderedPath:
     if images.path is None:
-        raise ValueError("pathwise: these images carry no rendered path, which this estimator differentiates")
+        raise ValueError("pathwise: these images carry no rendered path to differentiate")
     return images.path
 
 
 def _pixels(images: ObjectImages) -> Float[Tensor, "n 3 h w"]:
-    assert images.images is not None  # as images with a path always have
+    assert images.images is not None  # images with a path always have pixels
     return images.images
 
 
@@ -148,9 +148,9 @@ def map_cotangents(path: RenderedPath, cotangents: Float[Tensor, "n 3 h w"]) -> 
 def draw_cotangents(
     render_rays: RenderRays, camera: PinholeCamera, draw: SceneDraw, maps: Maps, patch_size: int
 ) -> dict[str, Float[Tensor, "n"]]:
-    """Cotangents of the draw's coordinates: the second forward and the only backward (Tools 2, 3).
+    """Compute cotangents of the draw's coordinates: the second forward and the only backward pass (Tools 2, 3).
 
-    Memory is that of ``patch_size`` rays. Pixels whose cotangent is exactly zero are skipped, which is exact.
+    Only ``patch_size`` rays are in memory. Pixels whose cotangent is exactly zero are skipped, without any error.
     """
     rgb, opacity = maps.rgb.reshape(-1, 3), maps.opacity.reshape(-1)
     live = ((rgb != 0.0).any(-1) | (opacity != 0.0)).nonzero().squeeze(-1)
@@ -172,7 +172,7 @@ def draw_cotangents(
 
 
 def contract(tangents: Mapping[str, Maps], maps: Maps) -> dict[str, Float[Tensor, "n"]]:
-    """Cotangents of the draw's numbers: each image's tangents against the maps' cotangents, image by image."""
+    """Contract each image's tangents with its maps' cotangents, which gives the cotangents of the draw's numbers."""
     return {
         name: (tangent.rgb * maps.rgb).sum((1, 2, 3)) + (tangent.opacity * maps.opacity).sum((1, 2))
         for name, tangent in tangents.items()
@@ -184,10 +184,10 @@ def psi_contributions(
     psi: Float[Tensor, "K"],
     cotangents: Mapping[str, Float[Tensor, "n"]],
 ) -> Float[Tensor, "n K"]:
-    """Every image's contribution to the derivative by psi: its draw's cotangents through the relaxed draw (Tool 1).
+    """Compute each image's contribution to the derivative by psi: its draw's cotangents through Tool 1's relaxed draw.
 
-    Rows sum to the vector-Jacobian product; the standard error needs them apart. psi has fewer numbers than there are
-    images, so forward mode, one pass for each number, is the cheap way to all rows.
+    Rows sum to the vector-Jacobian product; the standard error needs them separately. psi has fewer numbers than there
+    are images, so that forward mode, with one pass for each number, is the cheaper way to all rows.
     """
 
     def along(psi: Tensor) -> Tensor:

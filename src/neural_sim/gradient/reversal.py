@@ -1,14 +1,14 @@
 """Reverse mode through the steps of a training's optimiser.
 
-The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. With lambda_t the derivative of
-L_val by the state before step t (theta and the optimiser's moments), each step back takes
+The implicit adjoint assumes a stationary point, which a dozen epochs do not reach. Let lambda_t be the derivative of
+L_val by the state before step t (theta and the optimiser's moments). Going back one step computes
 
     a_t       the step's derivative by its batch's gradient, pulled back from lambda_{t+1},
     lambda_t  the step's derivative by the state itself, plus ``H_t a_t`` in theta,
 
-where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has ``dL_val/dw = <dl/dtheta,
-a_t>``. Summed over the steps, this score replaces ``-<dl/dtheta, v>``, the minus sign included (Baydin and Pearlmutter
-2014; Maclaurin et al. 2015, with stored states instead of states recomputed backwards).
+where H_t is the Hessian of the batch's loss at theta_t. An image of weight w in that loss has
+``dL_val/dw = <dl/dtheta, a_t>``. This score, summed over the steps, replaces ``-<dl/dtheta, v>``, minus sign included
+(Baydin and Pearlmutter 2014; Maclaurin et al. 2015; here states are stored, not recomputed backwards).
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from neural_sim.solver.operator import flatten, plain_norm, unflatten
 
 Product = Literal["forward_difference", "central_difference", "reverse_over_reverse"]
 Wanted = Literal["probes", "weights", "inputs"]
-"""Sums that an estimator reads: probes' scores only, also derivatives by the training images' weights, or also those by
-the images' inputs."""
+"""Which sums an estimator reads: the probes' scores only; also derivatives by the training images' weights; or also
+those by the images' inputs."""
 InputsOf = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
-"""A training's inputs from images and their rows."""
+"""Computes a training's inputs from images and their rows."""
 
 
 class LossesFrom(Protocol):
-    """Losses of training images, differentiable twice in parameters and in the inputs."""
+    """Losses of training images, twice differentiable in parameters and inputs."""
 
     def __call__(
         self, params: Params, inputs: tuple[Tensor, ...], rows: Int[Tensor, "n"], /
     ) -> Float[Tensor, "n"]:
-        """Compute the losses of ``rows`` from those rows of the inputs."""
+        """Compute the losses of ``rows`` from their inputs."""
         ...
 
 
@@ -48,16 +48,16 @@ class LossesFrom(Protocol):
 class Examples:
     """A training's examples and their losses.
 
-    Each step's objective was its batch's mean loss plus ``proximal / 2 |theta - anchor|^2``.
+    Each step's objective is its batch's mean loss plus ``proximal / 2 |theta - anchor|^2``.
 
     Attributes:
-        inputs: those by which losses are differentiated where images move, [N, ...] each.
-        losses: of rows of the inputs.
+        inputs: the tensors by which losses are differentiated where images change with psi, each [N, ...].
+        losses: computes losses of rows from their inputs.
         proximal: weight of the proximal term.
-        anchor: its fixed theta_0.
+        anchor: the fixed theta_0 of the proximal term.
         inputs_of: computes the inputs from images and their rows.
-        drawn: how many rows, the first ones, were drawn from p_psi; the others (photographs) do not depend on it. None:
-            all of them.
+        drawn: number of rows, the first ones, that were drawn from p_psi; the others (photographs) do not depend on it.
+            None: all rows.
 
     Raises:
         ValueError: a proximal term that is negative or lacks its anchor.
@@ -104,12 +104,12 @@ class Examples:
 
 @dataclass(frozen=True)
 class RecordedTraining:
-    """A training that can be reversed.
+    """A training with all that is needed to reverse it.
 
     Attributes:
-        trajectory: its steps.
-        examples: what it was trained on.
-        params: theta after its last step.
+        trajectory: the recorded steps.
+        examples: the training set.
+        params: theta after the last step.
     """
 
     trajectory: Trajectory
@@ -128,11 +128,11 @@ class ReversedStep:
 
     Attributes:
         step: its number.
-        params: theta before it.
+        params: theta before the step.
         along: a_t.
-        rows: its batch.
-        scores: the batch's <dl/dtheta, a_t>; empty unless wanted.
-        inputs: derivative of the mean score by these rows of the inputs; empty unless wanted.
+        rows: the rows of its batch.
+        scores: <dl/dtheta, a_t> of the batch's images; empty unless wanted.
+        inputs: derivative of the mean score by the inputs of these rows; empty unless wanted.
     """
 
     step: int
@@ -145,7 +145,7 @@ class ReversedStep:
 
 @dataclass(frozen=True)
 class _Curved:
-    """A batch's curvature along a: ``product`` is H a, the others as in ``ReversedStep``."""
+    """A batch's curvature along a: ``product`` is H a; the other fields are as in ``ReversedStep``."""
 
     product: Float[Tensor, "n"]
     scores: Float[Tensor, "_"]
@@ -159,21 +159,21 @@ def reversed_steps(
     wanted: Wanted = "weights",
     floor: float = 0.0,
 ) -> Iterator[ReversedStep]:
-    """Walk the steps of a training backwards, from the last to the first recorded one.
+    """Walk back through the steps of a training, from the last to the first recorded one.
 
     Args:
         training: the training.
         slope: ``dL_val/dtheta`` after its last step.
         product: how a batch's Hessian is multiplied. ``forward_difference``: the gradient at ``theta + h a`` minus the
-            step's recorded gradient, of relative error eps^(1/2), if only probes are wanted (else as
-            ``central_difference``); ``central_difference``: two gradients at ``theta +- h a``, of relative error
-            eps^(2/3); ``reverse_over_reverse``: exact, at the time of three and a half gradients and the memory of a
+            step's recorded gradient, with relative error eps^(1/2), if only probes are wanted (else like
+            ``central_difference``); ``central_difference``: two gradients at ``theta +- h a``, with relative error
+            eps^(2/3); ``reverse_over_reverse``: exact, for the time of three and a half gradients and the memory of a
             second derivative.
         wanted: what each step computes.
-        floor: fraction of ``detector.optimiser.Rule.floored``; at 0 the derivative is that of the training.
+        floor: the fraction passed to ``detector.optimiser.Rule.floored``; at 0 the derivative is the training's own.
 
     Raises:
-        ValueError: an unknown product, or a slope of another length than theta.
+        ValueError: an unknown product, or a slope whose length is not theta's.
     """
     trajectory, examples, like = training.trajectory, training.examples, training.params
     if product not in get_args(Product):
@@ -248,8 +248,8 @@ def _differenced(
 def _from_one_side(
     examples: Examples, theta: Tensor, like: Params, rows: Tensor, along: Tensor, at_theta: Tensor
 ) -> _Curved:
-    """Take the forward difference of gradients; ``at_theta``, the one at theta, is the training's."""
-    # At eight times the root of eps, rounding and third derivatives contribute about equally.
+    """Take the forward difference of gradients; ``at_theta`` is the gradient at theta, recorded by the training."""
+    # Rounding and third derivatives contribute about equally at eight times the root of eps.
     unit, scale = _displacement(theta, along, 8 * torch.finfo(theta.dtype).eps ** 0.5)
     leaf = (theta + unit).detach().requires_grad_()
     with torch.enable_grad():
@@ -259,9 +259,9 @@ def _from_one_side(
 
 
 def _displacement(theta: Tensor, along: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """Return a vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device.
+    """Return the vector h a of length ``reach`` (1 + RMS of theta), and 1 / h, without waiting for the device.
 
-    For a = 0 all differences are zero.
+    All differences are zero if a is 0.
     """
     size = plain_norm(along).clamp_min(torch.finfo(torch.float64).tiny)
     length = reach * (1.0 + plain_norm(theta) / theta.numel() ** 0.5)

@@ -1,11 +1,12 @@
 """Whether a derivative can be told from zero: p-values for all components of one factor of psi together.
 
-The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2`` of per-image contributions c to the derivative. Every
-component is divided by its own variance, so that bins of scattered scores and rare bins weigh no more than others; an
-image alone in its bin adds about 1 to Q whatever its score. Q's distribution under the null comes from resampling: the
-data are changed at random in ways that the null allows. The p-value is the fraction of the resampled data, and the data
-themselves, whose Q is at least the data's. The level is exact, whatever the scores' distribution, where the changes
-leave that distribution invariant (Phipson and Smyth 2010). The random changes are the same in every call.
+The statistic is ``Q = sum_j (sum_i c_ij)^2 / sum_i c_ij^2``, where c are the images' contributions to the derivative.
+Each component is divided by its own variance, so that bins with scattered scores and rare bins weigh no more than
+others; an image that is alone in its bin adds about 1 to Q whatever its score. The distribution of Q under the null
+hypothesis comes from resampling: the data are changed at random in ways that the null allows. The p-value is the
+fraction of samples, the data themselves included, whose Q is at least that of the data. If the changes leave the
+distribution of the scores invariant, the level is exact whatever that distribution is (Phipson and Smyth 2010). The
+random changes are the same in every call.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from jaxtyping import Float, Num
 from torch import Tensor
 
 DRAWS = 999
-"""Random changes of the data; with the data themselves the p-values are multiples of ``SMALLEST``."""
+"""Number of random changes of the data. Counting the data themselves, p-values are multiples of ``SMALLEST``."""
 SMALLEST = 1.0 / (DRAWS + 1)
 _BLOCK = 250
-# Changed data that are the data again, or their mirror image, have the same Q up to rounding and must count.
+# A change that gives the same data again, or their mirror image, has the same Q up to rounding and must count.
 _TIE = 1.0 - 1e-9
 
 
 def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
-    """Compute the p-value of the null that independent ``rows`` have mean zero, by random changes of their signs.
+    """Test that independent ``rows`` have mean zero, by random changes of their signs; return the p-value.
 
-    Exact for rows symmetric about zero, whatever their tails, their variances and the dependence between their
-    components. Rows of zeros add nothing: with m others the p-value is at least about 2^(1 - m). 1 for rows that are
-    not finite.
+    The test is exact for rows symmetric about zero, whatever their tails, their variances and the dependence between
+    their components. Rows of zeros add nothing: with m others the p-value is at least about 2^(1 - m). It is 1 for rows
+    that are not finite.
     """
     rows = _scaled(rows.double())
     if not bool(rows.any()):
@@ -44,16 +45,16 @@ def zero_mean(rows: Float[Tensor, "n k"], draws: int = DRAWS) -> float:
 
 
 def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws: int = DRAWS) -> float:
-    """Compute the p-value of the null that images' ``scores`` have the same mean whatever was ``drawn`` for them.
+    """Test that images' ``scores`` have the same mean whatever was ``drawn`` for them; return the p-value.
 
-    What was drawn is the bin, as a row of zeros and a one, or numbers. The contributions ``(s_i - mean s)(d_i - mean
-    d)`` are changed at random.
+    ``drawn`` holds the bin, as a row of zeros and a one, or numbers. The contributions
+    ``(s_i - mean s)(d_i - mean d)`` are changed at random.
 
-    The larger of two p-values, so that the level holds where either does. Scores permuted over the images: exact where
-    scores do not depend on what was drawn, for any law of the scores, any skewness and any number of images. Signs
-    changed (``zero_mean``): bins whose scores scatter differently, for scores that scatter symmetrically.
-    Asymptotically each holds without its condition (Chung and Romano 2013, for permutations of such a statistic). 1
-    for numbers that are not finite.
+    The result is the larger of two p-values, so that the level holds if either test's condition does. Permuting the
+    scores over the images is exact if scores do not depend on what was drawn, for any law of the scores, any skewness
+    and any number of images. Changing signs (``zero_mean``) covers bins whose scores scatter differently, if scores
+    scatter symmetrically. Asymptotically each test holds without its condition (Chung and Romano 2013, for permutations
+    of such a statistic). The result is 1 for numbers that are not finite.
     """
     residuals, drawn = _centred(scores.double()), _centred(drawn.double())
     flipped = zero_mean(residuals[:, None] * drawn, draws)
@@ -71,13 +72,13 @@ def no_association(scores: Float[Tensor, "n"], drawn: Num[Tensor, "n k"], draws:
 
 
 def no_difference(scores: Float[Tensor, "scenes lights"], draws: int = DRAWS) -> float:
-    """Compute the p-value of the null that the same scenes have the same mean score under every light.
+    """Test that the same scenes have the same mean score under every light; return the p-value.
 
-    Each scene's scores are changed at random, apart from their mean.
+    Each scene's deviations from its mean score are changed at random.
 
-    The larger of two p-values, as in ``no_association``: each scene's scores permuted among the lights, exact where
-    a scene's scores differ by chance alone, for any law; signs changed, for lights under which scores scatter
-    differently.
+    The result is the larger of two p-values, as in ``no_association``. Permuting each scene's scores among the lights
+    is exact if a scene's scores differ by chance alone, for any law; changing signs covers lights under which scores
+    scatter differently.
     """
     apart = scores.double() - scores.double()[:, :1]
     rows = _scaled((apart - apart.mean(-1, keepdim=True)).flatten()).view_as(apart)
@@ -101,15 +102,15 @@ def _p_value(observed: Tensor, changed: Callable[[int, torch.Generator], Tensor]
 
 
 def _statistic(sums: Float[Tensor, "*d k"], squares: Float[Tensor, "... k"]) -> Float[Tensor, "*d"]:
-    """Compute Q; a component to which nothing contributes adds 0."""
+    """Compute Q; a component without contributions adds 0."""
     ratio = sums.square() / torch.where(squares > 0.0, squares, 1.0)
     return torch.where(squares > 0.0, ratio, 0.0).sum(-1)
 
 
 def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
-    """Subtract the mean of values and put them in a unit of their own.
+    """Subtract the mean of the values and scale them, so that squares neither over- nor underflow.
 
-    The first value is subtracted beforehand: equal values give exactly 0, not a rounding error.
+    The first value is subtracted before the mean: equal values then give exactly 0, not a rounding error.
     """
     apart = values - values[:1]
     return _scaled(apart - apart.mean(0))
@@ -118,7 +119,7 @@ def _centred(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
 def _scaled(values: Float[Tensor, "n *k"]) -> Float[Tensor, "n *k"]:
     """Divide each component by its largest absolute value, so that no square over- or underflows.
 
-    Zeros where a value is not finite.
+    A component with a value that is not finite becomes zeros.
     """
     if not bool(values.isfinite().all()):
         return torch.zeros_like(values)

@@ -1,6 +1,6 @@
-"""The hypergradient of the training that was run.
+"""The hypergradient of the training that was actually run.
 
-Its steps are reversed (``gradient.reversal``). Estimators read sums over these steps: scores of images and probes,
+``gradient.reversal`` reverses its steps. Estimators read sums over these steps: scores of images and probes,
 and derivatives by the training's inputs.
 """
 
@@ -42,16 +42,16 @@ from neural_sim.solver.operator import norm
 
 @dataclass(frozen=True)
 class Accumulated:
-    """Sums over the reversed steps; a_t is that of ``gradient.reversal``.
+    """Sums over the reversed steps; for a_t see ``gradient.reversal``.
 
     Attributes:
-        images: derivatives of L_val by the training images' weights (1 in the means of its batches); empty unless
+        images: derivatives of L_val by the training images' weights (1 each in the mean of a batch); empty unless
             wanted.
         inputs: derivatives by the training images' inputs; empty unless wanted.
-        probes: every probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
+        probes: each probe's score, estimated from the steps that scored it. The mean over the probes of a bin is
             unbiased for ``sum_t f_t mean_i <dl_i/dtheta, a_t>``, up to an offset common to all bins of a group; f_t is
             the fraction of step t's batch that was drawn from p_psi.
-        scored: number of scored pairs of a probe and a step.
+        scored: number of pairs of a probe and a step that were scored.
         inputs_of: computes the inputs from images and their rows.
     """
 
@@ -64,12 +64,12 @@ class Accumulated:
     def cotangents(
         self, images: Float[Tensor, "n 3 h w"], index: Int[Tensor, "n"], chunk_size: int = 16
     ) -> Float[Tensor, "n 3 h w"]:
-        """Compute derivatives of L_val by images: the vector-Jacobian product of ``inputs_of``.
+        """Compute derivatives of L_val by the pixels of images: the vector-Jacobian product of ``inputs_of``.
 
-        ``images`` are those of the rows ``index``; ``chunk_size`` of them are differentiated at a time.
+        ``images`` belong to the rows ``index``; ``chunk_size`` of them are differentiated at a time.
 
         Raises:
-            ValueError: no derivatives by the inputs were accumulated.
+            ValueError: derivatives by the inputs were not accumulated.
         """
         if not self.inputs or self.inputs_of is None:
             raise ValueError("unrolled: want the derivative by the inputs, which was not accumulated")
@@ -79,7 +79,7 @@ class Accumulated:
             leaf = chunk.detach().requires_grad_()
             with torch.enable_grad():
                 inputs = self.inputs_of(leaf, rows)
-            # Targets of boxes depend on no image.
+            # Box targets do not depend on the image.
             moved = [
                 (x, pulled[rows]) for x, pulled in zip(inputs, self.inputs, strict=True) if x.requires_grad
             ]
@@ -90,15 +90,15 @@ class Accumulated:
 
 @dataclass(frozen=True)
 class ProbeGroups:
-    """The probes, of which each step scores a sample.
+    """The probes; each step scores a sample of them.
 
     Attributes:
-        losses: of probes by row.
-        groups: tables [strata, per_bin] of rows: one object's images of one factor's bins, or of the same scenes
-            (columns) under each light. All have the same number of columns.
+        losses: losses of probes by row.
+        groups: tables [strata, per_bin] of rows. Each holds one object's images of one factor's bins, or of the same
+            scenes (columns) under each light. All have the same number of columns.
 
     Raises:
-        ValueError: tables of other shapes.
+        ValueError: the tables have other shapes.
     """
 
     losses: IndexedLoss
@@ -112,12 +112,12 @@ class ProbeGroups:
 
     @property
     def per_bin(self) -> int:
-        """Columns of every table."""
+        """Number of columns of every table."""
         return self.groups[0].shape[-1]
 
     @property
     def count(self) -> int:
-        """One above the largest row of any group."""
+        """One more than the largest row of any group."""
         return 1 + max(int(table.max()) for table in self.groups)
 
 
@@ -128,16 +128,16 @@ class Unrolled:
 
     Args:
         product: how a batch's Hessian is multiplied, see ``gradient.reversal.reversed_steps``.
-        part: fraction of the steps, the last ones, that are reversed; 1 is exact.
-        max_memory_mb: limit of the recorded training, see ``detector.trajectory.Recording``.
-        probes_per_step: probes of every bin that a step scores, from a shuffled cycle over all; 0: all of them. With
-            one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
-        scored_steps: about the number of steps that score probes; 0: all. A longer training is divided into blocks, of
-            which one step, drawn at random, scores probes with the block's weight, see ``step_weights``. More
-            objects have more probes and more steps: were all scored, the cost would grow with their square.
-        chunk_size: probes whose losses are computed at a time.
-        floor: least denominator of an entry of theta in AdamW's steps, as a fraction of what is usual for it and for
-            its tensor, see ``detector.optimiser.AdamW.floored``; 0 is exact.
+        part: fraction of the steps that are reversed, counted from the end; 1 is exact.
+        max_memory_mb: memory limit of the recorded training, see ``detector.trajectory.Recording``.
+        probes_per_step: number of probes of every bin that a step scores, in a shuffled cycle over all; 0: all of them.
+            At one, the choice of probes is most of a derivative's variance (docs/numerics.md, Noise of a derivative).
+        scored_steps: approximate number of steps that score probes; 0: all. A longer training is divided into blocks;
+            in each block one random step scores probes, with the block's weight, see ``step_weights``. More objects
+            have more probes and more steps: if all were scored, the cost would grow with the square of their number.
+        chunk_size: number of probes whose losses are computed at a time.
+        floor: smallest denominator allowed for an entry of theta in AdamW's steps, as a fraction of what is usual for
+            the entry and its tensor, see ``detector.optimiser.AdamW.floored``; 0 is exact.
     """
 
     product: Product = "forward_difference"
@@ -154,7 +154,7 @@ class Unrolled:
         return Recording(self.part, self.max_memory_mb)
 
     def doubts(self, adjoint: UnrolledAdjoint) -> list[str]:
-        """Name what speaks against a reversed training."""
+        """Name the reasons not to trust a reversed training."""
         return [] if adjoint.finite else ["solver"]
 
     def derivative(
@@ -172,9 +172,9 @@ class Unrolled:
             training: the training.
             validation: the terms of L_val as functions of the parameters.
             estimates: by object, its estimator as a function of the sums over the steps.
-            generator: of the choice of steps and probes.
+            generator: random numbers that choose steps and probes.
             wanted: which sums the estimators read.
-            probes: what the steps score.
+            probes: the probes that the steps score.
         """
         began = time.perf_counter()
         slope = gradient(validation, training.params)
@@ -225,7 +225,7 @@ class Unrolled:
 
 
 Estimate = Callable[[Accumulated], MixedDerivative]
-"""One object's derivative from the sums over the steps."""
+"""Computes one object's derivative from the sums over the steps."""
 
 
 class _Scoring:
@@ -247,8 +247,9 @@ class _Scoring:
         parts = torch.split(along, [part.numel() for part in rows])
         means = [part.mean() for part in parts]
         scale = weight * self.per_bin / len(columns)
-        # An offset common to a group has no effect, but adds noise where probes are scored unequally often. It is
-        # subtracted as estimated at the step before: the mean of these same scores would correlate with their noise.
+        # An offset common to a group has no effect, but it adds noise if probes are scored unequally often. The offset
+        # that is subtracted comes from the previous step: the mean of these same scores would correlate with their
+        # noise.
         for into, part, level in zip(rows, parts, self._levels or means, strict=True):
             self.total.index_add_(0, into, scale * (part - level))
         self._levels, self.scored = means, self.scored + len(along)
@@ -257,8 +258,8 @@ class _Scoring:
 def step_weights(steps: int, every: int, generator: torch.Generator) -> Iterator[int]:
     """Yield each step's weight, from the last step to the first.
 
-    It is the block's length for one random step of each block and 0 for others. Blocks are 1 to ``2 every - 1`` steps
-    long, longer the later in the training, where scores scatter less.
+    In each block one random step has the block's length as its weight and the others have 0. Blocks are 1 to
+    ``2 every - 1`` steps long, and longer late in the training, where scores scatter less.
     """
     left = steps
     while left:
