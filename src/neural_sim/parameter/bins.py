@@ -1,6 +1,6 @@
 """A categorical distribution over bins and its Gumbel-softmax relaxation (paper, Sec. 3.1, Tool 1).
 
-Everything is a pure function of logits psi and of noise drawn beforehand, so that a draw can be replayed.
+Everything is a pure function of the logits psi and of noise drawn beforehand, so that a draw can be replayed.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from neural_sim.parameter.distributions import project_simplex
 
-# The softmax of a logit at its lowest (``bounded``), in floors: there p is within this fraction of the floor.
+# softmax of the lowest logit that ``bounded`` allows, as a fraction of the floor; p there is within this of the floor.
 LOWEST = 0.25
-# The logit of a bin that nothing may be drawn from, such as one that no photograph of the object shows. Its p is 0 and
-# has no floor; no step of some logits brings it back. Far below what steps reach, so that no low logit is taken for
-# one, and not so far that it takes the digits of others in a mean.
+# Logit of a bin from which nothing may be drawn, such as one that no photograph of the object shows. Its p is 0,
+# without a floor, and no step brings it back. It is far below what steps can reach, so that no low logit is mistaken
+# for it, and yet small enough to keep the digits of the other logits in a mean.
 CLOSED = -1e9
 
 
@@ -26,33 +26,33 @@ CLOSED = -1e9
 class BinNoise:
     """Noise that selects the bins of n draws.
 
-    ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see
-    ``balanced``; None: independent draws.
+    ``offset``: uniform in [0, 1), for exact draws that are balanced over the bins, see ``balanced``; None: independent
+    draws.
     """
 
     gumbel: Float[Tensor, "n k"]
     offset: float | None = None
 
     def select(self, index: Int[Tensor, "m"]) -> BinNoise:
-        """Select the draws ``index``, which may repeat; not balanced, which is a property of all draws together."""
+        """Select the draws ``index``, which may repeat. The result is not balanced: only all draws together are."""
         return BinNoise(self.gumbel[index])
 
 
 def is_closed(psi: Float[Tensor, "*n k"]) -> Bool[Tensor, "*n k"]:
-    """Find the bins that nothing may be drawn from."""
+    """Find the bins from which nothing may be drawn."""
     return psi.detach() < 0.5 * CLOSED
 
 
 def closing(psi: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-    """Close bins, whatever psi was there; psi itself where there are none."""
+    """Close bins, whatever their psi was; return psi itself if there are none."""
     return torch.where(closed, torch.full_like(psi, CLOSED), psi) if bool(closed.any()) else psi
 
 
 def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log p for p = (1 - k floor) softmax(psi) + floor, so that no bin's probability falls below ``floor``.
 
-    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is. Closed bins have no floor,
-    and of k the open ones count.
+    The floor keeps every bin within reach of a draw and every log p finite, whatever psi is. Closed bins have no floor;
+    k counts only the open ones.
 
     Raises:
         ValueError: unless 0 <= floor < 1 / k.
@@ -71,8 +71,8 @@ def log_probabilities(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[T
 def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Compute log w for w = p - ``floor``, without cancellation.
 
-    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)). Divided by p in the place of w, derivatives of
-    bins at the floor would vanish.
+    The derivative of any f(p) by psi is w (f' - sum(w f') / sum(w)). With p instead of w, the derivatives of bins at
+    the floor would vanish.
     """
     closed = is_closed(psi)
     if not bool(closed.any()):
@@ -83,7 +83,7 @@ def log_slopes(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, 
 def bounded(psi: Float[Tensor, "*n k"], floor: float = 0.0) -> Float[Tensor, "*n k"]:
     """Raise logits that lie further below the largest than log(1 / (``LOWEST`` ``floor``)).
 
-    There a bin's p is within a quarter of the floor; further down p hardly changes, yet a step of some logits would not
+    At that logit a bin's p is within a quarter of the floor. Further down p hardly changes, and a few steps could not
     bring the bin back.
     """
     if floor == 0.0:
@@ -98,15 +98,15 @@ def nearest(
     least: Float[Tensor, "*n k"] | float = 0.0,
     closed: Bool[Tensor, "*n k"] | None = None,
 ) -> Float[Tensor, "*n k"]:
-    """Find the nearest probabilities (Euclidean), none below its ``least``, which sum to less than 1.
+    """Find the nearest probabilities (Euclidean) with none below its ``least``, which must sum to less than 1.
 
-    Nor is any below the p of a logit that ``bounded`` has raised, if the largest p is 1. Those of ``closed`` bins
-    are 0.
+    Nor does any fall below the p of a logit that ``bounded`` has raised, taking the largest p as 1. Those of ``closed``
+    bins are 0.
     """
     bins = values.shape[-1]
     lowest = (torch.zeros_like(values) + least).clamp_min(floor + LOWEST * floor * (1.0 - bins * floor))
     if closed is not None and bool(closed.any()):
-        # So far below the others that the projection leaves nothing there.
+        # Far enough below the others that the projection leaves nothing there.
         lowest = lowest.masked_fill(closed, 0.0)
         values = torch.where(
             closed, values.masked_fill(closed, -torch.inf).amax(-1, keepdim=True) - 4.0, values
@@ -120,7 +120,7 @@ def logits(
 ) -> Float[Tensor, "*n k"]:
     """Compute centred logits of ``probabilities``, clamped to just above the floor; see ``log_probabilities``.
 
-    What ``closed`` bins have of them goes to the others, in proportion.
+    The probability of ``closed`` bins goes to the others, in proportion.
     """
     if closed is not None and bool(closed.any()):
         open_ = (~closed).sum(-1, keepdim=True)
@@ -135,20 +135,21 @@ def logits(
 
 
 def gumbel(shape: tuple[int, ...], generator: torch.Generator, dtype: torch.dtype) -> Tensor:
-    """Draw standard Gumbel noise from uniforms that are kept off 0 and 1, so that it is finite in every dtype."""
+    """Draw standard Gumbel noise, from uniforms kept away from 0 and 1 so that it is finite in every dtype."""
     uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
     return -(-(uniform.clamp(1e-12, 1.0 - 1e-12)).log()).log().to(dtype)
 
 
 def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: float) -> Int[Tensor, "n"]:
-    """Draw n bins of which each follows p, and bin b comes n p_b times, rounded down or up.
+    """Draw n bins, each of which follows p, with bin b drawn n p_b times, rounded down or up.
 
-    The counts are those of systematic sampling: the numbers ``offset``, ``offset`` + 1, ... below n (``offset`` uniform
-    in [0, 1)) that fall between the cumulated n p. The draws begin at the Gumbel-max ones; those of bins with too many
-    that lose least change to bins with too few. So most draws stay when p moves under the same noise.
+    The counts are those of systematic sampling: of the numbers ``offset``, ``offset`` + 1, ... below n (``offset``
+    uniform in [0, 1)), those that fall into the bin's part of the cumulated n p. The draws start as the Gumbel-max
+    ones; from bins with too many, those that lose least change to bins with too few. Most draws therefore stay when p
+    moves under the same noise.
 
     Raises:
-        ValueError: log p is not a number, for which no bin would ever have enough.
+        ValueError: log p is not a number; no bin would ever have enough.
     """
     count, k = gumbel.shape
     p = log_p.double().softmax(-1)
@@ -172,7 +173,7 @@ def balanced(log_p: Float[Tensor, "k"], gumbel: Float[Tensor, "n k"], offset: fl
 def gumbel_softmax(
     log_p: Float[Tensor, "... k"], noise: Float[Tensor, "*n k"], temperature: float
 ) -> Float[Tensor, "*n k"]:
-    """Compute y of Eq. 4: softmax((G + log p) / tau). The largest component follows p for every tau > 0.
+    """Compute y of Eq. 4: softmax((G + log p) / tau). Its largest component follows p for every tau > 0.
 
     Raises:
         ValueError: unless the temperature is positive.
@@ -198,8 +199,8 @@ def circular_mean(
 ) -> Float[Tensor, "*n"]:
     """Compute the direction of sum_i y_i exp(i B_i), in [0, 2 pi): equivariant under shifts of the bins.
 
-    Its derivative grows as one over the resultant's length, without bound where opposite bins mix in equal
-    parts; a length below ``smallest_resultant`` is replaced by it in the derivative. The value is exact.
+    Its derivative grows as one over the resultant's length, without bound if opposite bins mix in equal parts. The
+    derivative therefore uses at least ``smallest_resultant`` as the length. The value is exact.
     """
     sine, cosine = weights @ bin_centres.sin(), weights @ bin_centres.cos()
     squared = (sine.square() + cosine.square()).detach().clamp_min(smallest_resultant**2)

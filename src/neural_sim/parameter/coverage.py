@@ -16,14 +16,14 @@ from neural_sim.parameter.factor import COORDINATES
 from neural_sim.parameter.product import SceneDistribution, SceneNoise
 
 STEPS = 5
-"""Poses along each angle of a bin at which photographs are looked for."""
+"""Number of poses along each angle of a bin at which photographs are looked for."""
 LEAST = 0.5
-"""Smallest part of a bin's poses near a photograph with which it counts as covered."""
+"""Smallest fraction of a bin's poses that must be near a photograph for the bin to count as covered."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """The part of each bin's poses whose direction is within an angle of a photograph's."""
+    """For each bin, the fraction of its poses whose direction is within an angle of a photograph's."""
 
     fractions: tuple[float, ...]
     within_deg: float
@@ -35,20 +35,20 @@ class Coverage:
 
     @property
     def missing(self) -> list[int]:
-        """The bins, numbered from 1, that they do not show."""
+        """The bins, numbered from 1, that photographs do not show."""
         return [number + 1 for number, covered in enumerate(self.covered) if not covered]
 
 
 def coverage(
     distribution: SceneDistribution, factor: str, directions: Float[Tensor, "photos 3"], within_deg: float
 ) -> Coverage | None:
-    """How far photographs cover a factor's bins; None where its bins are not of directions.
+    """Compute how far photographs cover a factor's bins; None if its bins are not directions.
 
     Args:
-        distribution: of the poses; what the factor does not draw is anywhere in its range.
-        factor: its name.
+        distribution: the distribution of poses; coordinates that the factor does not draw take all of their range.
+        factor: name of the factor.
         directions: unit vectors from the object to the photographs' cameras, in the object's frame.
-        within_deg: largest angle in degrees between a pose and a photograph that is near it.
+        within_deg: largest angle in degrees at which a photograph is near a pose.
     """
     (own,) = (f for f in distribution.binned if f.name == factor)
     if own.coordinate not in ("phi", "rho"):
@@ -61,7 +61,7 @@ def coverage(
     fractions: list[float] = []
     for number in range(own.bins):
         bins = {
-            # Another angle's bins together are its range, which ``second`` runs through.
+            # All bins of another angle together are its range, which ``second`` runs through.
             f.name: torch.full((len(first),), number) if f is own else (second * f.bins).long()
             for f in distribution.binned
         }
@@ -80,7 +80,7 @@ def coverage(
 def coverages(
     distribution: SceneDistribution, directions: Mapping[str, Float[np.ndarray, "_ 3"]], within_deg: float
 ) -> dict[str, dict[str, Coverage]]:
-    """Compute ``coverage`` of all factors that have one, by object and factor."""
+    """Compute ``coverage`` by object and factor, for all factors that have one."""
     found: dict[str, dict[str, Coverage]] = {}
     for name, seen in directions.items():
         every = {

@@ -1,4 +1,4 @@
-"""Distributions over bins: by name, as configurations state them; projections onto them; distances."""
+"""Distributions over bins: as configurations state them by name; projections onto them; distances between them."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor
 
 Specification = str | Mapping[str, object] | Sequence[float]
 Biased = Mapping[str, Mapping[Literal["initial", "target"], Specification]]
-"""Distributions of some objects by their names."""
+"""Named distributions of some objects, by object."""
 
 DOMINANT_REST = 0.02
-"""Probability of a bin that is no mode. The paper (Sec. 4.2) only names the dominant bins; the number is that of its
+"""Probability of a bin that is not a mode. The paper (Sec. 4.2) only names the dominant bins; the number comes from its
 authors' code and leaves 0.86 for one mode of eight bins, 0.44 for each of two and 0.3 for each of three
 (github.com/gyhandy/Neural-Sim-NeRF, optimization/neural_sim_main.py)."""
 
 
 def distribution(specification: Specification, bins: int, where: str = "distribution") -> Float[Tensor, "k"]:
-    """Compute the probabilities of ``bins`` bins, float64, from how a configuration states them.
+    """Compute the probabilities of ``bins`` bins, float64, from a specification in the configuration.
 
-    ``uniform``; ``{dominant: b}``, 0.02 on all bins but b, which has the rest (0.86 for k = 8);
+    A specification is ``uniform``; ``{dominant: b}``, 0.02 on all bins except b, which has the rest (0.86 for k = 8);
     ``{modes: [b, ...]}``, 0.02 on all others, the rest split equally among the modes; or ``bins`` numbers
     that add up to 1. Bins are numbered from 1, as in the paper.
 
     Raises:
-        ValueError: an unknown name, a bin outside 1..bins, numbers that are negative or do not add up to 1;
-            the message begins with ``where``.
+        ValueError: an unknown name, a bin outside 1..bins, or numbers that are negative or do not add up to 1.
+            The message begins with ``where``.
     """
     if specification == "uniform":
         return torch.full((bins,), 1.0 / bins, dtype=torch.float64)
@@ -69,12 +69,12 @@ def _numbers(values: Sequence[float], bins: int, where: str) -> Tensor:
 
 
 def merged(p: Float[Tensor, "*n k"], groups: Sequence[Sequence[int]]) -> Float[Tensor, "*n g"]:
-    """Add up the probabilities of groups of bins, which are numbered from 1."""
+    """Add up the probabilities within groups of bins, which are numbered from 1."""
     return torch.stack([p[..., [b - 1 for b in group]].sum(-1) for group in groups], -1)
 
 
 def total_variation(p: Float[Tensor, "*n k"], q: Float[Tensor, "*n k"]) -> Float[Tensor, "*n"]:
-    """Compute half the L1 distance between two distributions: 0 when equal, 1 when disjoint."""
+    """Compute the total variation, half the L1 distance of two distributions: 0 if equal, 1 if disjoint."""
     return 0.5 * (p - q).abs().sum(-1)
 
 
@@ -82,7 +82,7 @@ def project_sum(values: Float[Tensor, "*n k"], total: float = 1.0) -> Float[Tens
     """Project onto the plane ``sum(w) = total``, whose points may have either sign.
 
     Raises:
-        ValueError: no entries, or entries that are not finite.
+        ValueError: there are no entries, or some are not finite.
     """
     _check_weights(values)
     return values - (values.mean(-1, keepdim=True) - total / values.shape[-1])
@@ -91,13 +91,13 @@ def project_sum(values: Float[Tensor, "*n k"], total: float = 1.0) -> Float[Tens
 def project_simplex(values: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
     """Project onto the simplex ``w >= 0, sum(w) = 1`` (Held, Wolfe and Crowder 1974).
 
-    The nearest point is ``max(v - t, 0)`` for the one t at which that adds up to 1. Only differences to the largest
-    entry matter, and of those only the ones below 1 (t lies at most 1 below the largest entry), so that nothing large
-    is ever subtracted: entries of any size are projected to a few roundings of 1. Differentiable where the set of
-    positive weights does not change: there the derivative is ``I - 1 1^T / (positive weights)`` on that set.
+    The nearest point is ``max(v - t, 0)`` for the one t at which it adds up to 1. Only differences to the largest
+    entry matter, and only those below 1 (t lies at most 1 below the largest entry), so that nothing large is ever
+    subtracted: entries of any size are projected to within a few roundings of 1. The projection is differentiable where
+    the set of positive weights does not change: there the derivative is ``I - 1 1^T / (positive weights)`` on that set.
 
     Raises:
-        ValueError: no entries, or entries that are not finite.
+        ValueError: there are no entries, or some are not finite.
     """
     _check_weights(values)
     below = (values - values.amax(-1, keepdim=True).detach()).clamp_min(-1.0)

@@ -1,4 +1,4 @@
-"""Factors of p_psi: what all have in common, and log p over equal bins of one number of the scene."""
+"""Factors of p_psi: what all of them share, and log p over equal bins of one scene parameter."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from neural_sim.types import SceneDraw
 
 Coordinate = Literal["phi", "rho", "distance", "magnification"]
 COORDINATES: tuple[Coordinate, ...] = get_args(Coordinate)
-"""The numbers of a ``SceneDraw`` that images depend on smoothly."""
+"""The numbers of a ``SceneDraw`` on which images depend smoothly."""
 Gap = Literal["disjoint", "uniform", "same"]
 Floor = Annotated[float, Ge(0), Lt(1)]
-"""Smallest probability of a bin, below 1 over their number."""
+"""Smallest probability of a bin; must be below 1 over their number."""
 
 
 @validated
@@ -32,11 +32,11 @@ class ConfiguredDistributions:
     """Initial and target distribution of one factor for each object, as configured.
 
     Args:
-        initial, target: distributions of objects not named in ``biased``.
+        initial, target: the distributions of objects that are not named in ``biased``.
         biased: object name -> {initial: ..., target: ...}, see ``distributions.distribution``.
-        gap: how far biased objects start from their target: ``disjoint`` as ``biased`` says, ``uniform``, or ``same``,
+        gap: how far biased objects start from their target: ``disjoint``, as ``biased`` says; ``uniform``; or ``same``,
             at the target itself.
-        closed: object name -> its bins, from 1, that nothing is drawn from, whatever the distributions say of them.
+        closed: object name -> its bins, from 1, from which nothing is drawn, whatever the distributions say.
     """
 
     initial: Specification = "uniform"
@@ -57,15 +57,15 @@ class ConfiguredDistributions:
 
     @property
     def states_target(self) -> bool:
-        """Whether any object's target is another than uniform, the default."""
+        """Whether any object has a target other than uniform, the default."""
         own = [biased.get("target", self.target) for biased in (self.biased or {}).values()]
         return any(target != "uniform" for target in [self.target, *own])
 
 
 class Factor(Protocol):
-    """One factor of p_psi, with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
+    """One factor of p_psi with its part of psi: ``size`` numbers, one for each stratum (bin or anchor light).
 
-    ``update`` names the setting of the psi loop that steps it.
+    ``update`` names the setting of the psi loop that chooses its optimiser.
     """
 
     update: ClassVar[str]
@@ -77,14 +77,14 @@ class Factor(Protocol):
 
     @property
     def size(self) -> int:
-        """Numbers of psi for each object."""
+        """Number of psi's entries for each object."""
         ...
 
     @property
     def lights(self) -> int:
         """Number of anchor lights.
 
-        Above 0, the images themselves change with psi, not only how often each is drawn.
+        If it is above 0, psi changes the images themselves, not only how often each is drawn.
         """
         ...
 
@@ -95,7 +95,7 @@ class Factor(Protocol):
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What hard draws at given ``p`` depend on."""
+        """What hard draws at a given ``p`` depend on."""
         ...
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
@@ -103,7 +103,7 @@ class Factor(Protocol):
         ...
 
     def closed(self, object_name: str) -> Bool[Tensor, "k"]:
-        """Find the strata of an object that nothing is drawn from."""
+        """Find the strata of an object from which nothing is drawn."""
         ...
 
     def psi_of(
@@ -117,7 +117,7 @@ class Factor(Protocol):
         ...
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Compute log w: a derivative by psi over w is that by p but for a constant. 0 for lights."""
+        """Compute log w, where a derivative by psi over w is the one by p up to a constant. 0 for lights."""
         ...
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -127,7 +127,7 @@ class Factor(Protocol):
     def moved(
         self, psi: Float[Tensor, "*n k"], change: Float[Tensor, "*n k"], keep: float
     ) -> Float[Tensor, "*n k"]:
-        """Find the psi whose p is nearest to p + ``change``, no bin left with less than ``keep`` of its p."""
+        """Find the psi whose p is nearest to p + ``change``, such that each bin keeps at least ``keep`` of its p."""
         ...
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
@@ -141,8 +141,8 @@ class BinnedFactor:
     """psi are the logits of ``bins`` equal bins of [``low``, ``high``] of one coordinate.
 
     Args:
-        name: the factor's, and that of the configuration node ``parameter.<name>``.
-        coordinate: the coordinate of the scene that is drawn; angles in radians, lengths in object radii.
+        name: name of the factor, and of the configuration node ``parameter.<name>``.
+        coordinate: the scene's coordinate that is drawn; angles in radians, lengths in object radii.
         geometric: bins of equal ratio instead of equal width (both ends positive).
         periodic: ``low`` and ``high`` are the same place.
         temperature: tau of the Gumbel-softmax (Eq. 4; the paper: 0.1).
@@ -151,7 +151,7 @@ class BinnedFactor:
         configured: initial and target distributions by object.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: any of these is out of its range; the message has the key and the value.
     """
 
     update: ClassVar[str] = "update"
@@ -177,19 +177,19 @@ class BinnedFactor:
             )
         if not self.low < self.high or (self.geometric and not self.low > 0.0):
             raise ValueError(f"{where}: want an ordered range of its bins, got [{self.low}, {self.high}]")
-        for name in (*(self.configured.biased or {}), ""):  # "": of objects that are not named
+        for name in (*(self.configured.biased or {}), ""):  # "": objects that are not named
             for which in ("initial", "target"):
                 self.probabilities(which, name)
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What draws of given probabilities depend on; how they are relaxed, and from which logits, is left out."""
+        """What draws at given probabilities depend on; excludes their relaxation, and the logits behind them."""
         names = ("coordinate", "bins", "low", "high", "geometric", "periodic")
         return {name: getattr(self, name) for name in names}
 
     @property
     def size(self) -> int:
-        """Numbers of psi for each object."""
+        """Number of psi's entries for each object."""
         return self.bins
 
     @property
@@ -203,11 +203,11 @@ class BinnedFactor:
         return distribution(self.configured.of(which, object_name), self.bins, where)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """Compute the logits that give ``probabilities``, but for bins that are closed."""
+        """Compute the logits that give ``probabilities``, except for closed bins."""
         return self.psi_of(self.probabilities(which, object_name), self.closed(object_name))
 
     def closed(self, object_name: str) -> Bool[Tensor, "k"]:
-        """Find the bins that nothing is drawn from."""
+        """Find the bins from which nothing is drawn."""
         bins = (self.configured.closed or {}).get(object_name, ())
         return torch.tensor([number + 1 in bins for number in range(self.bins)])
 
@@ -230,7 +230,7 @@ class BinnedFactor:
         return binned.log_slopes(psi, self.floor)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Raise logits out of reach of the largest, see ``bounded``."""
+        """Raise logits that lie too far below the largest, see ``bounded``."""
         return binned.bounded(psi, self.floor)
 
     def moved(
@@ -238,33 +238,32 @@ class BinnedFactor:
     ) -> Float[Tensor, "*n k"]:
         """Compute logits of the probabilities nearest to p + ``change``.
 
-        None is lower than ``project`` lets it be, nor than the fraction ``keep`` of what it was.
+        None is lower than ``project`` allows, nor lower than the fraction ``keep`` of its present value.
         """
         p, closed = self.p_of(psi), binned.is_closed(psi)
         return binned.logits(binned.nearest(p + change, self.floor, keep * p, closed), self.floor, closed)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """Find the bin of each draw's coordinate: for a relaxed draw not always the bin that was drawn."""
+        """Find the bin of each draw's coordinate, which for a relaxed draw is not always the bin that was drawn."""
         return self.bin_of(getattr(draw, self.coordinate))
 
     def hard(self, psi: Float[Tensor, "k"], noise: BinNoise) -> Int[Tensor, "n"]:
-        """Draw bins exactly by the Gumbel-max trick, balanced where the noise has an offset, without a derivative."""
+        """Draw bins exactly by the Gumbel-max trick, balanced if the noise has an offset; not differentiable."""
         log_p = self.log_probabilities(psi.detach())
         if noise.offset is None:
             return (log_p + noise.gumbel).argmax(-1)
         return binned.balanced(log_p, noise.gumbel, noise.offset)
 
     def at(self, bins: Int[Tensor, "n"], within: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Compute the coordinate in given bins, at the fraction ``within`` of each."""
+        """Compute the coordinate at the fraction ``within`` of each given bin."""
         return self._place(self._centres(within)[bins], within)
 
     def relaxed(
         self, psi: Float[Tensor, "k"], noise: BinNoise, within: Float[Tensor, "n"]
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Draw the coordinate differentiably in psi: approximate bin centre plus uniform offset (Tool 1); and the bins.
+        """Draw the coordinate differentiably in psi (approximate bin centre plus uniform offset, Tool 1), and the bins.
 
-        At small tau most draws have next to no derivative, and the few near a tie between two bins have nearly all of
-        it.
+        At small tau nearly all of the derivative comes from the few draws near a tie between two bins.
         """
         log_p = self.log_probabilities(psi)
         weights = binned.gumbel_softmax(log_p, noise.gumbel, self.temperature)
@@ -273,7 +272,7 @@ class BinnedFactor:
         return self._place(centre, within), (log_p.detach() + noise.gumbel).argmax(-1)
 
     def bin_of(self, values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-        """Find the bin of each value. Values outside a range that is not periodic belong to the bin at that end."""
+        """Find the bin of each value. Values outside a range that is not periodic belong to the nearest end bin."""
         low, high = self._ends
         at = values.log() if self.geometric else values
         if self.periodic:

@@ -1,8 +1,8 @@
-"""The illumination parameter: psi are affine weights over anchor lights, deterministic and constrained.
+"""The illumination parameter: psi are affine weights of anchor lights, deterministic and constrained.
 
-A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), so an object's images share one light, and
-psi steps by projected gradient descent. Estimators that need a density draw a Gaussian around psi instead and score the
-draw as it was before its projection: the projected one has no density.
+A light's code is l = sum_i psi_i l_i with sum_i psi_i = 1 (paper, Sec. 3.2), so that an object's images share one
+light, and psi takes projected gradient steps. Estimators that need a density draw a Gaussian around psi instead, and
+score the draw before its projection, because the projected draw has no density.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Constraint = Literal["simplex", "affine"]
 
 @dataclass(frozen=True)
 class GaussianDraw:
-    """Draws around psi: ``log_prob`` scores ``unprojected``; ``weights``, on the constraint, are rendered."""
+    """Draws around psi: ``log_prob`` scores ``unprojected``; ``weights`` are projected, and rendered."""
 
     unprojected: Float[Tensor, "n k"]
     weights: Float[Tensor, "n k"]
@@ -48,12 +48,12 @@ class Illumination:
         anchors: k, the number of anchor lights.
         constraint: ``simplex``: no weight below 0; ``affine``: any that add up to 1.
         deviation: standard deviation of each weight in Gaussian draws.
-        initial, target: weights of objects not named in ``biased``: ``uniform``, ``{dominant: b}``,
+        initial, target: weights of objects that are not named in ``biased``: ``uniform``, ``{dominant: b}``,
             ``{modes: [b, ...]}`` (see ``distributions.distribution``) or k numbers that add up to 1.
         biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: any of these is out of its range; the message has the key and the value.
     """
 
     update: ClassVar[str] = "light_update"
@@ -77,12 +77,12 @@ class Illumination:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What images under given weights depend on."""
+        """What images at given weights depend on."""
         return {"anchors": self.anchors}
 
     @property
     def size(self) -> int:
-        """Numbers of psi for each object."""
+        """Number of psi's entries for each object."""
         return self.anchors
 
     @property
@@ -97,7 +97,7 @@ class Illumination:
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Nothing else is drawn here."""
+        """Empty: nothing else is drawn here."""
         return {}
 
     @property
@@ -106,7 +106,7 @@ class Illumination:
         return ConfiguredDistributions(self.initial, self.target, self.biased, self.gap)
 
     def psi(self, which: str, object_name: str) -> Float[Tensor, "k"]:
-        """Compute the configured ``initial`` or ``target`` weights of one object, float64: they are psi itself."""
+        """Compute the configured ``initial`` or ``target`` weights of one object, float64; psi is these weights."""
         specification = self.configured.of(which, object_name)
         where = f"parameter.illumination.{which}" + (f" of {object_name}" if object_name else "")
         numbers = isinstance(specification, Sequence) and not isinstance(specification, str)
@@ -115,13 +115,13 @@ class Illumination:
         return distribution(specification, self.anchors, where)
 
     def closed(self, object_name: str) -> Bool[Tensor, "k"]:
-        """Close no light."""
+        """Return False for every light: none can be closed."""
         return torch.zeros(self.anchors, dtype=torch.bool)
 
     def psi_of(
         self, p: Float[Tensor, "*n k"], closed: Bool[Tensor, "*n k"] | None = None
     ) -> Float[Tensor, "*n k"]:
-        """Return the weights themselves."""
+        """Return ``p``, the weights: psi is these."""
         return p
 
     def p_of(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
@@ -129,14 +129,14 @@ class Illumination:
         return psi
 
     def log_slopes(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
-        """Return 0: psi are the weights."""
+        """Return 0: psi are the weights themselves."""
         return torch.zeros_like(psi)
 
     def project(self, psi: Float[Tensor, "*n k"]) -> Float[Tensor, "*n k"]:
         """Find the nearest weights that meet the constraint.
 
         Raises:
-            ValueError: values that are not finite.
+            ValueError: some values are not finite.
         """
         return project_simplex(psi) if self.constraint == "simplex" else project_sum(psi)
 
@@ -145,15 +145,15 @@ class Illumination:
     ) -> Float[Tensor, "*n k"]:
         """Find the nearest weights to psi + ``change`` that meet the constraint.
 
-        ``keep``, of bins, does not bound them: a weight is no number of images.
+        ``keep`` is for bins and ignored here: a weight does not count images.
         """
         return self.project(psi + change)
 
     def stratum_of(self, draw: SceneDraw) -> Int[Tensor, "n"]:
-        """Find the anchor light of the largest weight.
+        """Find the anchor light with the largest weight.
 
         Raises:
-            ValueError: draws under the fixed light.
+            ValueError: the draws are under the fixed light.
         """
         if draw.weights is None:
             raise ValueError("parameter.illumination: want draws under weighed lights, got the fixed one")
@@ -164,7 +164,7 @@ class Illumination:
         return psi.expand(count, -1)
 
     def explore(self, psi: Float[Tensor, "k"], noise: Float[Tensor, "n k"]) -> GaussianDraw:
-        """Draw from N(psi, deviation^2 I) by standard normal ``noise``, and project the draws; detached from psi."""
+        """Draw from N(psi, deviation^2 I) with standard normal ``noise``, and project the draws; detached from psi."""
         unprojected = psi.detach() + self.deviation * noise
         return GaussianDraw(unprojected, self.project(unprojected))
 

@@ -1,4 +1,4 @@
-"""The pose parameter: bins of the angle round the poles, of the turn about the vertical, or of both."""
+"""The pose parameter: bins of the angle around the poles, of the turn about the vertical, or of both."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neural_sim.ranges import Ascending, Matching, Positive, PositiveInt, valida
 
 Axis = Literal["polar", "azimuth", "both"]
 OTHER_RANGE_DEG: Mapping[Axis, tuple[float, float]] = {"azimuth": (45.0, 135.0), "both": (-45.0, 45.0)}
-"""Range of the other angle, where ``unlearned`` does not give it."""
+"""Range of the angle that is not learned, if ``unlearned`` does not give it."""
 Range = Annotated[
     tuple[float, float], Ascending(), Matching(lambda ends: ends[1] - ends[0] <= 360.0, "at most a circle")
 ]
@@ -30,20 +30,20 @@ class Pose:
         bins: k, the number of equal bins of the full circle.
         axis: ``polar`` bins phi, the great circle through the poles, with rho uniform in ``other_range_deg``;
             ``azimuth`` bins rho, the turn about the vertical, with phi uniform in ``other_range_deg``; ``both`` bins
-            phi's full circle and rho's ``other_range_deg`` (``other_bins`` of them, which do not wrap), as two factors
-            ``pose`` and ``turn``. Where both angles go round the full circle (the paper's rho), (phi, rho) and
-            (360 - phi, rho + 180) are one place and direction, with the camera upside down in one of them: bins i and
-            k + 1 - i show an object from the same sides, upright and on its head.
-        other_range_deg: null: that of rho is ``unlearned.rho_deg``, with ``both`` [-45, 45]; that of phi [45, 135].
-        temperature, bin_mean, floor: see ``BinnedFactor``; ``bin_mean`` is that of the full circle.
-        uncovered: what happens to bins that no photograph of an object is near: ``leave_out``, their p is 0, or
+                phi's full circle and rho's ``other_range_deg`` (``other_bins`` of them, which do not wrap), as two
+                factors ``pose`` and ``turn``. If both angles go round the full circle (the paper's rho), (phi, rho) and
+                (360 - phi, rho + 180) are the same place and direction, with the camera upside down in one of them:
+                bins i and k + 1 - i show an object from the same sides, upright and upside down.
+        other_range_deg: null: for rho ``unlearned.rho_deg``, or [-45, 45] with ``both``; for phi [45, 135].
+        temperature, bin_mean, floor: see ``BinnedFactor``; ``bin_mean`` applies to the full circle.
+        uncovered: what to do with bins that are not near any photograph of the object: ``leave_out`` (their p is 0) or
             ``render``.
-        covered_within_deg: angle from a pose to a photograph's direction up to which it is near.
-        initial, target, biased, gap: see ``ConfiguredDistributions``. With ``both``, {phi: ..., rho: ...} gives
-            each angle a distribution; a single distribution is phi's, and rho is uniform.
+        covered_within_deg: largest angle between a pose and the direction of a photograph that is near it.
+        initial, target, biased, gap: see ``ConfiguredDistributions``. With ``both``, {phi: ..., rho: ...} gives each
+            angle a distribution; a single distribution applies to phi, and rho is uniform.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: any of these is out of its range; the message has the key and the value.
     """
 
     bins: PositiveInt = 8
@@ -61,7 +61,7 @@ class Pose:
     covered_within_deg: Annotated[float, Gt(0), Le(180)] = 30.0
 
     def __post_init__(self) -> None:
-        _ = self.factors  # raises for what their distributions do not take
+        _ = self.factors  # raises if their distributions are invalid
 
     @property
     def _other_range_deg(self) -> tuple[float, float] | None:
@@ -87,7 +87,7 @@ class Pose:
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Uniform ranges of what is drawn but not learned, in radians."""
+        """Uniform ranges, in radians, of coordinates that are drawn but not learned."""
         if self.axis == "both" or self._other_range_deg is None:
             return {}
         low, high = (math.radians(degrees) for degrees in self._other_range_deg)
@@ -95,7 +95,7 @@ class Pose:
 
 
 def _angle(configured: ConfiguredDistributions, angle: str) -> ConfiguredDistributions:
-    """Pick one angle's distributions from those configured for two."""
+    """Pick one angle's distributions from those configured for both."""
 
     def part(specification: Specification) -> Specification:
         if isinstance(specification, Mapping) and set(specification) <= {"phi", "rho"} and specification:

@@ -1,4 +1,4 @@
-"""p_psi over the scene's numbers V: a product of independent factors; coordinates that no factor draws are uniform."""
+"""p_psi over the scene parameters V: a product of independent factors; coordinates without a factor are uniform."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neural_sim.types import SceneDraw
 
 
 class Parameter(Protocol):
-    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it does not learn."""
+    """A configured parameter: the factors that it learns, and uniform ranges of coordinates that it draws unlearned."""
 
     @property
     def factors(self) -> tuple[Factor, ...]:
@@ -31,7 +31,7 @@ class Parameter(Protocol):
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Uniform ranges of coordinates that are not, in radians."""
+        """Uniform ranges of coordinates that are not learned, in radians."""
         ...
 
 
@@ -40,7 +40,7 @@ class Covered(Protocol):
 
     @property
     def missing(self) -> list[int]:
-        """The bins, numbered from 1, that they do not show."""
+        """The bins, numbered from 1, that photographs do not show."""
         ...
 
 
@@ -48,9 +48,9 @@ class Covered(Protocol):
 class SceneNoise:
     """All randomness of n draws, drawn once and replayed in every pass (paper, Tool 2).
 
-    ``bins`` selects each factor's bins. ``uniform`` in [0, 1) places each coordinate within its bin, or in its range
-    where no factor draws it. ``light`` is standard normal, for lights drawn around psi's weights; None: the lights are
-    psi's weights.
+    ``bins`` selects each factor's bins. ``uniform``, in [0, 1), places each coordinate within its bin, or within its
+    range if no factor draws it. ``light`` is standard normal, for lights drawn around psi's weights; None: the lights
+    are psi's weights.
     """
 
     bins: Mapping[str, BinNoise]
@@ -69,12 +69,12 @@ class SceneNoise:
 
 @dataclass(frozen=True)
 class SceneDistribution:
-    """p_psi = the product of the factors' distributions; psi is one vector for each object, factor by factor.
+    """p_psi, the product of the factors' distributions; psi is one vector for each object, factor by factor.
 
-    ``ranges`` are of coordinates that no factor draws; distances are in ``distance_unit``.
+    ``ranges`` are those of coordinates that no factor draws; distances are in ``distance_unit``.
 
     Raises:
-        ValueError: no factor, two factors of one name, or two of one coordinate.
+        ValueError: there is no factor, or two of one name or of one coordinate.
     """
 
     factors: tuple[Factor, ...]
@@ -104,7 +104,7 @@ class SceneDistribution:
         )
 
     def radii(self, sizes: Mapping[str, float | None]) -> tuple[float, ...] | None:
-        """List the radii of ``sizes`` where distances are in metres, see ``radii_in_metres``; else None."""
+        """List the radii of ``sizes`` if distances are in metres, see ``radii_in_metres``; else None."""
         if self.distance_unit == "radii":
             return None
         nearest = next((f.low for f in self.binned if f.coordinate == "distance"), self.ranges["distance"][0])
@@ -130,7 +130,7 @@ class SceneDistribution:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What hard draws at given probabilities depend on: not the relaxation, not the logits."""
+        """What hard draws at given probabilities depend on; excludes the relaxation and the logits."""
         drawn = {"factors": [factor.drawn for factor in self.factors], "ranges": dict(self.ranges)}
         return drawn | {"distance_unit": self.distance_unit}
 
@@ -143,7 +143,7 @@ class SceneDistribution:
 
     @property
     def size(self) -> int:
-        """Numbers of psi for each object."""
+        """Number of psi's entries for each object."""
         return sum(factor.size for factor in self.factors)
 
     def split(self, psi: Float[Tensor, "*n K"]) -> dict[str, Float[Tensor, "*n _"]]:
@@ -162,10 +162,10 @@ class SceneDistribution:
         )
 
     def leaving_out(self, covered: Mapping[str, Mapping[str, Covered]]) -> SceneDistribution:
-        """Return the distribution without what is not covered, by object and factor: p of these bins is 0.
+        """Return the distribution with p = 0 in the bins that are not covered, by object and factor.
 
         Raises:
-            ValueError: an object of which no bin is left.
+            ValueError: an object has no bin left.
         """
         factors: list[Factor] = []
         for factor in self.factors:
@@ -184,7 +184,7 @@ class SceneDistribution:
         return replace(self, factors=tuple(factors))
 
     def uniform_of(self, objects: Sequence[str]) -> Float[Tensor, "objects K"]:
-        """Compute the psi of the objects with uniform open bins and equal weights of lights."""
+        """Compute the psi at which every object has uniform open bins and equal weights of lights."""
         even = [(f, distribution("uniform", f.size)) for f in self.factors]
         return torch.stack([torch.cat([f.psi_of(p, f.closed(name)) for f, p in even]) for name in objects])
 
@@ -199,7 +199,7 @@ class SceneDistribution:
         return {f.name: f.p_of(parts[f.name]) for f in self.factors}
 
     def digest_of(self, psi: Float[Tensor, "objects K"]) -> str:
-        """Digest the probabilities and weights that psi gives, to 12 digits after the point."""
+        """Digest the probabilities and weights at psi, rounded to 12 decimal places."""
         p = self.probabilities(psi.detach().cpu().double())
         return tensor_digest([(p[name] * 1e12).round() + 0.0 for name in self.names])
 
@@ -215,7 +215,7 @@ class SceneDistribution:
 
     @property
     def states_target(self) -> bool:
-        """Whether the target of any factor is configured: uniform is the default."""
+        """Whether any factor configures a target; the default is uniform."""
         return any(factor.configured.states_target for factor in self.factors)
 
     # --- draws ---
@@ -233,10 +233,10 @@ class SceneDistribution:
 
         Args:
             n: number of draws.
-            generator: of all of it.
-            dtype: of the noise.
-            explore: lights around psi's, for estimators that need a density.
-            balanced: exact draws have n p, rounded, in every factor's bins.
+            generator: the source of all random numbers.
+            dtype: dtype of the noise.
+            explore: whether to draw lights around psi's, for estimators that need a density.
+            balanced: whether exact draws fill every factor's bins n p times, rounded.
         """
         gumbel = {f.name: binned.gumbel((n, f.bins), generator, dtype) for f in self.binned}
         learned = {f.coordinate for f in self.binned}
@@ -252,20 +252,20 @@ class SceneDistribution:
         return SceneNoise(noise, dict(zip(drawn, uniform.unbind(), strict=True)), light)
 
     def hard(self, psi: Float[Tensor, "K"], noise: SceneNoise) -> SceneDraw:
-        """Draw exact samples of p_psi; no derivative reaches psi."""
+        """Draw exact samples of p_psi; not differentiable by psi."""
         parts = self.split(psi)
         bins = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned}
         return self.lit(self.at_bins(bins, noise), psi.detach(), noise.light)
 
     def at_bins(self, bins: Mapping[str, Int[Tensor, "n"]], noise: SceneNoise) -> SceneDraw:
-        """Draw samples in given bins of every factor, uniform within each; without a light."""
+        """Draw samples in given bins of every factor, uniform within each bin; sets no light."""
         placed = {f.coordinate: f.at(bins[f.name], noise.uniform[f.coordinate]) for f in self.binned}
         return self._draw(placed, bins, noise)
 
     def lit(
         self, draw: SceneDraw, psi: Float[Tensor, "K"], noise: Float[Tensor, "n k"] | None = None
     ) -> SceneDraw:
-        """Put draws under psi's light, differentiably; with ``noise`` under lights drawn around it, detached."""
+        """Put draws under psi's light, differentiably; with ``noise``, under lights drawn around it, detached."""
         if self._light is None:
             return draw
         weights = self.split(psi)[self._light.name]
@@ -289,7 +289,7 @@ class SceneDistribution:
     ) -> SceneDraw:
         """Draw ``each`` samples in every stratum of one factor, stratum after stratum.
 
-        All else is from p_psi and the same in all strata.
+        Everything else is drawn from p_psi and is the same in all strata.
         """
         size, lights = self.factor(name).size, self.factor(name).lights
         strata = torch.arange(size).repeat_interleave(each)
@@ -301,16 +301,16 @@ class SceneDistribution:
     def stratum(
         self, name: str, bins: Int[Tensor, "n"], psi: Float[Tensor, "K"], noise: SceneNoise
     ) -> SceneDraw:
-        """Draw samples in given bins of one factor, all others from p_psi."""
+        """Draw samples in given bins of one factor, with all others from p_psi."""
         parts = self.split(psi)
         others = {f.name: f.hard(parts[f.name], noise.bins[f.name]) for f in self.binned if f.name != name}
         return self.lit(self.at_bins({**others, name: bins}, noise), psi.detach())
 
     def log_prob(self, psi: Float[Tensor, "K"], draw: SceneDraw) -> Float[Tensor, "n"]:
-        """Compute log p of drawn bins and explored lights (for REINFORCE).
+        """Compute log p of the drawn bins and explored lights (for REINFORCE).
 
         Raises:
-            ValueError: a light that was not explored, which has no density.
+            ValueError: a light was not explored, and so has no density.
         """
         parts = self.split(psi)
         logs = [f.log_probabilities(parts[f.name])[draw.bins[:, i]] for i, f in enumerate(self.binned)]
@@ -361,7 +361,7 @@ class SceneDistribution:
 class RelaxedDraws:
     """Draws that depend smoothly on psi, for the pathwise estimator.
 
-    ``tangents``: also render the maps' derivatives by the numbers that depend on psi.
+    ``tangents``: also render the maps' derivatives by those numbers of the draw that depend on psi.
     """
 
     tangents: bool = False
@@ -369,7 +369,7 @@ class RelaxedDraws:
     def noise(
         self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
     ) -> SceneNoise:
-        """Return the randomness of ``count`` draws of one object."""
+        """Draw the random numbers of ``count`` draws of one object."""
         return distribution.draw_noise(count, generator, dtype)
 
 
@@ -385,7 +385,7 @@ class HardDraws:
     def noise(
         self, distribution: SceneDistribution, count: int, generator: torch.Generator, dtype: torch.dtype
     ) -> SceneNoise:
-        """Return the randomness of ``count`` draws of one object."""
+        """Draw the random numbers of ``count`` draws of one object."""
         return distribution.draw_noise(
             count, generator, dtype, explore=self.explore, balanced=not self.explore
         )
@@ -396,5 +396,5 @@ HARD = HardDraws()
 
 
 def _columns(bins: Sequence[Tensor], like: Tensor) -> Int[Tensor, "n factors"]:
-    """Join bins as columns of one table, [n, 0] without factors."""
+    """Join bins as the columns of one table; [n, 0] without factors."""
     return torch.stack(list(bins), -1) if bins else torch.zeros(len(like), 0, dtype=torch.long)

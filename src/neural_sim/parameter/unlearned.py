@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 from neural_sim.ranges import Ascending, Positive, validated
 
 Unit = Literal["radii", "metres"]
-"""Each object's own radius, or metres for objects of known size."""
+"""Each object's own radius, or metres, which need objects of known size."""
 NEAREST = 1.05
-"""Object radii: a camera any closer is inside the object."""
+"""In object radii: any closer, a camera is inside the object."""
 
 
 @validated
@@ -35,28 +35,28 @@ class Unlearned:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """By coordinate, in radians and the unit of distances."""
+        """Ranges by coordinate, in radians and in the unit of distances."""
         phi, rho = ((math.radians(r[0]), math.radians(r[1])) for r in (self.phi_deg, self.rho_deg))
         return {"phi": phi, "rho": rho, "distance": self.distance, "magnification": (1.0, 1.0)}
 
 
 def radii_in_metres(nearest: float, sizes: Mapping[str, float | None]) -> tuple[float, ...]:
-    """List the radii (metres) of ``sizes``, by object, for cameras no nearer than ``nearest`` metres.
+    """List the radii in metres of ``sizes``, by object, and check that cameras ``nearest`` metres away are outside.
 
     Raises:
-        ValueError: an object of unknown size, or one that the nearest camera would be inside of.
+        ValueError: an object has an unknown size, or the nearest camera would be inside it.
     """
     unknown = [name for name, radius in sizes.items() if radius is None]
     if unknown:
         raise ValueError(
-            f"distances in metres want objects of known size, and nothing says that of {', '.join(unknown)}: "
+            f"distances in metres need objects of known size, and nothing says that of {', '.join(unknown)}: "
             "set objects.size, or give distances in object radii"
         )
     known = {name: radius for name, radius in sizes.items() if radius is not None}
     for name, radius in known.items():
         if not nearest > NEAREST * radius:
             raise ValueError(
-                f"distances: a camera {nearest:g} m from {name}, of radius {radius:.3g} m, is inside of it; want more "
+                f"distances: a camera {nearest:g} m from {name}, of radius {radius:.3g} m, is inside it; want more "
                 f"than {NEAREST * radius:.3g} m"
             )
     return tuple(known.values())

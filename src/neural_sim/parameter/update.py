@@ -1,9 +1,9 @@
 """Steps of psi along a hypergradient, bounded so that one noisy gradient cannot collapse p.
 
-For bins, psi are logits and ``log_p`` [objects, k] the factor's ``log_slopes``, log p without the floor; steps are in
-logits. For lights, psi are weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the factor's
-``project`` returns the result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient`` and
-``standard_error`` have psi's shape, in units of the outer loss over those of psi.
+For bins, psi are logits and ``log_p`` [objects, k] is the factor's ``log_slopes``, log p without the floor; steps are
+in logits. For lights, psi are weights and ``log_p`` is 0: steps are Euclidean, in units of the weights, and the
+factor's ``project`` returns the result to its constraint (projected gradient descent; paper, Sec. 3.2). ``gradient``
+and ``standard_error`` have psi's shape, in units of the outer loss over those of psi.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 Momentum = Annotated[float, Ge(0), Lt(1)]
 CLIP = 10.0
-"""The mirror step clips a gradient's root mean square to this many times the largest seen before."""
+"""The mirror step clips a gradient whose root mean square exceeds the largest so far by more than this factor."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class UpdateState:
 
     @staticmethod
     def zeros(psi: Float[Tensor, "objects k"]) -> UpdateState:
-        """Begin without a step."""
+        """Begin before the first step."""
         return UpdateState(torch.zeros_like(psi), torch.zeros_like(psi), torch.zeros_like(psi))
 
 
@@ -60,14 +60,14 @@ def _accept(
     second: Float[Tensor, "objects k"],
     noise: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], UpdateState]:
-    """Take a step, or refuse it where the result is not finite: NaN would stay in the moments.
+    """Take a step, or refuse it if the result is not finite: a NaN would stay in the moments.
 
-    An infinite noise variance (an unknown standard error) keeps the old one for the same reason.
+    An infinite noise variance (an unknown standard error) keeps the old variance for the same reason.
     """
     if all(bool(torch.isfinite(values).all()) for values in (moved, first, second)):
         noise = torch.where(torch.isfinite(noise), noise, before.noise)
         return moved, UpdateState(first, second, noise, before.steps + 1, before.refused)
-    _log.warning("psi: a step from a gradient that is not finite was refused")
+    _log.warning("psi: refused a step, because its gradient is not finite")
     return psi, replace(before, refused=before.refused + 1)
 
 
@@ -76,8 +76,8 @@ def _accept(
 class SGD:
     """Gradient descent with momentum (the paper: rate 1e-5 on its own loss scale, momentum 0.9).
 
-    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; ``max_step`` None: steps are
-    not bounded, as in the paper.
+    ``v <- momentum v + gradient``, ``psi <- psi - learning_rate v``; with ``max_step`` None steps are not bounded, as
+    in the paper.
     """
 
     learning_rate: Positive
@@ -99,13 +99,13 @@ class SGD:
 class Mirror:
     """Mirror descent on the simplex with the entropy as mirror map (exponentiated gradient).
 
-    The direction in the logits is the gradient by p, which is the gradient by the logits divided by p, centred: a bin
-    of small p gets as long a step as one of large p. Momentum averages the direction. The average is divided by the
-    largest root mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever
-    the units of the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients
-    near the end, and objects without a gradient would drift.)
+    In logits, the direction is the gradient by p (the gradient by the logits divided by p), centred: a bin of small p
+    takes as long a step as one of large p. Momentum averages the direction. The average is divided by the largest root
+    mean square over all objects and bins so far, so that ``learning_rate`` is in logits per step whatever the units of
+    the loss, and steps shorten with the gradient. (A scale that decays would amplify the small gradients near the end,
+    and objects without a gradient would drift.)
 
-    ``shrink`` multiplies each component of the average by ``shrinkage`` (James and Stein 1961, positive part):
+    With ``shrink``, each component of the average is multiplied by ``shrinkage`` (James and Stein 1961, positive part):
     components within their noise do not move. Standard errors that are not finite shrink nothing.
     """
 
@@ -135,7 +135,7 @@ class Mirror:
         return _accept(psi, moved, state, velocity, largest, noise)
 
     def _clipped(self, direction: Float[Tensor, "objects k"], state: UpdateState) -> Float[Tensor, ""]:
-        """Compute the factor that clips an outlier to ``CLIP`` times the scale, which never falls."""
+        """Compute the factor that clips an outlier to ``CLIP`` times the scale, which never decreases."""
         size, known = direction.square().mean().sqrt(), state.second.max().sqrt()
         return torch.where(
             known > 0.0, (CLIP * known / size.maximum(known)).clamp_max(1.0), torch.ones_like(size)

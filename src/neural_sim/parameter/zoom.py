@@ -1,4 +1,4 @@
-"""The zoom parameter: how large objects appear, by the camera's distance or by its focal length."""
+"""The zoom parameter: how large objects appear, set by the camera's distance or by its focal length."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Zoom:
 
     Args:
         bins: k.
-        by: ``distance`` moves the camera; ``focal_length`` magnifies its image from where it stands, without a change
-            of perspective.
+        by: ``distance`` moves the camera; ``focal_length`` magnifies the image from where the camera stands, without
+            changing the perspective.
         range: nearest and farthest distance; or smallest and largest focal length in units of the camera's own. Bin 1
             is the nearest, or the smallest magnification.
-        unit: of the distances, ``radii`` of each object or ``metres``; has no meaning for a focal length.
+        unit: unit of the distances, ``radii`` of each object or ``metres``; has no effect on a focal length.
         temperature, floor: see ``BinnedFactor``.
         initial, target, biased, gap: see ``ConfiguredDistributions``.
 
     Raises:
-        ValueError: any of these out of its range, with the key and the value.
+        ValueError: any of these is out of its range; the message has the key and the value.
     """
 
     bins: PositiveInt = 4
@@ -49,7 +49,7 @@ class Zoom:
             raise ValueError(
                 f"parameter.zoom.range: want more than {NEAREST} object radii, got {list(self.range)}"
             )
-        _ = self.factors  # raises for what their distributions do not take
+        _ = self.factors  # raises if their distributions are invalid
 
     @property
     def factors(self) -> tuple[BinnedFactor, ...]:
@@ -66,5 +66,5 @@ class Zoom:
 
     @property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Nothing else is drawn here."""
+        """Empty: nothing else is drawn here."""
         return {}
