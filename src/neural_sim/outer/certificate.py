@@ -1,7 +1,7 @@
 """Quality of each iteration's hypergradient, the conditions that it fails, and what happens to the steps.
 
-An iteration makes one step for each object and each factor of psi. The solve and the hypergradient as a whole concern
-all of them; whether a derivative differs significantly from zero is tested for each.
+An iteration takes one step for each object and each factor of psi. The solve, and the hypergradient as a whole, concern
+all steps; whether a derivative differs significantly from zero is tested for each one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ACTIONS: Mapping[OnUntrusted, Action] = {
 
 
 Actions = dict[str, dict[str, Action]]
-"""The fate of each step, by object and factor. A trusted step waits where a trust region does not take it yet."""
+"""What happens to each step, by object and factor. A trusted step may wait, if a trust region does not take it yet."""
 
 
 @validated
@@ -36,16 +36,17 @@ Actions = dict[str, dict[str, Action]]
 class Trust:
     """``outer.trust``: when a psi step is trusted, and what happens to one that is not.
 
-    The adjoint's own conditions are ``outer.adjoint``'s.
+    The adjoint's own conditions are settings of ``outer.adjoint``.
 
     Args:
         level: significance level of the test that an object's derivative by a factor is zero (see
             ``gradient.significance``); None: not tested.
-        min_cosine: smallest cosine of the hypergradient with the response of training (wants ``outer.certify_every``);
-            None: no limit.
-        on_untrusted: what happens to steps that fail: those of one factor of one object where its derivative is not
-            significant, all of them where the whole hypergradient fails. ``keep`` takes them whole, as the paper does;
-            ``stop`` skips the former, and ends the loop at the latter or where no step is left.
+        min_cosine: smallest cosine of the hypergradient with the finite-difference response of training (needs
+            ``outer.certify_every``); None: no limit.
+        on_untrusted: what happens to steps that fail: those of one object and factor if the derivative is not
+            significant, all of them if the whole hypergradient fails. ``keep`` takes them whole, as the paper does.
+            ``stop`` skips steps without significance, and ends the loop if the whole hypergradient fails or no step is
+            left.
         shrink: fraction of an untrusted step that is taken under ``on_untrusted=shrink``.
     """
 
@@ -57,10 +58,10 @@ class Trust:
 
 @dataclass(frozen=True)
 class ImplicitQuality:
-    """The numbers of an ``ImplicitAdjoint`` that are recorded, None where one was not measured.
+    """The recorded numbers of an ``ImplicitAdjoint``; None where one was not measured.
 
-    ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme Ritz values, ``condition`` the damped
-    operator's condition number (inf where it is not positive definite), both of an estimated spectrum.
+    All come from an estimated spectrum: ``curvature_min`` and ``curvature_max`` are the undamped operator's extreme
+    Ritz values, ``condition`` is the damped operator's condition number (inf if it is not positive definite).
     """
 
     stationarity: float
@@ -110,7 +111,7 @@ class ImplicitQuality:
 
 @dataclass(frozen=True)
 class UnrolledQuality:
-    """The numbers of an ``UnrolledAdjoint`` that are recorded."""
+    """The recorded numbers of an ``UnrolledAdjoint``."""
 
     validation_norm: float
     reversed_steps: int
@@ -128,13 +129,13 @@ class Certificate:
     """Quality of one iteration's hypergradient.
 
     Attributes:
-        adjoint: how the adjoint went; None where trainings were compared.
-        cosine: with the response of training, None where that was not measured.
-        doubts: names of the conditions on the whole hypergradient that fail.
-        p_values: by object and factor, of the null that a derivative is zero: this iteration's, or, for trust-region
-            steps, of the average over iterations that steps follow.
-        actions: what happens to the learned objects' steps: one is kept if no condition fails and its derivative is
-            significant. What waited is recorded by ``waiting``.
+        adjoint: how the adjoint went; None if trainings were compared instead.
+        cosine: cosine with the finite-difference response of training; None if that was not measured.
+        doubts: names of the failed conditions on the whole hypergradient.
+        p_values: by object and factor, of the null hypothesis that the derivative is zero. They test this iteration's
+            derivative or, for trust-region steps, the average over iterations that the steps follow.
+        actions: what happens to the learned objects' steps. A step is kept if no condition fails and its derivative is
+            significant. ``waiting`` adds which steps waited.
     """
 
     adjoint: Quality | None
@@ -150,11 +151,11 @@ class Certificate:
 
     @property
     def void(self) -> bool:
-        """Whether this iteration's derivative is discarded, also from the momentum."""
+        """Whether this iteration's derivative is discarded, from the momentum as well."""
         return self.stopped or (bool(self.doubts) and not self._taken & {"shrunk", "kept"})
 
     def waiting(self, steps: Collection[tuple[str, str]]) -> Certificate:
-        """Record the trusted ones among ``steps``, of an object and a factor, as waited."""
+        """Mark as waiting those of ``steps``, given as object and factor, that are trusted."""
         actions: Actions = {
             name: {
                 factor: "waited" if action == "kept" and (name, factor) in steps else action
@@ -180,17 +181,17 @@ def certify(
 ) -> Certificate:
     """Certify an iteration's hypergradient.
 
-    No step follows a gradient that is not finite. A derivative is insignificant where its p-value is above
+    No step follows a gradient that is not finite. A derivative is insignificant if its p-value is above
     ``trust.level``; one that was not tested counts as significant.
 
     Args:
         result: the hypergradient.
-        p_values: of the derivatives that steps follow, by object and factor.
+        p_values: p-values of the derivatives that steps follow, by object and factor.
         names: the learned objects.
         factors: the factors of psi.
-        trust: the conditions, and what happens where they fail.
+        trust: the conditions, and what happens if they fail.
         adjoint: the adjoint's own conditions.
-        cosine: with the response of training, None if not measured.
+        cosine: cosine with the finite-difference response of training; None if not measured.
     """
     finite = all(bool(gradient.isfinite().all()) for gradient in result.gradients.values())
     doubts = _adjoint_doubts(result, adjoint)
@@ -235,8 +236,8 @@ def _by_signal(
 ) -> Actions:
     """Keep the steps of significant derivatives.
 
-    An object at its optimum has none, and is no reason to stop the others: ``stop`` skips its step, and ends the loop
-    where no step is left.
+    An object at its optimum has no significant derivative, which is no reason to stop the others: ``stop`` skips its
+    step, and ends the loop only if no step is left.
     """
     stops = trust.on_untrusted == "stop"
     otherwise: Action = "skipped" if stops else _ACTIONS[trust.on_untrusted]
@@ -267,12 +268,12 @@ def line(certificate: Certificate, iteration: int, iterations: int, validation_l
 
 
 def untrusted(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Count over recorded iterations what happened to steps.
+    """Count, over recorded iterations, what happened to steps.
 
-    Counted are steps (one for each object and factor), trusted ones that waited, untrusted ones, what happened to these
-    and why (failed conditions, or ``signal``: no significance), objects' steps that were judged, and those that were
-    rejected. Every measured cosine is listed; ``taken_back`` are the objects that the loop returned at an earlier psi,
-    with their accepted steps and how many of them they keep.
+    The counts are: steps (one for each object and factor), trusted steps that waited, untrusted steps, what happened to
+    these and why (the failed conditions, or ``signal``: no significance), objects' steps that were judged, and those
+    that were rejected. Every measured cosine is listed. ``taken_back`` lists the objects that the loop returned to an
+    earlier psi, with the number of their accepted steps and how many of them they keep.
     """
     certificates = [record["certificate"] for record in records if record["certificate"]]
     actions = [

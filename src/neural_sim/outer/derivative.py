@@ -29,22 +29,22 @@ def image_losses(detector: Detector, backbone: Parameters, targets: Targets) -> 
 
 
 def bound_losses(cached: CachedSet, backbone: Parameters, probes: CachedSet | None) -> Losses:
-    """Return the losses of a training's images, from features and from pixels, and of its probes."""
+    """Return the losses of a training's images, from features and from pixels, and those of its probes."""
     from_images = image_losses(cached.detector, backbone, cached.targets)
     return Losses(cached.losses, from_images, probes.losses if probes else None)
 
 
 def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compose) -> RenderedPath:
-    """Return the path from psi to one object's images through a relaxed draw; ``compose`` makes them of its maps.
+    """Return the path from psi to one object's images through a relaxed draw; ``compose`` makes images from its maps.
 
     Raises:
-        ValueError: images of hard draws.
+        ValueError: the images come from hard draws.
     """
     noise = part.noise
     if noise is None or part.relaxed is None:
         raise ValueError("pathwise: these images were not drawn from psi by a relaxed draw")
 
-    # All of an object's images are under psi's light.
+    # All images of an object are under psi's light.
     light = None if part.draw.weights is None else part.draw.weights[0]
 
     def replay(psi: Tensor) -> SceneDraw:
@@ -64,9 +64,9 @@ def rendered_path(scene: Scene, label: int, part: RenderedObject, compose: Compo
 def object_images(
     scene: Scene, rendered: RenderedImages, psi: Tensor, weights: Tensor
 ) -> dict[str, ObjectImages]:
-    """Return the images in which each object shows, by its name, with their rows in the training set.
+    """Return, by object name, the images that show the object, with their rows in the training set.
 
-    They have a path where draws are relaxed. ``weights`` are those of all images in the training loss.
+    They have a path if draws are relaxed. ``weights`` are the weights of all images in the training loss.
     """
     pixels = rendered.images.images
     bound = {}
@@ -87,7 +87,7 @@ def recorded(inner: InnerLoop, trained: Trained) -> RecordedTraining:
     """Bind a training's recorded steps to what it was trained on.
 
     Raises:
-        ValueError: that training was not recorded.
+        ValueError: the training was not recorded.
     """
     if trained.trajectory is None:
         raise ValueError("unrolled: the training was not recorded; want train(..., recording=...)")
@@ -109,7 +109,7 @@ def probe_groups(probed: ProbeSet, probes: Mapping[str, Mapping[str, Probes]]) -
 
 
 def inputs_of(inner: InnerLoop, examples: CachedSet) -> InputsOf:
-    """Return the function that computes a training set's inputs from drawn images and their rows."""
+    """Return the function that computes a training set's inputs from its drawn images and their rows."""
 
     def inputs(pixels: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
         return (*inner.detector.features(inner.backbone, pixels), examples.targets.select(rows).deltas)

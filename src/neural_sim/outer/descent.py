@@ -1,4 +1,4 @@
-"""The psi loop of methods with a derivative: train, differentiate, step, train to accept or reject the step."""
+"""The psi loop of methods with a derivative: train, differentiate, step, then train to accept or reject the step."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Derived:
-    """The derivative of a training at psi; p-values are of all derivatives that steps follow."""
+    """The derivative of a training at psi. The p-values are those of all derivatives that steps follow."""
 
     trained: Trained
     result: Hypergradient
@@ -41,9 +41,9 @@ class Derived:
 class GradientLoop(OuterLoop, ABC):
     """One training step is one outer iteration. A subclass computes the derivative in ``_derivative``.
 
-    In a trust region, consecutive trainings have common random numbers, an iteration begins with a training that
-    accepts or rejects the last step, and the last iteration ends with it. Before its first derivative, it tries the psi
-    that ``first`` proposes, if any. At the end every object goes back to its best psi on the way.
+    In a trust region, consecutive trainings use common random numbers. Each iteration begins with a training that
+    accepts or rejects the last step, and the last iteration does nothing else. Before the first derivative, the loop
+    tries the psi that ``first`` proposes, if any. At the end every object goes back to the best psi that it has had.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class GradientLoop(OuterLoop, ABC):
         self.trajectory.append(self.psi.detach().clone())
 
     def _offer(self) -> None:
-        """Go to the psi that the first step proposes, after a training at the start, by which it will be judged."""
+        """Train at the start, for comparison, then go to the psi that the first step proposes."""
         steps = self.steps
         if self.first is None or not isinstance(steps, TrustRegionSteps):
             return
@@ -130,29 +130,29 @@ class GradientLoop(OuterLoop, ABC):
         return trained, verdicts
 
     def _saw(self, scores: Float[Tensor, "classes images"], names: Iterable[str]) -> None:
-        """Note what a training says of the objects that it saw at the psi where they stand."""
+        """Note the scores that a training gives to the objects it saw, at their present psi."""
         for name in names:
             self._way = self._way.seen(name, float(scores[self.scene.names.index(name)].sum()))
 
     def _derive(self) -> Derived:
-        """Take the derivative at psi: of one training, in a trust region's first iteration of several."""
+        """Take the derivative at psi: of one training, or in a trust region's first iteration of several."""
         first = not self.records
         for trial in range(self.settings.steps.trainings if first else 1):
             if trial or not first or self._offered:
-                self.renew()  # what is peculiar to one training averages out of the derivatives
+                self.renew()  # what is particular to one training averages out of the derivatives
             trained, result = self._differentiated()
             self.steps, p_values = self.steps.observe(result)
         return Derived(trained, result, p_values)
 
     def _differentiated(self) -> tuple[Trained, Hypergradient]:
-        """Train at psi, and take the derivative of that training.
+        """Train at psi, and differentiate that training.
 
-        A derivative that is compared with the response is of L_val on all images, as the response is.
+        A derivative that is compared with the response uses L_val on all images, as the response does.
         """
         with self.timed("probes"):
             self._prepare()
         if not self.records and not self.settings.train_first:
-            # The warm start has trained at this psi, on more images and for more steps than an iteration.
+            # The warm start has trained at this psi, with more images and steps than an iteration.
             trained = self.charged(self.inner.untrained(self.psi, self.numbers, self.theta))
         else:
             trained = self.train_on(self.psi, self._recording)
@@ -193,7 +193,7 @@ class GradientLoop(OuterLoop, ABC):
         return every > 0 and (len(self.records) + 1) % every == 0
 
     def _fold(self) -> Objective:
-        """Take the next part of L_val. The scatter of derivatives then has that of the validation images in it."""
+        """Take the next part of L_val, so that derivatives also scatter with the choice of validation images."""
         count = self.settings.steps.folds
         if count == 1:
             return self.inner.objective
@@ -203,7 +203,7 @@ class GradientLoop(OuterLoop, ABC):
         return self._folds.pop()
 
     def derivative(self) -> Hypergradient:
-        """Take the derivative at psi as an iteration does, by new images and a training on them; psi does not move."""
+        """Take the derivative at psi as an iteration does, with new images and a new training; psi does not move."""
         self._prepare()
         trained = self.inner.train(self.psi, self.numbers, self.theta, self._recording)
         self.theta = trained.theta
@@ -235,7 +235,7 @@ class GradientLoop(OuterLoop, ABC):
     @override
     def restore(self, state: Mapping[str, Any]) -> None:
         self._before_folds = state["before_folds"]
-        if state["folds"]:  # those that are left are the first: they are taken from the end
+        if state["folds"]:  # parts are taken from the end: those that are left are the first
             self.numbers.generator.set_state(self._before_folds)
             count = self.settings.steps.folds
             self._folds = self.inner.objective.folds(count, self.numbers.generator)[: state["folds"]]
@@ -252,17 +252,17 @@ class GradientLoop(OuterLoop, ABC):
         """Compute d objective/dpsi of the learned objects, zeros for the others."""
 
     def _cosine(self, result: Hypergradient) -> float | None:
-        """Compare the derivative with an independent reference; None without one."""
+        """Compare the derivative with an independent reference; None if there is none."""
         return None
 
 
 def learned_objects(inner: InnerLoop) -> LearnedObjects:
     """Choose the objects whose psi moves: those that were asked for, else all that validation images show.
 
-    Of an object that they do not show they measure only where it is taken for another, whatever its own best psi is.
+    For an object that they do not show, they only measure where it is mistaken for another, whatever its best psi is.
 
     Raises:
-        ValueError: validation images without any object.
+        ValueError: no validation image shows an object.
     """
     names, wanted = inner.scene.names, inner.settings.learned
     if wanted is not None:
@@ -276,6 +276,6 @@ def learned_objects(inner: InnerLoop) -> LearnedObjects:
         unseen = [name for label, name in enumerate(names) if label not in inner.shown]
         if unseen:
             _log.warning(
-                "psi stays as it is of objects that no validation image shows: %s", ", ".join(unseen)
+                "no validation image shows these objects, so their psi stays as it is: %s", ", ".join(unseen)
             )
     return LearnedObjects([names[label] for label in labels], labels, inner.scene.distribution)

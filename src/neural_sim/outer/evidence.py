@@ -1,4 +1,4 @@
-"""Evidence of the derivatives of several trainings: their mean, its variance, and whether it differs from zero."""
+"""Evidence from the derivatives of several trainings: their mean, its variance, and whether it differs from zero."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 class Average:
     """Weighted mean of derivatives by p, object by object; weights are inverse variances and decay as psi moves.
 
-    So neither a noisy derivative, which is long, nor the first one dominates. Two variances add up: that of the images
-    which a derivative was computed from, and that between trainings (of other initial parameters, batches and images),
-    ``between``. A derivative of which a component is not finite counts for nothing.
+    The weights keep noisy derivatives, which are long, and the first one from dominating. Two variances add up: that
+    over the images a derivative was computed from, and ``between``, the variance between trainings (with other initial
+    parameters, batches and images). A derivative with a component that is not finite is ignored.
 
     Attributes:
         directions: the derivatives.
-        variances: their variances by images.
+        variances: their variances over images.
         moves: how often the object has moved since.
-        momentum: factor of a derivative's weight for every move.
+        momentum: factor on a derivative's weight for every move.
     """
 
     directions: Float[Tensor, "n objects k"]
@@ -47,17 +47,17 @@ class Average:
         )
 
     def moved(self, objects: Bool[Tensor, "objects"]) -> Average:
-        """Let the derivatives of some ``objects`` that have moved decay."""
+        """Let the derivatives of those ``objects`` that have moved decay."""
         return replace(self, moves=self.moves + objects.long())
 
     @property
     def between(self) -> Float[Tensor, "objects"]:
-        """Variance of a component between trainings, 0 where no object has two derivatives at one psi.
+        """Variance of a component between trainings; 0 if no object has two derivatives at one psi.
 
-        It is estimated from an object's derivatives at one psi: their scatter beyond that of their images. What the
-        median object's ratio of the two would give counts as one more pair of derivatives of each: a ratio, because
-        objects' derivatives differ in size, and the median, so that one object whose derivatives scatter wildly does
-        not hide those of others.
+        It is estimated from an object's derivatives at one psi, as their scatter beyond that of their images. The
+        median object's ratio of the two is added for each object as if it were one more pair of derivatives. It is a
+        ratio because objects' derivatives differ in size, and a median so that one object with wildly scattered
+        derivatives does not hide those of the others.
         """
         excess, freedom = self._excess
         if not bool((freedom > 0).any()):
@@ -73,7 +73,7 @@ class Average:
 
     @property
     def _excess(self) -> tuple[Float[Tensor, "objects"], Float[Tensor, "objects"]]:
-        """Squared differences of derivatives from their mean at one psi, beyond those of images; degrees of freedom."""
+        """Squared deviations of derivatives from their mean at one psi, beyond those of images; degrees of freedom."""
         known = self.variances.isfinite().all(2)
         excess = torch.zeros_like(self.directions[:1].sum((0, 2)))
         freedom = torch.zeros_like(excess)
@@ -90,7 +90,7 @@ class Average:
 
     @property
     def _weights(self) -> Float[Tensor, "n objects 1"]:
-        """Relative weights. Without any variance (exact derivatives) all have the same."""
+        """Relative weights. Without any variance (exact derivatives), all are equal."""
         variance = self.variances.mean(2, keepdim=True) + self.between[:, None]
         inverse = torch.where(variance > 0.0, 1.0 / variance, 1.0)
         return self.momentum ** self.moves[..., None].to(inverse) * inverse
@@ -113,10 +113,10 @@ class Average:
 
     @property
     def p_values(self) -> Float[Tensor, "objects"]:
-        """P-values of the null that all components of the mean are equal.
+        """P-values of the null hypothesis that all components of the mean are equal.
 
-        By a chi-square test with k - 1 degrees of freedom, each component over its own variance. 1 without
-        observations, 0 without noise.
+        They come from a chi-square test with k - 1 degrees of freedom, each component divided by its own variance. 1
+        without observations, 0 without noise.
         """
         value, variance = self.value, self.variance
         exact = (variance == 0.0).all(1)

@@ -1,4 +1,4 @@
-"""``outer/first_step``: what proposes the psi that a loop tries first."""
+"""``outer/first_step``: proposes the psi that a loop tries first."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from neural_sim.types import LabelledImages
 @validated
 @dataclass(frozen=True)
 class Derivative:
-    """``outer.first_step``: nothing is proposed; the first step is that along the first derivative."""
+    """``outer.first_step``: propose nothing; the first step follows the first derivative."""
 
 
 class FirstStep(Protocol):
-    """Proposes the psi that a training accepts or rejects, object by object, before the first derivative is taken."""
+    """Proposes a psi before the first derivative; a training accepts or rejects it, object by object."""
 
     def propose(
         self,
@@ -39,10 +39,10 @@ class FirstStep(Protocol):
         """Propose a psi.
 
         Args:
-            scene: draws images of all bins, without rendering where the loop has a pool.
-            images: labelled ones of the target.
-            psi: where the loop stands.
-            generator: of all draws.
+            scene: draws images of all bins; if the loop has a pool, without rendering.
+            images: labelled images of the target.
+            psi: the loop's present psi.
+            generator: the source of all random numbers.
         """
         ...
 
@@ -52,9 +52,9 @@ class WhatTheTargetShows(FirstStep):
     """Proposes the psi that the target's boxes show.
 
     Attributes:
-        settings: how it is read off them.
+        settings: how psi is estimated from them.
         groups: bins that look the same.
-        whole: read whole images, which have no boxes.
+        whole: use whole images, because there are no boxes.
     """
 
     settings: LabelShift
@@ -77,9 +77,9 @@ class WhatTheTargetShows(FirstStep):
 
 
 def p_value_of(factors: Sequence[FactorEstimate], name: str) -> float:
-    """Compute the p-value of the null that psi of an object is right where it stands.
+    """Compute the p-value of the null hypothesis that an object's present psi is right.
 
-    Among several factors that move, the most significant one counts, its p-value times their number (Bonferroni).
+    If several factors move, the most significant one counts, with its p-value times their number (Bonferroni).
     """
     moving = [one.p_value for one in factors if one.name == name and one.finding == "moves"]
     return min(1.0, len(moving) * min(moving)) if moving else 1.0

@@ -1,4 +1,4 @@
-"""The inner problem, common to all methods: images drawn from p_psi, and a detector trained on them."""
+"""The inner problem, which all methods share: images drawn from p_psi, and a detector trained on them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from neural_sim.types import LabelledImages
 
 @contextmanager
 def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterator[None]:
-    """Add the seconds spent inside, the device's work for it included, to those of a phase."""
+    """Add the seconds spent inside, including the device's work, to those of a phase."""
     begin = time.perf_counter()
     yield
     synchronise(device)
@@ -40,7 +40,7 @@ def timed(seconds: dict[str, float], phase: str, device: torch.device) -> Iterat
 
 
 def pooled(settings: Outer, draws: Draws, distribution: SceneDistribution) -> bool:
-    """Tell whether images come from a pool: they do where no image is differentiated and the light is fixed."""
+    """Tell whether images come from a pool: they do if no image is differentiated and the light is fixed."""
     return settings.pool_per_bin > 0 and isinstance(draws, HardDraws) and not distribution.lights
 
 
@@ -49,9 +49,9 @@ class Numbers:
     """The random numbers of trainings.
 
     Attributes:
-        generator: the loop's.
+        generator: the loop's generator.
         common: whether all draws and trainings use the same random numbers, so that they differ by psi alone.
-        index: number of the common ones.
+        index: number of the set of common random numbers in use.
     """
 
     generator: torch.Generator
@@ -59,22 +59,22 @@ class Numbers:
     index: int = 0
 
     def of(self, purpose: str) -> torch.Generator:
-        """Return the generator of a training's ``images``, or of the ``training`` itself."""
+        """Return the generator for a training's ``images``, or for the ``training`` itself."""
         return stream(self.index, f"common {purpose}", self.generator) if self.common else self.generator
 
     def renewed(self) -> Numbers:
-        """Return other common random numbers."""
+        """Return another set of common random numbers."""
         return replace(self, index=self.index + 1)
 
 
 @dataclass(frozen=True)
 class RenderedPool:
-    """A pool and what it leaves behind.
+    """A pool of renders, with the state of the generator after them.
 
     Attributes:
-        scene: of the pooled renders.
-        state: of the generator after them: who goes on from it draws what the pool's own maker would.
-        spent: seconds.
+        scene: the scene of the pooled renders.
+        state: the generator's state after them: whoever continues from it draws what the pool's maker would draw next.
+        spent: seconds that it took.
     """
 
     scene: Scene
@@ -97,10 +97,10 @@ class LoopInputs:
 
     Attributes:
         detector: the detector.
-        params: its warm start, on the device where the loop trains and the scene's fields are.
-        validation: the labelled target set, on any device; the loop sees no other images of the target.
-        photographs: labelled ones that train with the drawn images, as ``training.real`` says.
-        pool: that the loop's generator has rendered already; None: it is rendered where the loop has one.
+        params: its warm start, on the device on which the loop trains and the scene's fields are.
+        validation: the labelled validation set, on any device; the loop sees no other images of the target.
+        photographs: labelled photographs that train with the drawn images, as ``training.real`` says.
+        pool: a pool that was already rendered by the loop's generator; None: the loop renders its own if it needs one.
     """
 
     detector: Detector
@@ -112,19 +112,19 @@ class LoopInputs:
 
 @dataclass(frozen=True)
 class Trained:
-    """A detector after a training on images of one psi, or one that was trained elsewhere and these images.
+    """A detector after training on images at one psi, or a detector that was trained elsewhere, with these images.
 
     Attributes:
-        psi: of which the images were drawn.
+        psi: the psi from which the images were drawn.
         rendered: the drawn images.
-        examples: the training set: these images and the photographs, under the backbone.
+        examples: the training set: these images and the photographs, passed through the backbone.
         theta: the detector's parameters.
-        trainable: their trained part.
-        loss: of the last epoch; nan for no epochs.
-        trajectory: the steps, where they were recorded.
+        trainable: the part of them that is trained.
+        loss: mean training loss of the last epoch; nan without epochs.
+        trajectory: the steps, if they were recorded.
         objective: L_val.
         cost: images and steps.
-        seconds: by phase: render, features, train.
+        seconds: seconds by phase: render, features, train.
     """
 
     psi: Float[Tensor, "objects K"]
@@ -150,30 +150,30 @@ class Trained:
 
     @property
     def scores(self) -> Float[Tensor, "classes images"]:
-        """Each validation image's contribution to the score of each class, more is better."""
+        """Each validation image's contribution to the score of each class; higher is better."""
         return self.objective.scores(self._outputs)
 
 
 @dataclass(frozen=True)
 class InnerLoop:
-    """The inner problem of Eq. 1: theta after training on images of one psi.
+    """The inner problem of Eq. 1: theta after training on images at one psi.
 
-    The backbone is that of ``params``, frozen but for its last ``settings.loop_layers`` stages. These, pyramid and
-    head are trained for ``settings.epochs`` epochs at a time, more where ``settings.least_steps`` asks for them.
-    Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a pool of poses
-    of every bin.
+    The backbone is the one in ``params``, frozen except for its last ``settings.loop_layers`` stages. These stages, the
+    pyramid and the head are trained for ``settings.epochs`` epochs at a time, or more if ``settings.least_steps``
+    requires it. Relaxed draws, and images under a light that moves, are always rendered anew; all others come from a
+    pool of poses of every bin.
 
     Attributes:
-        scene: what images are drawn from.
+        scene: the scene from which images are drawn.
         detector: the detector as the loop trains it.
         params: its warm start.
-        start: where a training begins that does not go on from the one before.
+        start: where a training begins, unless it continues the previous one.
         objective: L_val.
-        photographs: those that train with the drawn images.
-        settings: of the psi loop.
+        photographs: the photographs that train with the drawn images.
+        settings: settings of the psi loop.
         training: batch size and weight decay.
         draws: how the method draws images.
-        pool: the scene of poses that are rendered once, where there is one.
+        pool: the scene of poses that are rendered once, if there is one.
         preparation: cost of rendering the pool.
     """
 
@@ -237,18 +237,18 @@ class InnerLoop:
 
     @property
     def shown(self) -> set[int]:
-        """Classes of which a validation image shows an object."""
+        """Classes that some validation image shows."""
         labels = self.objective.images.labels
         return set(labels[labels >= 0].tolist())
 
     def draw(self, psi: Float[Tensor, "objects K"], numbers: Numbers) -> RenderedImages:
-        """Draw training images, without maps where no derivative goes through them."""
+        """Draw training images; maps are kept only if a derivative goes through them."""
         scene, count = self.pool or self.scene, self.settings.images_per_object
         rendered = scene.training_set(psi, count, numbers.of("images"), self.draws)
         return rendered.without_maps() if isinstance(self.draws, HardDraws) else rendered
 
     def training_set(self, images: LabelledImages) -> CachedSet:
-        """Return drawn images, and after them the photographs that train with them, under the backbone."""
+        """Join drawn images and, after them, the photographs that train with them, passed through the backbone."""
         drawn = CachedSet.of(self.detector, self.backbone, images)
         return drawn if self.photographs is None else CachedSet.concatenate([drawn, self.photographs])
 
@@ -270,13 +270,13 @@ class InnerLoop:
         theta: Parameters | None = None,
         recording: Recording | None = None,
     ) -> Trained:
-        """Train on images of psi.
+        """Train on images at psi.
 
         Args:
-            psi: of p_psi.
-            numbers: of the draws and the training.
-            theta: where a training goes on under ``settings.start=previous``; None: from the warm start.
-            recording: what is recorded of the steps.
+            psi: the images are drawn from p_psi.
+            numbers: random numbers of the draws and the training.
+            theta: where a training continues if ``settings.start=previous``; None: at the warm start.
+            recording: which part of the steps is recorded.
         """
         theta = self.params if theta is None else theta
         seconds: dict[str, float] = {}
@@ -288,7 +288,7 @@ class InnerLoop:
         return self._trained(psi, rendered, examples, theta, seconds, history)
 
     def untrained(self, psi: Float[Tensor, "objects K"], numbers: Numbers, theta: Parameters) -> Trained:
-        """Draw images of psi for a detector that was trained elsewhere; the loss is theirs."""
+        """Draw images at psi for a detector that was trained elsewhere; the loss is evaluated on them."""
         seconds: dict[str, float] = {}
         rendered, examples = self._examples(psi, numbers, seconds)
         with timed(seconds, "train", self.device):
@@ -309,7 +309,7 @@ class InnerLoop:
         sampling = self._sampling(examples)
         how = self.training.of(self._epochs(len(examples), sampling))
         how = replace(how, learning_rate=self.settings.learning_rate)
-        # The proximal term replaces weight decay: with both, its Hessian would not be the inner problem's.
+        # The proximal term replaces weight decay: with both, the inner problem would have another Hessian.
         if self.detector.proximal > 0.0:
             how = replace(how, weight_decay=0.0)
         start = theta if self.settings.start == "previous" else self.start
@@ -325,7 +325,7 @@ class InnerLoop:
         )
 
     def _epochs(self, images: int, sampling: Sampling | None) -> int:
-        """As many as ``outer.epochs`` and ``outer.least_steps`` ask for."""
+        """Compute the number of epochs from ``outer.epochs`` and ``outer.least_steps``."""
         if self.settings.start == "previous":
             return self.settings.epochs
         steps = math.ceil(images / self.training.batch_size) if sampling is None else sampling.steps

@@ -1,4 +1,4 @@
-"""The base of all outer loops (psi, costs, records, the Trainer), and the loop of rewards."""
+"""The base class of all outer loops (psi, costs, records, the Trainer), and the loop of methods with rewards."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ logger = logging.getLogger(__name__)
 
 
 class OuterLoop(pl.LightningModule):
-    """psi [objects, K], all factors of p_psi; one training step is one outer iteration of ``rounds``.
+    """psi [objects, K] with all factors of p_psi; one training step is one of ``rounds`` outer iterations.
 
-    ``inner`` draws an iteration's images and trains the detector on them, from ``theta`` where a training goes on from
-    the one before, under the random ``numbers``. A subclass's ``training_step`` ends with ``record`` and, after the
-    step of psi, appends to ``trajectory`` the method's result if it ended there. ``shown`` is what the target's boxes
-    showed, where they were read.
+    ``inner`` draws an iteration's images and trains the detector on them with the random ``numbers``; ``theta`` is
+    where a training continues if it follows the previous one. A subclass's ``training_step`` ends with ``record``;
+    after psi's step it appends the method's result, as if the loop ended here, to ``trajectory``. ``shown`` is what the
+    target's boxes showed, if they were read.
     """
 
     def __init__(
@@ -63,17 +63,17 @@ class OuterLoop(pl.LightningModule):
         return None
 
     def train_dataloader(self) -> range:
-        """Count the iterations that are left, which need no data."""
+        """Count the iterations that are left; they need no data."""
         return range(len(self.records), self.rounds)
 
     @property
     def ended(self) -> bool:
-        """Whether there is no iteration left."""
+        """Whether no iteration is left."""
         return len(self.records) == self.rounds
 
     @override
     def on_train_batch_end(self, *step: Any) -> None:
-        """Write the checkpoint and call ``on_record``, whose processor time is not counted as the method's."""
+        """Write the checkpoint and call ``on_record``; the processor time of both is not charged to the method."""
         begun = time.process_time()
         if self.checkpoint is not None:
             self.checkpoint.offer(self.state)
@@ -81,9 +81,9 @@ class OuterLoop(pl.LightningModule):
         self._cpu += time.process_time() - begun
 
     def state(self) -> dict[str, Any]:
-        """Return all that an iteration leaves to the next: psi, records, random numbers, the detector's parameters.
+        """Return everything that an iteration passes on: psi, records, random numbers, the detector's parameters.
 
-        What follows from the loop's inputs, such as its pool, is left out.
+        Whatever follows from the loop's inputs, such as its pool, is left out.
         """
         return {
             "psi": self.psi.data,
@@ -96,7 +96,7 @@ class OuterLoop(pl.LightningModule):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a ``state`` of a loop of the same inputs, which has not begun."""
+        """Continue from the ``state`` of a loop with the same inputs; this loop must not have begun."""
         self.psi.data = state["psi"]
         self.records, self.trajectory, self.shown = state["records"], state["trajectory"], state["shown"]
         self.theta = placed(state["theta"], self.inner.device)
@@ -109,11 +109,11 @@ class OuterLoop(pl.LightningModule):
         self.numbers = self.numbers.renewed()
 
     def train_on(self, psi: Float[Tensor, "objects K"], recording: Recording | None = None) -> Trained:
-        """Train on images of psi, at the iteration's cost."""
+        """Train on images at psi, and add the cost to the iteration's."""
         return self.charged(self.inner.train(psi, self.numbers, self.theta, recording))
 
     def charged(self, trained: Trained) -> Trained:
-        """Go on from a training, and add its cost to the iteration's."""
+        """Continue from a training, and add its cost to the iteration's."""
         self.theta = trained.theta
         self.charge(trained.cost)
         for phase, spent in trained.seconds.items():
@@ -125,7 +125,7 @@ class OuterLoop(pl.LightningModule):
         self._cost = self._cost + cost
 
     def timed(self, phase: str) -> AbstractContextManager[None]:
-        """Add the seconds spent inside to those of the iteration's phase."""
+        """Add the seconds spent inside to the phase's seconds in this iteration."""
         return timed(self._seconds, phase, self.inner.device)
 
     def record(
@@ -139,10 +139,10 @@ class OuterLoop(pl.LightningModule):
         """Record an iteration, before the step of psi.
 
         Args:
-            trained: its last training.
-            scores: of the classes, before the step.
-            outcome: of steps.
-            certificate: of its derivative.
+            trained: the iteration's last training.
+            scores: scores of the classes, before the step.
+            outcome: what happened to the previous steps.
+            certificate: certificate of the iteration's derivative.
             gradient: the derivative.
         """
         outcome = outcome or Outcome()
@@ -179,14 +179,14 @@ class OuterLoop(pl.LightningModule):
         return last
 
     def _lengths(self, values: Mapping[str, Tensor]) -> list[float]:
-        """Return the length of each object's value, in the order of the scene's objects."""
+        """Return the norm of each object's value, in the order of the scene's objects."""
         return [float(values[name].norm()) for name in self.scene.names] if values else []
 
 
 class RewardLoop(OuterLoop):
-    """The outer loop of methods that see only a reward: draw, train, reward; one training step is one round.
+    """The outer loop of methods that see only a reward: draw, train, reward. One training step is one round.
 
-    The reward is minus L_val, which varies where AP is still zero.
+    The reward is minus L_val, which still varies where AP is zero.
     """
 
     def __init__(
@@ -225,13 +225,13 @@ def learn_psi(
     on_record: Callable[[IterationRecord], object] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> LearnedPsi:
-    """Run the loop to its end by a Lightning Trainer that writes nothing.
+    """Run the loop to its end with a Lightning Trainer that writes nothing.
 
     Args:
         module: the loop, not yet run.
-        progress: whether to show a bar.
-        on_record: is called with the record of each iteration when it ends.
-        checkpoint: where the loop is taken up, and what it writes after each iteration.
+        progress: whether to show a progress bar.
+        on_record: called with the record of each iteration when it ends.
+        checkpoint: where to resume from, and what to write after each iteration.
     """
     if on_record is not None:
         module.on_record = on_record
@@ -240,13 +240,13 @@ def learn_psi(
     if state is not None:
         module.restore(state)
         logger.info(
-            "psi loop: goes on after round %d/%d of a run that was ended", len(module.records), module.rounds
+            "psi loop: resumes after round %d/%d of an interrupted run", len(module.records), module.rounds
         )
         for record in module.records:
             module.on_record(record)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         if not module.ended:
-            # psi and its records are a few numbers: they stay on the CPU wherever images and detector are.
+            # psi and its records are a few numbers: they stay on the CPU, wherever images and detector are.
             trainer_on(torch.device("cpu"), progress=progress).fit(module)
     return LearnedPsi(torch.stack(module.trajectory), module.records, shown=module.shown)

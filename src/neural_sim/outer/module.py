@@ -29,7 +29,7 @@ from neural_sim.solver.adjoint import AdjointSolver
 
 
 class SimulatorModule(GradientLoop):
-    """psi follows the hypergradient, with a certificate for every iteration."""
+    """The loop in which psi follows the hypergradient, with a certificate for every iteration."""
 
     def __init__(
         self,
@@ -71,11 +71,11 @@ class SimulatorModule(GradientLoop):
             len(trained.rendered),
             self.settings.adjoint,
         )
-        # Drawn whatever the adjoint, so that all later random numbers are the same.
+        # Drawn whatever the adjoint is, so that all later random numbers are the same.
         implicit = adjoint if isinstance(adjoint, Implicit) else Implicit()
         subset, own = curvature_rows(drawn, weights, implicit.curvature_images, self.numbers.generator)
         if isinstance(adjoint, Unrolled):
-            # The fraction of photographs is that of each step's batch, see Examples.drawn.
+            # Each step takes the fraction of photographs from its batch, see Examples.drawn.
             images = self._images(trained, torch.full((drawn,), 1.0 / drawn))
             return self._with_fixed(self._through_training(trained, objective, images, adjoint))
         device = self.inner.device
@@ -88,7 +88,7 @@ class SimulatorModule(GradientLoop):
         return self._with_fixed(self._at_stationary_point(trained, objective, images, problem))
 
     def _images(self, trained: Trained, weights: Float[Tensor, "n"]) -> dict[str, ObjectImages]:
-        """Select the images of each learned object; ``weights`` are those of all drawn images."""
+        """Select the images of each learned object; ``weights`` are the weights of all drawn images."""
         by_object = object_images(self.scene, trained.rendered, self.psi, weights)
         return {name: by_object[name] for name in self.objects.names}
 
@@ -144,7 +144,7 @@ class SimulatorModule(GradientLoop):
         return result
 
     def _with_fixed(self, result: Hypergradient) -> Hypergradient:
-        """Add zeros for objects whose psi is fixed, for which nothing was computed."""
+        """Add zeros for objects with fixed psi, for which nothing was computed."""
         zeros = {name: torch.zeros(self.psi.shape[1]) for name in self.scene.names}
         return replace(
             result,
@@ -154,7 +154,7 @@ class SimulatorModule(GradientLoop):
 
     @override
     def _prepare(self) -> None:
-        """Draw probes, or replace a fraction of them, so that the noise of a sample does not bias all iterations."""
+        """Draw probes, or replace a fraction of them, so that one sample's noise does not bias all iterations."""
         per_bin = self.estimator.probes_per_bin
         if not per_bin:
             return

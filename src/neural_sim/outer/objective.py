@@ -18,7 +18,7 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class Loss:
-    """``outer.objective``: the mean loss of the validation images, the paper's."""
+    """``outer.objective``: the mean loss of the validation images, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Objective:
 
     Attributes:
         cached: the validation images' features.
-        images: the same images' boxes.
-        score: what is lowered: their mean loss, or one minus the mean over classes of this smooth score, plus its
-            ``loss`` times that mean loss.
+        images: the boxes of the same images.
+        score: what is minimised: the images' mean loss; or one minus the mean over classes of this smooth score, plus
+            its ``loss`` times that mean loss.
     """
 
     cached: CachedSet
@@ -37,9 +37,9 @@ class Objective:
     score: SmoothAP | SmoothAccuracy | Loss
 
     def folds(self, count: int, generator: torch.Generator) -> list[Objective]:
-        """Divide L_val by disjoint random parts of the validation images, ``count`` or one for each image.
+        """Split L_val into disjoint random parts of the validation images, ``count`` of them or one for each image.
 
-        They have the same number of images of every class (that of an image's first box), give or take one.
+        The parts have the same number of images of every class (the class of an image's first box), give or take one.
         """
         shuffled = torch.randperm(len(self.images), generator=generator)
         ordered = shuffled[self.images.labels.cpu()[shuffled, 0].argsort(stable=True)]
@@ -48,7 +48,7 @@ class Objective:
         return [replace(self, cached=self.cached.select(r), images=self.images.select(r)) for r in rows]
 
     def terms(self) -> list[Term]:
-        """Return L_val as a sum of terms; a smooth score is one, because average precision ranks all images."""
+        """Return L_val as a sum of terms; a smooth score is one term, because average precision ranks all images."""
         if isinstance(self.score, Loss):
             return self.cached.mean_terms()
         return [lambda params: self.of_outputs(self.outputs(params))]
@@ -72,10 +72,10 @@ class Objective:
 
     @torch.no_grad()
     def scores(self, outputs: Outputs) -> Float[Tensor, "classes images"]:
-        """Compute each image's contribution to the score of every class, more is better; on the CPU.
+        """Compute each image's contribution to the score of every class, on the CPU; higher is better.
 
-        A class's score, the sum of its row, is minus its part of L_val (up to the constant one), with losses averaged
-        over the images with a box of the class; nan for a class without a box.
+        A class's score, the sum of its row, is minus its part of L_val (up to the constant one). Losses are averaged
+        over the images with a box of the class; a class without a box is nan.
         """
         labels = self.images.labels.cpu()
         losses = self.cached.detector.losses_of(outputs, self.cached.targets).cpu()

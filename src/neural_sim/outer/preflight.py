@@ -1,4 +1,4 @@
-"""What an optimisation would bring before any is made: steps of psi, to first order, and labelled photographs."""
+"""Predict, to first order, what an optimisation would gain from steps of psi and from labelled photographs."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ExpectedGains:
-    """The expected fall of L_val by one object and factor, to first order.
+    """The expected fall of L_val from moving one object's psi of one factor, to first order.
 
     Attributes:
         name: the object.
         factor: the factor of psi.
-        p_value: of the null that the derivative is zero.
+        p_value: p-value of the null hypothesis that the derivative is zero.
         moved: fraction of the object's images that moves to a bin.
-        by_bin: the fall when they move to each bin (or light), all others losing in proportion.
-        by_bin_error: its standard errors.
-        step: the fall by a step of the loop, along the derivative.
-        step_error: its standard error.
+        by_bin: fall of L_val when they move to each bin (or light) and all others lose in proportion.
+        by_bin_error: standard errors of ``by_bin``.
+        step: fall of L_val from a step of the loop along the derivative.
+        step_error: standard error of ``step``.
     """
 
     name: str
@@ -51,7 +51,7 @@ def expected_gains(loop: GradientLoop, trials: int, moved: float) -> list[Expect
     """Average the derivative at psi over ``trials`` trainings with new random numbers; psi does not move.
 
     Raises:
-        ValueError: no trial, or a fraction outside (0, 1].
+        ValueError: there is no trial, or the fraction is outside (0, 1].
     """
     if trials < 1 or not 0.0 < moved <= 1.0:
         raise ValueError(f"want trials >= 1 and moved in (0, 1], got {trials}, {moved}")
@@ -77,7 +77,7 @@ def gains_of(
     moved: float,
     region: TrustRegion,
 ) -> list[ExpectedGains]:
-    """Average derivatives at one psi, and step in ``region``; other arguments as for ``expected_gains``."""
+    """Average derivatives at one psi, and step within ``region``; for other arguments see ``expected_gains``."""
     parts, found = distribution.split(psi), []
     for factor in distribution.factors:
         own = parts[factor.name]
@@ -104,18 +104,18 @@ def gains_of(
 
 
 def _along(change: Tensor, direction: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first-order gain of a change of p, and its standard error, for independent errors of components."""
+    """Return the first-order gain of a change of p, and its standard error for independent component errors."""
     return (change * direction).sum(-1), (change.square() * variance).sum(-1).sqrt()
 
 
 @dataclass(frozen=True)
 class PhotographGain:
-    """How far L_val falls when photographs train with the images of the initial distribution.
+    """How far L_val falls when photographs train together with images of the initial distribution.
 
     Attributes:
-        photographs: their number.
-        fall: of L_val.
-        error: its standard error over trainings; None of one training.
+        photographs: number of photographs.
+        fall: fall of L_val.
+        error: its standard error over trainings; None for a single training.
     """
 
     photographs: int
@@ -128,11 +128,11 @@ def photograph_gains(
 ) -> list[PhotographGain]:
     """Train as the loop does at its psi, without photographs and with each of ``counts``; psi does not move.
 
-    Photographs are half of every batch, drawn again and again. The trainings of a trial have the same random numbers,
-    so that their differences are due to photographs alone. Counts above the number of photographs are that number.
+    Photographs are half of every batch, drawn repeatedly. The trainings of a trial share their random numbers, so that
+    their differences are due to the photographs alone. Counts above the number of photographs are reduced to it.
 
     Raises:
-        ValueError: no trial, or a count below 1.
+        ValueError: there is no trial, or a count is below 1.
     """
     if trials < 1 or min(counts, default=1) < 1:
         raise ValueError(f"want trials >= 1 and counts of at least 1, got {trials}, {list(counts)}")
@@ -162,7 +162,7 @@ def _gain(count: int, without: Sequence[float], with_them: Sequence[float]) -> P
 
 
 def equivalent(gains: Sequence[PhotographGain], fall: float) -> float | None:
-    """Return the number of photographs by which L_val falls this far, linear in between; None: more than were tried."""
+    """Return the number of photographs at which L_val falls this far, interpolated linearly; None: more than tried."""
     before = PhotographGain(0, 0.0, None)
     for gain in sorted(gains, key=lambda g: g.photographs):
         if gain.fall >= fall:

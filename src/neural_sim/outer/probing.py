@@ -1,4 +1,4 @@
-"""Probes: a stratified sample of images, a fixed number of every bin, of which each iteration replaces a fraction."""
+"""Probes: stratified samples of images with a fixed number in every bin; each iteration replaces a fraction."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class ProbeSet:
-    """A stratified sample: images of every bin of every factor of every object, with their features.
+    """Stratified samples: images of every bin of every factor of every object, with their features.
 
-    The bins of an illumination are its anchor lights.
+    The bins of an illumination factor are its anchor lights.
 
     Attributes:
-        probes: by object and by the factor's name, rows of ``cached``, bin after bin; empty for objects left out.
+        probes: rows of ``cached``, bin after bin, by object and factor name; empty for objects left out.
         cached: the images' features.
-        per_bin: images of every bin.
+        per_bin: number of images in every bin.
     """
 
     probes: list[dict[str, Probes]]
@@ -44,7 +44,7 @@ class ProbeSet:
         generator: torch.Generator,
         objects: Sequence[int],
     ) -> ProbeSet:
-        """Draw probes of some ``objects``; all factors but the stratified one are drawn from p_psi."""
+        """Draw probes of some ``objects``; all factors except the stratified one are drawn from p_psi."""
         probes: list[dict[str, Probes]] = [{} for _ in scene.names]
 
         def drawn() -> Iterator[LabelledImages]:
@@ -78,10 +78,10 @@ class ProbeSet:
         return ProbeSet(probes, CachedSet(detector, features, targets), state["per_bin"])
 
     def renewed(self, fresh: ProbeSet, turn: int) -> ProbeSet:
-        """Replace the next ``fresh.per_bin`` probes of every bin, cyclically by the iteration ``turn``.
+        """Replace the next ``fresh.per_bin`` probes of every bin, in a cycle that the iteration ``turn`` positions.
 
         Raises:
-            ValueError: for more fresh probes a bin than there are places.
+            ValueError: there are more fresh probes for a bin than places.
         """
         if fresh.per_bin > self.per_bin:
             raise ValueError(f"probes: got {fresh.per_bin} fresh ones a bin for {self.per_bin} places")

@@ -1,4 +1,4 @@
-"""What an iteration of the loop tells the reader of a screen: in words, with the time that is left."""
+"""The line that an iteration of the loop prints: what happened, in words, and the time left."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def iteration_line(records: Sequence[IterationRecord], iterations: int, seconds:
     """Describe the last iteration in one line: L_val, the verdict on the last steps, what moves next, and the time.
 
     Args:
-        records: all so far.
-        iterations: of the whole loop.
-        seconds: that the iteration took.
-        left: seconds that the others will take, about.
+        records: all records so far.
+        iterations: number of iterations of the whole loop.
+        seconds: duration of the iteration.
+        left: estimated seconds for the remaining iterations.
     """
     last = records[-1]
     start = f" ({records[0].validation_loss:.3f} at the start)" if len(records) > 1 else ""
@@ -38,7 +38,7 @@ def iteration_line(records: Sequence[IterationRecord], iterations: int, seconds:
 
 
 def _next_steps(certificate: Certificate) -> list[str]:
-    """Name the objects that move now, and count those that wait or show no significant derivative."""
+    """Name the objects that move now, and count those that wait or have no significant derivative."""
     if certificate.doubts:
         return [f"derivative not trusted: {', '.join(certificate.doubts)}"]
     actions = {name: set(by_factor.values()) for name, by_factor in certificate.actions.items()}

@@ -41,10 +41,10 @@ class Cost:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What trainings made of steps in an iteration.
+    """What an iteration's trainings decided about steps.
 
     Attributes:
-        verdicts: of the objects whose last step was accepted or rejected.
+        verdicts: verdicts on the objects whose last step was accepted or rejected.
         taken_back: at the end, the objects whose best psi was not their last one.
     """
 
@@ -56,14 +56,14 @@ class Outcome:
 class IterationRecord:
     """One outer iteration.
 
-    ``probabilities`` and ``entropies`` (nats), by factor and object, are of the distribution that the images were drawn
-    from, before the step. ``gradient_norms`` and ``gradient_errors`` are, by object, the length of dL_val/dpsi and that
+    ``probabilities`` and ``entropies`` (nats), by factor and object, describe the distribution from which the images
+    were drawn, before the step. ``gradient_norms`` and ``gradient_errors`` are, by object, the norms of dL_val/dpsi and
     of its standard errors; empty without a derivative. ``images`` counts labelled images, probes included,
-    ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase,
-    ``cpu_seconds`` the processor time over all cores, which other processes on the machine disturb less.
+    ``detector_steps`` optimiser steps and ``products`` Hessian products. ``seconds`` are wall-clock times by phase;
+    ``cpu_seconds``, the processor time over all cores, is disturbed less by other processes on the machine.
     ``certificate`` is None for methods without a hypergradient, and in an iteration that takes none. ``scores``
-    [classes] are those of the loop's objective, more is better. ``verdicts``
-    and ``taken_back`` are those of an ``Outcome``.
+    [classes] are the scores of the loop's objective; higher is better. For ``verdicts`` and ``taken_back`` see
+    ``Outcome``.
     """
 
     probabilities: dict[str, list[list[float]]]
@@ -114,12 +114,12 @@ def _certificate_of(stored: Mapping[str, Any]) -> Certificate:
 
 @dataclass(frozen=True)
 class LearnedPsi:
-    """The loop's result.
+    """The result of the loop.
 
-    ``trajectory`` has the method's psi before the first iteration and after each; a checked step is in it at once, and
-    undone an iteration later if it is rejected. The last one has every object's best psi on its way. ``before`` is the
-    cost before the first iteration: the warm start, whose backbone every loop uses, or the estimate of a method that
-    reads psi off the target, which is ``shown``.
+    ``trajectory`` has the method's psi before the first iteration and after each. A trust-region step enters it at once
+    and is undone an iteration later if it is rejected; the last entry has the best psi that every object has had.
+    ``before`` is the cost before the first iteration: the warm start, whose backbone every loop uses, or the estimate
+    of ``shown`` by a method that reads psi off the target.
     """
 
     trajectory: Float[Tensor, "psis objects K"]
@@ -128,12 +128,12 @@ class LearnedPsi:
     shown: tuple[FactorEstimate, ...] = ()
 
     def cost(self, iterations: int) -> Cost:
-        """Sum up the cost to the end of a number of iterations; zero for none, whose psi is given."""
+        """Sum up the cost up to the given number of iterations; zero for none, because psi is then given."""
         return sum(
             (cost_of(record) for record in self.records[:iterations]), self.before if iterations else Cost()
         )
 
     @property
     def last(self) -> Float[Tensor, "objects K"]:
-        """The method's result."""
+        """The method's final psi."""
         return self.trajectory[-1]

@@ -1,8 +1,8 @@
-"""The finite-difference response of training: what an object's score gains when images of it move to one bin.
+"""The finite-difference response of training: how an object's score changes when its images move to one bin.
 
-It takes no derivative. The training is repeated, with common random numbers, once for each bin of a factor. Each run
-moves all objects at once, each to another bin, and reads each object's response from its score. The response is the
-reference for hypergradients of the loop's training, and a method by itself (``baseline=response``), at the cost of one
+No derivative is taken. The training is repeated, with common random numbers, once for each bin of a factor. Each run
+moves all objects at once, each to a different bin, and measures each object's response by its score. The response is
+the reference for hypergradients of the loop's training, and a method of its own (``baseline=response``). It costs one
 training for each bin.
 """
 
@@ -27,9 +27,9 @@ from neural_sim.parameter.bins import is_closed
 from neural_sim.parameter.factor import Factor
 
 PART = 0.15
-"""Fraction of an object's images that move."""
+"""Fraction of an object's images that move to the bin."""
 SPACING = 3
-"""Bins between those that consecutive objects move to in one run, so that pairs of objects differ from run to run."""
+"""Distance between the bins of consecutive objects in one run, so that pairs of bins differ from run to run."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Response:
     """The finite-difference response of training.
 
     Attributes:
-        value: the gain of each object's score when a fraction of its images moves to each bin (or of its weights to
+        value: rise of each object's score when a fraction of its images moves to each bin (or of its weights to
             each light), divided by that fraction.
         trainings: number of trainings that were run.
-        cost: what they cost.
+        cost: their total cost.
     """
 
     value: Float[Tensor, "objects K"]
@@ -48,7 +48,7 @@ class Response:
     cost: Cost = field(default_factory=Cost)
 
     def slopes(self, inner: InnerLoop, psi: Float[Tensor, "objects K"]) -> Float[Tensor, "objects K"]:
-        """Compute the derivative by psi that the response implies, of L_val = minus the mean score over classes."""
+        """Compute the derivative by psi that the response implies, for L_val = minus the mean score over classes."""
         distribution, parts = inner.scene.distribution, {}
         values, at = distribution.split(self.value), distribution.split(psi)
         for factor in distribution.factors:
@@ -66,17 +66,17 @@ def response(
     theta: Parameters | None = None,
     part: float = PART,
 ) -> Response:
-    """Measure the response at ``psi``: by one training at psi and one for each bin of each factor.
+    """Measure the response at ``psi``, by one training at psi and one for each bin of each factor.
 
     Args:
         inner: the inner problem.
-        psi: where.
-        numbers: of the trainings, which have them in common.
-        theta: where each training goes on under ``outer.start=previous``.
+        psi: where the response is measured.
+        numbers: random numbers that the trainings share.
+        theta: where each training continues if ``outer.start=previous``.
         part: fraction of an object's images that move.
 
     Raises:
-        ValueError: a part that is not in (0, 1].
+        ValueError: ``part`` is not in (0, 1].
     """
     if not 0.0 < part <= 1.0:
         raise ValueError(f"response: part must lie in (0, 1], got {part}")
@@ -106,7 +106,7 @@ def agreement(
     """Compare derivatives at ``psi`` with the ``slopes`` of the response.
 
     Returns:
-        The cosine of centred derivatives by p, averaged over learned objects and factors; None where one vanishes.
+        The cosine of the centred derivatives by p, averaged over learned objects and factors; None if one vanishes.
     """
     distribution = objects.distribution
     truth = distribution.split(slopes)
@@ -121,9 +121,9 @@ def agreement(
 
 
 def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float:
-    """Cosine of two gradients after subtracting their means (a constant added to logits does not change softmax).
+    """Compute the cosine of two gradients after centring (adding a constant to logits does not change softmax).
 
-    Not a number where either vanishes.
+    The result is nan if either gradient vanishes.
     """
     left, right = (g.double() - g.double().mean() for g in (left, right))
     size = float(left.norm() * right.norm())
@@ -131,7 +131,7 @@ def centred_cosine(left: Float[Tensor, "k"], right: Float[Tensor, "k"]) -> float
 
 
 class ResponseLoop(GradientLoop):
-    """psi follows the response in the place of a derivative."""
+    """The loop in which psi follows the response instead of a derivative."""
 
     def __init__(
         self, inner: InnerLoop, psi: Float[Tensor, "objects K"], part: float, generator: torch.Generator
@@ -148,7 +148,7 @@ class ResponseLoop(GradientLoop):
         gradients = {
             name: slopes[i] if i in self.objects.labels else zero for i, name in enumerate(self.scene.names)
         }
-        # Its noise is not known; the training at the new psi decides on each step.
+        # Its noise is unknown; the training at the new psi decides on each step.
         return Hypergradient(gradients, dict.fromkeys(gradients, zero), None)
 
 

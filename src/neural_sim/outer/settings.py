@@ -28,38 +28,40 @@ class Outer:
     """The psi loop.
 
     Args:
-        iterations: outer iterations.
-        images_per_object: training images of each object in an iteration.
-        epochs: of an iteration's training.
-        learning_rate: of that training.
-        least_steps: of that training, which has more epochs where these would give fewer steps: the images of one or
-            two objects fill few batches, and so short a training says little about psi. Not of a training that goes on
-            from the iteration before.
-        loop_layers: last stages of the detector's backbone that this training changes, from the warm start's values;
-            the others are frozen. None: as many as the detector proposes (``Detector.in_loop``).
-        start: initial pyramid and head of that training: those of the iteration before (``previous``, the paper's), of
-            the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that goes on remembers
-            bins that psi has left, so that their loss stays low; an untrained one depends on the distribution alone.
-        train_first: train before the first hypergradient; otherwise that is taken at the warm start.
-        pool_per_bin: poses of every bin that are rendered once and then composited onto new backgrounds; 0: every image
-            is rendered anew, as it always is for the pathwise estimator, which replays exact draws.
+        iterations: number of outer iterations.
+        images_per_object: number of training images of each object in an iteration.
+        epochs: epochs of an iteration's training.
+        learning_rate: peak learning rate of that training.
+        least_steps: least optimiser steps of that training; its epochs are raised to reach them. The images of one or
+            two objects fill few batches, and such a short training says little about psi. Does not apply to a training
+            that continues the previous iteration's.
+        loop_layers: number of last stages of the detector's backbone that this training changes, starting from the warm
+            start's values; the others are frozen. None: as many as the detector proposes (``Detector.in_loop``).
+        start: initial pyramid and head of that training: those of the previous iteration (``previous``, the paper's),
+            of the warm start (``warm``), or untrained ones, always the same (``fresh``). A detector that continues
+            remembers bins that psi has left, so that their loss stays low; an untrained one depends on the distribution
+            alone.
+        train_first: train before the first hypergradient; otherwise it is taken at the warm start.
+        pool_per_bin: number of poses of every bin that are rendered once and then composited onto new backgrounds; 0:
+            every image is rendered anew, as is always the case for the pathwise estimator, which replays exact draws.
         refresh: fraction of the probes that an iteration replaces. The others keep their images, with the values that
             the other factors of p_psi had when they were drawn.
-        quality: of the loop's renders; None: the renderer's own, which the scored detectors always train on.
+        quality: quality of the loop's renders; None: the renderer's own, which the scored detectors always train on.
         learned: names of the objects whose psi a hypergradient moves; None: all that validation images show. The others
             get no probes and no second derivatives.
-        certify_every: iterations from one comparison of the hypergradient with the response of training at this psi
-            (``outer.response``, one training for each bin) to the next; 0: never.
-        first_step: what proposes the psi that is tried first: the first derivative, or what the target's boxes show.
-        steps: how psi follows its derivative: in a trust region, under common random numbers, and the last iteration
-            only trains, to accept or reject the last step; or freely.
-        adjoint: the hypergradient of the training that was run, or of a stationary point (the paper's Eq. 2).
-        objective: what of the validation images is lowered: one minus a smooth average precision, or a classifier's
+        certify_every: number of iterations between comparisons of the hypergradient with the finite-difference response
+            of training at the same psi (``outer.response``, one training for each bin); 0: never.
+        first_step: how the psi that is tried first is proposed: by the first derivative, or by what the target's boxes
+            show.
+        steps: how psi follows its derivative: freely, or in a trust region, under common random numbers, where the last
+            iteration only trains, to accept or reject the last step.
+        adjoint: the hypergradient of the training that was run, or that at a stationary point (the paper's Eq. 2).
+        objective: what is minimised on the validation images: one minus a smooth average precision, or a classifier's
             smooth accuracy, or their loss (the paper's).
         trust: conditions on the hypergradient.
 
     Raises:
-        UserError: a combination that cannot be.
+        UserError: the combination of settings is impossible.
     """
 
     iterations: PositiveInt = 10

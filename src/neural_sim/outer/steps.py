@@ -1,4 +1,4 @@
-"""Steps of psi: what every kind has, and free gradient steps. Those of a trust region: ``outer.trust_region``."""
+"""Steps of psi: the common protocol, and free gradient steps. For trust-region steps see ``outer.trust_region``."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from neural_sim.parameter.update import Mirror, Update, UpdateState
 from neural_sim.ranges import PositiveFraction, validated
 
 PValues = Mapping[str, Mapping[str, float]]
-"""By object and factor."""
+"""P-values by object and factor."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether an object's step was accepted, by a training at the new psi; a rejected one is taken back.
+    """Whether a training at the new psi accepted an object's step; a rejected step is taken back.
 
     ``expected_gain`` is the fall of L_val that the hypergradient predicts to first order, ``measured_gain`` the rise of
-    the object's score, ``error`` the standard error of that rise, over validation images and trainings.
+    the object's score, ``error`` the standard error of that rise over validation images and trainings.
     """
 
     accepted: bool
@@ -38,13 +38,13 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A psi of all objects that no derivative proposes.
+    """A psi of all objects that is proposed without a derivative.
 
     Attributes:
-        psi: that is proposed; the present one of an object that should stay.
-        p_values: by object, of the null that the present psi is the right one.
-        images: that were composed for it.
-        shown: what it was read off.
+        psi: the proposed psi; for an object that should stay, its present one.
+        p_values: by object, of the null hypothesis that the present psi is right.
+        images: number of images that were composed for it.
+        shown: the estimate of what the target's boxes show, from which psi follows.
     """
 
     psi: Float[Tensor, "objects K"]
@@ -63,14 +63,14 @@ class LearnedObjects:
 
 
 class Steps(Protocol):
-    """Where psi [objects, K] of the learned objects stands, and what is known for its next step.
+    """Present psi [objects, K] of the learned objects, and what is known for the next step.
 
-    Immutable: ``judge``, ``observe`` and ``propose``, called in this order, return what comes after.
+    Immutable: ``judge``, ``observe`` and ``propose``, called in this order, each return a new state.
     """
 
     @property
     def reported(self) -> Float[Tensor, "objects K"]:
-        """Psi of the loop's result if it ends now."""
+        """The loop's result, as psi, if it ends now."""
         ...
 
     @property
@@ -80,7 +80,7 @@ class Steps(Protocol):
 
     @property
     def waiting(self) -> Collection[tuple[str, str]]:
-        """Objects and factors that the last step did not move, whatever the certificate allowed."""
+        """Pairs of object and factor that the last step did not move, although the certificate allowed it."""
         ...
 
     def judge(
@@ -88,14 +88,14 @@ class Steps(Protocol):
     ) -> tuple[Self, dict[str, Verdict]]:
         """Accept or reject the pending step by trainings before and after it.
 
-        The scores are each validation image's contributions to the score of each class, more is better.
+        Scores are each validation image's contributions to the score of each class; higher is better.
         """
         ...
 
     def observe(self, result: Hypergradient) -> tuple[Self, PValues]:
         """Add a derivative at ``reported``.
 
-        The p-values are those of the null that the derivative which steps follow is zero.
+        The p-values test the null hypothesis that the derivative which steps follow is zero.
         """
         ...
 
@@ -107,12 +107,12 @@ class Steps(Protocol):
 @validated
 @dataclass(frozen=True)
 class FreeSteps:
-    """``outer.steps``: gradient steps, none of which is rejected.
+    """``outer.steps``: gradient steps that are never rejected.
 
     Args:
-        update: the optimiser of logits of bins.
-        light_update: the optimiser of weights of lights, which are then projected on their constraint.
-        final_step: steps shorten linearly over the iterations to this fraction (Robbins and Monro 1951).
+        update: optimiser of the bins' logits.
+        light_update: optimiser of the weights of lights, which are then projected onto their constraint.
+        final_step: fraction to which steps shorten linearly over the iterations (Robbins and Monro 1951).
     """
 
     trainings: ClassVar[int] = 1
@@ -125,7 +125,7 @@ class FreeSteps:
     def begin(
         self, objects: LearnedObjects, psi: Float[Tensor, "objects K"], iterations: int
     ) -> GradientSteps:
-        """Stand at ``psi`` before the first of ``iterations`` steps."""
+        """Start at ``psi``, before the first of ``iterations`` steps."""
         psi = psi.detach().clone()
         states = {name: UpdateState.zeros(part) for name, part in objects.distribution.split(psi).items()}
         nothing = torch.zeros_like(psi)
@@ -134,17 +134,17 @@ class FreeSteps:
 
 @dataclass(frozen=True)
 class GradientSteps:
-    """Where psi stands on its way by free steps.
+    """State of psi under free steps.
 
     Attributes:
-        settings: of the steps.
+        settings: settings of the steps.
         objects: the learned objects.
-        iterations: over which steps shorten.
+        iterations: number of iterations over which steps shorten.
         reported: psi.
         updates: states of the optimisers, by factor.
-        gradient: the derivative that was observed last.
+        gradient: the derivative observed last.
         error: its standard errors.
-        taken: number of steps.
+        taken: number of steps taken.
     """
 
     settings: FreeSteps
@@ -158,18 +158,18 @@ class GradientSteps:
 
     @property
     def pending(self) -> bool:
-        """False: nothing judges a step."""
+        """False: no step is judged."""
         return False
 
     @property
     def waiting(self) -> Collection[tuple[str, str]]:
-        """No object waits."""
+        """Empty: no object waits."""
         return ()
 
     def judge(
         self, before: Float[Tensor, "classes images"], after: Float[Tensor, "classes images"]
     ) -> tuple[GradientSteps, dict[str, Verdict]]:
-        """Reject nothing."""
+        """Accept every step."""
         return self, {}
 
     def observe(self, result: Hypergradient) -> tuple[GradientSteps, PValues]:
@@ -180,7 +180,7 @@ class GradientSteps:
     def propose(self, certificate: Certificate, shrink: float) -> GradientSteps:
         """Take the optimisers' steps; see ``Steps``.
 
-        An insignificant derivative enters the momentum nevertheless: the average of several may be significant.
+        An insignificant derivative still enters the momentum: the average of several may be significant.
         """
         length = 1.0 + self.taken / max(1, self.iterations - 1) * (self.settings.final_step - 1.0)
         if certificate.void:
@@ -198,7 +198,7 @@ class GradientSteps:
         return replace(self, reported=reported, updates=updates, taken=self.taken + 1)
 
     def _step(self, factor: Factor, psi: Tensor, slope: Tensor, noise: Tensor) -> tuple[Tensor, UpdateState]:
-        """Step by one factor in logits of bins, or in weights of lights, which are projected on their constraint."""
+        """Step along one factor: in logits for bins, in weights for lights, projected onto their constraint."""
         update: Update = getattr(self.settings, factor.update)
         state = self.updates[factor.name]
         moved, state = update.step(psi, factor.log_slopes(psi), slope, noise, state)
@@ -206,7 +206,7 @@ class GradientSteps:
 
 
 def fractions(certificate: Certificate, names: Sequence[str], factor: str, shrink: float) -> list[float]:
-    """Return the fraction that is taken of each object's step by a factor; ``shrink`` is that of a shrunk step."""
+    """Return the fraction of each object's step by a factor that is taken; ``shrink`` applies to shrunk steps."""
     taken = {"kept": 1.0, "shrunk": shrink, "skipped": 0.0, "stopped": 0.0}
     return [taken[certificate.actions[name][factor]] for name in names]
 
@@ -217,14 +217,14 @@ def slopes_by_p(
     gradient: Float[Tensor, "objects k"],
     error: Float[Tensor, "objects k"],
 ) -> tuple[Float[Tensor, "objects k"], Float[Tensor, "objects k"]]:
-    """Convert the derivative of L_val by psi to that of minus L_val by a factor's p, centred.
+    """Convert the derivative of L_val by psi to the derivative of minus L_val by a factor's p, centred.
 
-    By logits it is p - floor times that by p, and would hardly move a bin of small p. ``error`` are the standard errors
-    of ``gradient``; the second result has the variances of the first.
+    The derivative by logits is (p - floor) times the one by p, and would hardly move a bin of small p. ``error`` has
+    the standard errors of ``gradient``; the second result has the variances of the first.
     """
     scale = (
         factor.log_slopes(psi).exp().clamp_min(torch.finfo(psi.dtype).tiny)
-    )  # 0 in closed bins, as their slope is
+    )  # 0 in closed bins, where the slope is 0
     direction = -gradient / scale
     return direction - direction.mean(-1, keepdim=True), (error / scale).square()
 

@@ -1,17 +1,18 @@
 """Trust-region steps of psi, accepted or rejected by a training at the new psi.
 
-The training has the random numbers of the training at the old psi, whose derivative was taken (the same initial
-parameters, batches, backgrounds and noise of the draws), so that the difference of the two measures the effect of the
-step with little noise. A step is accepted if its derivative and this difference together are significant, because
-either alone often is not, and if the score did not fall beyond its error. The radius grows after a step that raised the
-object's score beyond the error and shrinks after one that lowered it beyond the error or was rejected (Conn, Gould and
-Toint 2000, Chapter 6, with the reduction measured object by object); in the last case less: the noise of a training
-does not shrink with the step, so that a much shorter one would be judged by chance even more.
+This training uses the random numbers of the training at the old psi, whose derivative was taken (the same initial
+parameters, batches, backgrounds and noise of the draws), so that the difference between the two measures the effect of
+the step with little noise. A step is accepted if its derivative and this difference are significant together, because
+either alone often is not, and if the score did not fall by more than its error. The radius grows after a step that
+raised the object's score by more than the error, and shrinks after one that lowered it by more than the error or was
+rejected (Conn, Gould and Toint 2000, Chapter 6, with the reduction measured object by object). It shrinks less in the
+last case: the noise of a training does not shrink with the step, so that chance would decide even more about a much
+shorter step.
 
-A step goes to the p nearest to p + t direction whose distance from p is the radius: bins that are as good as each other
-gain as much as each other. (Along logits, a bin gains in proportion to its p, and what is likely already takes nearly
-all.) A bin keeps a fraction of its p: the score is concave in the number of a bin's images, so that the derivative,
-which is linear, says little about having none of them.
+A step goes to the p nearest to p + t direction at the distance of the radius from p, where bins of equal value gain
+equally. (Along logits, a bin gains in proportion to its p, and likely bins take nearly everything.) A bin keeps a
+fraction of its p: the score is concave in the number of a bin's images, so that the derivative, which is linear, says
+little about having none.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ from neural_sim.outer.steps import LearnedObjects, Proposal, PValues, Verdict, f
 from neural_sim.parameter.factor import Factor
 from neural_sim.ranges import Fraction, NonNegative, Positive, PositiveInt, validated
 
-SMALLEST = 1e-15  # p-value, whose normal quantile is -8
+SMALLEST = 1e-15  # smallest p-value, with normal quantile -8
 HALVINGS = 50
-# Of p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart.
+# Largest t in p + t direction, whose largest component is 1: bins that differ by a thousandth are told apart.
 FARTHEST = 1e3
 
 ByFactor = Mapping[str, Float[Tensor, "objects"]]
@@ -48,29 +49,29 @@ class TrustRegion:
     """``outer.steps``: trust-region steps, which another training accepts or rejects.
 
     Args:
-        trainings: of the first iteration, whose derivatives are averaged; two tell how much trainings scatter. After
-            one, the test knows the scatter of images alone.
-        folds: disjoint parts of the validation images; each derivative is that of L_val on one of them, so that the
-            scatter between derivatives has that of the validation images in it.
+        trainings: number of trainings in the first iteration, whose derivatives are averaged. Two show how much
+            trainings scatter; after one, the test only knows the scatter over images.
+        folds: number of disjoint parts of the validation images. Each derivative is of L_val on one of them, so that
+            the scatter between derivatives includes the choice of validation images.
         radius: initial trust radius of each object and factor, in total variation (lights: half the absolute change of
             the weights).
         largest: upper bound of the radius.
-        smallest: an object whose radius is smaller does not move.
-        keep: fraction of its p that a step leaves each bin; 0: no bound. The score is concave in a bin's images.
+        smallest: an object with a smaller radius does not move.
+        keep: fraction of its p that a step leaves to each bin; 0: no bound. The score is concave in a bin's images.
         level: significance level at which a step is accepted, by its derivative and its measured gain together.
-        errors: standard errors by which an object's score must rise for its radius to grow, and fall for it to shrink
-            by the whole factor.
-        waits_below: an object does not move by a factor whose expected gain is below this fraction of the iteration's
-            largest one: it waits until the large steps are done. Its own derivative is of a training with the others'
-            present mistakes in it, and another once they have moved.
-        take_back: whether, at the end, every object goes back to its best psi on the way, by the mean of all trainings
-            that saw each (``outer.way``); else the last one is the result.
-        grow: factor of the radius after an accepted step that raised the score.
-        shrink: factor after one that lowered it; its square root after another rejected step.
-        momentum: factor of a derivative's weight in the average for every later move of its object.
+        errors: number of standard errors by which an object's score must rise for its radius to grow, and fall for it
+            to shrink by the whole factor.
+        waits_below: an object does not move by a factor if its expected gain is below this fraction of the iteration's
+            largest one: it waits until the large steps are done. Its derivative belongs to a training with the other
+            objects' present errors, and changes once they have moved.
+        take_back: whether at the end every object goes back to the best psi that it has had, by the mean of all
+            trainings that saw each (``outer.way``); otherwise the last psi is the result.
+        grow: factor on the radius after an accepted step that raised the score.
+        shrink: factor on the radius after a step that lowered the score; its square root after another rejected step.
+        momentum: factor on a derivative's weight in the average for every later move of its object.
 
     Raises:
-        UserError: a radius that is not between its bounds.
+        UserError: the radius is not between its bounds.
     """
 
     trainings: PositiveInt = 2
@@ -96,7 +97,7 @@ class TrustRegion:
     def begin(
         self, objects: LearnedObjects, psi: Float[Tensor, "objects K"], iterations: int
     ) -> TrustRegionSteps:
-        """Stand at ``psi`` before the first iteration, whatever the number of ``iterations``."""
+        """Start at ``psi`` before the first iteration, whatever the number of ``iterations``."""
         psi, parts = psi.detach().clone(), objects.distribution.split(psi)
         averages = {name: Average.zeros(part, self.momentum) for name, part in parts.items()}
         nothing = torch.zeros_like(psi[:, 0])
@@ -116,23 +117,23 @@ class TrustRegion:
 
 @dataclass(frozen=True)
 class TrustRegionSteps:
-    """Where psi stands, and the evidence for its next step; see ``outer.steps.Steps``.
+    """Present psi, and the evidence for the next step; see ``outer.steps.Steps``.
 
     Attributes:
-        settings: of the steps.
+        settings: settings of the steps.
         objects: the learned objects.
         accepted: psi without the pending step.
-        trial: psi with it.
+        trial: psi with the pending step.
         radius: trust radii, by factor.
-        averages: the derivatives that steps have followed, by factor.
-        observed: these and the derivatives since the last step.
+        averages: the averaged derivatives that steps have followed, by factor.
+        observed: these averages with the derivatives since the last step added.
         moved: whether the pending step moved an object, by factor.
-        expected: its expected gain.
-        significance: that of the derivatives by which the pending step moved an object, or of the proposal that did, in
-            standard deviations.
-        at_rest: for each judgment, the mean square of what objects that did not move gained or lost beyond the errors
-            of images: the variance of trainings.
-        offered: objects that the pending step moved to a proposal; their radii are those of steps, and stay.
+        expected: expected gain of the pending step.
+        significance: significance, in standard deviations, of the derivatives or the proposal by which the pending step
+            moved an object.
+        at_rest: for each judgement, the variance between trainings: the mean square of what objects that did not move
+            gained or lost, less the error over images.
+        offered: objects that the pending step moved to a proposal; their radii are meant for steps, and stay.
     """
 
     settings: TrustRegion
@@ -160,7 +161,7 @@ class TrustRegionSteps:
 
     @property
     def waiting(self) -> set[tuple[str, str]]:
-        """Objects and factors whose radius is too small, or whose gain is small compared with the largest one."""
+        """Pairs of object and factor with too small a radius, or a small gain compared with the largest one."""
         return {
             (name, factor)
             for factor, moved in self.moved.items()
@@ -175,7 +176,7 @@ class TrustRegionSteps:
         return moved if self.offered is None else moved | self.offered
 
     def offer(self, proposal: Proposal) -> TrustRegionSteps:
-        """Try a psi that no derivative proposes, before any is known."""
+        """Try a proposed psi before any derivative is known."""
         labels = list(self.objects.labels)
         psi, p_values = (values[labels].double() for values in (proposal.psi, proposal.p_values))
         return replace(
@@ -191,16 +192,17 @@ class TrustRegionSteps:
     ) -> tuple[TrustRegionSteps, dict[str, Verdict]]:
         """Accept or reject the pending step of each object; see ``outer.steps.Steps``.
 
-        A step is accepted if its derivative and the measured gain together are significant at ``level``, by the sum of
-        their normal quantiles over the root of 2 (Stouffer et al. 1949), and the score did not fall beyond ``errors``:
-        a derivative may differ from zero with certainty and yet promise next to nothing. The gain's error is that of
-        the images' paired differences and of trainings, which the scores of objects that did not move show. Where the
-        mean over all classes fell by more than its own error, though all steps would be accepted, all are rejected.
+        A step is accepted if its derivative and the measured gain are significant together at ``level``, by the sum of
+        their normal quantiles divided by the root of 2 (Stouffer et al. 1949), and if the score did not fall by more
+        than ``errors``: a derivative may differ from zero with certainty and yet promise next to nothing. The gain's
+        error combines the images' paired differences with the scatter between trainings, which the scores of objects
+        that did not move show. If all steps would be accepted but the mean over all classes fell by more than its own
+        error, all are rejected.
         """
         settings, labels, pending = self.settings, torch.tensor(self.objects.labels), self._pending
         change = after.double() - before.double()
         gains, images = change.sum(1), _errors_of_sums(change)
-        # Before at_rest is added to: what this step costs others is not scatter of trainings.
+        # Computed before at_rest is extended: the harm that this step does to others is not scatter between trainings.
         total_error = (
             _errors_of_sums(change.nansum(0)).square() + len(gains) * _between_trainings(self.at_rest)
         ).sqrt()
@@ -265,7 +267,7 @@ class TrustRegionSteps:
         return replace(self, observed=observed), p_values
 
     def propose(self, certificate: Certificate, shrink: float) -> TrustRegionSteps:
-        """Go along the averages by the radii; see ``outer.steps.Steps``."""
+        """Step along the averages by the radii; see ``outer.steps.Steps``."""
         if certificate.void:
             nothing = torch.zeros_like(self.expected)
             return replace(self, observed=self.averages, trial=self.accepted, expected=nothing)
@@ -305,11 +307,11 @@ def step_within(
 ) -> Float[Tensor, "objects k"]:
     """Move p along ``direction`` until half its absolute change (for bins, the total variation) reaches ``radius``.
 
-    It goes as far as it can within ``FARTHEST`` if each bin keeps the fraction ``keep`` of its p. The length is found
-    by bisection.
+    Each bin keeps the fraction ``keep`` of its p, and the move stops at ``FARTHEST``. The length is found by
+    bisection.
 
     Returns:
-        Psi of the p that is reached.
+        The psi of the p that is reached.
     """
     before = factor.p_of(psi)
     size = direction.abs().amax(1, keepdim=True)
@@ -333,7 +335,7 @@ def step_within(
 def _between_trainings(at_rest: tuple[float, ...]) -> float:
     """Return the variance of a gain between trainings.
 
-    It is the median judgment's, because after large steps objects at rest really gain by the better images of others.
+    It is the median over judgements, because large steps make other objects at rest really gain by better images.
     """
     return max(median(at_rest), 0.0) if at_rest else 0.0
 
@@ -343,7 +345,7 @@ def _significance(
 ) -> Float[Tensor, "objects"]:
     """Return the significance of the derivatives by the factors that move, in standard deviations.
 
-    Of several factors, the most significant one counts, its p-value times their number (Bonferroni).
+    If several factors move, the most significant one counts, with its p-value times their number (Bonferroni).
     """
     moves = torch.stack([*moved.values()])
     p_values = torch.stack([averages[name].p_values for name in moved])
@@ -352,11 +354,11 @@ def _significance(
 
 
 def _quantile(p: Float[Tensor, "*n"] | float) -> Float[Tensor, "*n"]:
-    """Return what a standard normal variable exceeds with probability p."""
+    """Return the value that a standard normal variable exceeds with probability p."""
     return -torch.special.ndtri(torch.as_tensor(p, dtype=torch.float64))
 
 
 def _errors_of_sums(change: Float[Tensor, "*n images"]) -> Float[Tensor, "*n"]:
-    """Return standard errors of sums over images; 0 for one image, whose scatter is not known."""
+    """Return standard errors of sums over images; 0 for a single image, whose scatter is unknown."""
     images = change.shape[-1]
     return images**0.5 * change.std(-1) if images > 1 else torch.zeros_like(change[..., 0])

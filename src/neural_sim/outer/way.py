@@ -1,14 +1,14 @@
-"""The psi that an object had on its way, and which of them a loop returns.
+"""The sequence of psi that an object has had, and which of them a loop returns.
 
-Trainings scatter, and a step is judged by one pair of them: a small loss is accepted, and one that shows only over
-later trainings is never seen. At the end every psi that was accepted is therefore scored again, by all the trainings
-that saw it. The largest of several noisy means is too often one that was lucky; so the values m_v of an object's psi
-are fitted to the scores y_t of its trainings in such a way that neighbours on the way are worth about the same:
+Trainings scatter, and a step is judged by a single pair of them: a small loss may be accepted, and a loss that shows
+only over later trainings is never seen. At the end, every accepted psi is therefore scored again by all the trainings
+that saw it. The largest of several noisy means is too often a lucky one; so the values m_v of an object's psi are
+fitted to the scores y_t of its trainings under the assumption that neighbours on the way are worth about the same:
 
     minimise over m    sum_t (y_t - m_v(t))^2 + w sum_v f(m_v - m_(v-1)),    f(x) = c^2 log(1 + x^2 / c^2)
 
-It is the most probable m where scores have normal errors of standard deviation s between trainings, and steps change
-them by about s / sqrt(w), a few by much more (Student's t). c is three times s.
+This m is the most probable one if scores have normal errors with standard deviation s between trainings, and steps
+change them by about s / sqrt(w), a few by much more (Student's t). c is three times s.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 WEIGHT = 4.0
-"""w, for steps that mostly change a score by half of what it scatters by. On simulated ways (tests/outer/test_way.py)
+"""w, for steps that mostly change a score by half of its scatter. On simulated ways (tests/outer/test_way.py)
 1 takes too many good steps back and 8 too few bad ones."""
 LARGE = 3.0
-"""c in units of s: what a step changes a score by, beyond which neighbours on the way are not held together."""
+"""c in units of s: a larger change of score between neighbours is not held back."""
 REPETITIONS = 50
 
 
@@ -35,8 +35,8 @@ class Stay:
     """One psi on an object's way.
 
     Attributes:
-        psi: that the object had.
-        scores: of the object in every training that saw this psi, more is better.
+        psi: the object's psi.
+        scores: the object's score in every training that saw this psi; higher is better.
     """
 
     psi: Float[Tensor, "K"]
@@ -45,12 +45,12 @@ class Stay:
 
 @dataclass(frozen=True)
 class TakenBack:
-    """An object that goes back on its way at the end.
+    """An object that goes back to an earlier psi at the end.
 
     Attributes:
         kept: number of its accepted steps that are kept; 0: it goes back to the start.
-        accepted: number of all of them.
-        gain: by how much the psi that is returned is estimated to score above the last one.
+        accepted: number of all its accepted steps.
+        gain: estimated gain in score of the returned psi over the last one.
     """
 
     kept: int
@@ -60,17 +60,17 @@ class TakenBack:
 
 @dataclass(frozen=True)
 class Way:
-    """What every learned object was worth on its way, ``stays`` by name."""
+    """Every psi that each learned object has had, with its scores; ``stays`` by name."""
 
     stays: Mapping[str, tuple[Stay, ...]]
 
     @staticmethod
     def begin(names: Sequence[str], psi: Float[Tensor, "objects K"]) -> Way:
-        """Stand at ``psi`` before the first training."""
+        """Start at ``psi``, before the first training."""
         return Way({name: (Stay(row.clone()),) for name, row in zip(names, psi, strict=True)})
 
     def moved(self, name: str, psi: Float[Tensor, "K"]) -> Way:
-        """Let an object go to another psi."""
+        """Add another psi, to which an object has moved."""
         return self._with(name, (*self.stays[name], Stay(psi.clone())))
 
     def seen(self, name: str, score: float) -> Way:
@@ -83,7 +83,7 @@ class Way:
 
     @property
     def variance(self) -> float | None:
-        """Variance of a score between trainings at one psi, pooled over objects; None if nothing was trained twice."""
+        """Variance of a score between trainings at one psi, pooled over objects; None if no psi was trained twice."""
         squares, freedom = 0.0, 0
         for scores in (stay.scores for stays in self.stays.values() for stay in stays):
             if len(scores) > 1 and all(map(math.isfinite, scores)):
@@ -96,7 +96,7 @@ class Way:
     def best(self) -> dict[str, tuple[Stay, TakenBack]]:
         """Return the objects whose best psi is not their last one, and what is taken back.
 
-        Nothing is where no psi was trained on twice: how far trainings scatter is then not known.
+        The result is empty if no psi was trained on twice: the scatter of trainings is then unknown.
         """
         found, variance = {}, self.variance
         for name, stays in self.stays.items():
@@ -113,15 +113,15 @@ class Way:
 def fitted_scores(
     scores: Sequence[Sequence[float]], variance: float, weight: float = WEIGHT
 ) -> Float[Tensor, "stays"]:
-    """Estimate what each psi of an object's way is worth, by least squares with weights that follow the solution.
+    """Estimate the worth of each psi on an object's way, by iteratively reweighted least squares.
 
     Args:
-        scores: of the trainings that saw each psi; of every psi at least one.
-        variance: s^2, of a score between trainings.
-        weight: w; how many trainings count as much as a neighbour on the way.
+        scores: scores of the trainings that saw each psi; at least one for every psi.
+        variance: s^2, the variance of a score between trainings.
+        weight: w, the number of trainings that a neighbour on the way is worth.
 
     Raises:
-        ValueError: a psi without a score.
+        ValueError: some psi has no score.
     """
     if not scores or not all(scores):
         raise ValueError(f"fitted_scores: want a score of every psi, got {scores}")
