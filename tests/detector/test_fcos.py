@@ -212,9 +212,9 @@ def test_strides_that_the_backbone_has_not_are_refused():
 
 def test_labels_and_boxes_that_cannot_be_are_refused():
     detector, box = make_fcos(1), torch.tensor([[[1.0, 1, 5, 5]]])
-    with pytest.raises(ValueError, match="labels want to be below 1, got 1"):
+    with pytest.raises(ValueError, match="want labels below 1, got 1"):
         detector.assign(box, torch.tensor([[1]]))
-    with pytest.raises(ValueError, match="boxes want x0 < x1"):
+    with pytest.raises(ValueError, match="want boxes with x0 < x1"):
         detector.assign(box.flip(-1), torch.tensor([[0]]))
 
 

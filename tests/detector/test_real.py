@@ -45,7 +45,7 @@ def test_too_few_photographs_are_refused(tools, photographs):
 
 def test_fewer_photographs_than_asked_for_are_all_taken_where_that_is_allowed(tools, caplog):
     taken = Real("combined", count=5, fewer="all").chosen(tools.images(4), 0)
-    assert len(taken) == 4 and "4 photographs in the place of 5" in caplog.text
+    assert len(taken) == 4 and "4 photographs instead of 5" in caplog.text
     with pytest.raises(ValueError, match="want 5 photographs or more"):
         Real("combined", count=5, fewer="all").chosen(None, 0)
 

@@ -178,5 +178,5 @@ def test_bad_settings_are_named(tools, changes, message):
 def test_wrong_image_size_is_refused(tools, generator):
     detector = tools.detector()
     backbone, _ = detector.split(detector.init(generator))
-    with pytest.raises(ValueError, match="images want shape"):
+    with pytest.raises(ValueError, match="want images of shape"):
         detector.features(backbone, torch.zeros(1, 3, 40, 40))

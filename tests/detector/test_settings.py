@@ -18,7 +18,7 @@ from neural_sim.detector.trajectory import Recording
 THREE = {"strides": (8, 16, 32)}
 CASES = [
     (Backbone, {"architecture": "vgg"}, "Backbone.architecture: want one of micro, tiny, resnet18, resnet50"),
-    (Backbone, {"freeze": True}, "Backbone.weights: want some with freeze=true"),
+    (Backbone, {"freeze": True}, "Backbone.weights: want weights with freeze=true"),
     (Head, {"channels": 12}, "Head.channels: want at least 8 and a multiple of 8, got 12"),
     (Head, {"convs": 5}, "Head.convs: want at least 1 and at most 4, got 5"),
     (Head, {"normalisation": "batch"}, "Head.normalisation: want one of group, none"),

@@ -25,7 +25,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def group_norm(channels: int) -> nn.GroupNorm:
-    """Normalise in groups of 8 channels, without the batch, so that an image's loss depends on no other image."""
+    """Normalise in groups of 8 channels, independently of the batch: an image's loss depends on no other image."""
     return nn.GroupNorm(max(1, channels // 8), channels)
 
 
@@ -39,7 +39,7 @@ def set_activation(module: nn.Module, activation: str) -> None:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions added to their input; width and size stay."""
+    """Two convolutions added to their input; width and size do not change."""
 
     def __init__(self, channels: int, activation: str) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class ResidualBlock(nn.Module):
 
 @dataclass(frozen=True)
 class Plan:
-    """Shape of a strided backbone: output channels of its four stages, and which end in a residual block."""
+    """Shape of a strided backbone: output channels of its four stages, and which of them end in a residual block."""
 
     widths: tuple[int, int, int, int]
     residual: tuple[bool, bool, bool, bool]
@@ -73,7 +73,7 @@ PLANS = {
 
 
 class Stages(nn.Module):
-    """Modules one after the other, of which some end a stage; the backbone's maps are those of ``strides``.
+    """A sequence of modules, some of which end a stage; the maps at ``strides`` are the backbone's output.
 
     ``children`` are under the attribute ``under``, which is part of their parameters' names; ``ends`` gives the strides
     of those that end a stage, from fine to coarse. ``channels`` are the maps' widths by stride.
@@ -101,12 +101,12 @@ class Stages(nn.Module):
         return tuple(maps[stride] for stride in self.strides)
 
     def divided(self, layers: int) -> tuple[Stages, LastStages]:
-        """Divide the backbone in two, the second with the last ``layers`` stages.
+        """Divide the backbone into two parts, the second with the last ``layers`` stages.
 
-        Both share its parameters, each those that it needs, under their own names.
+        The parts share the backbone's parameters: each has those that it needs, under their own names.
 
         Raises:
-            ValueError: not at least 1 stage, or not fewer than there are.
+            ValueError: ``layers`` is below 1, or not below the number of stages.
         """
         if not 0 < layers < len(self._ends):
             raise ValueError(
@@ -131,9 +131,9 @@ class Stages(nn.Module):
 
 
 class LastStages(nn.Module):
-    """The last stages of a backbone, which turn the maps of the first stages into all maps; parameters ``backbone.*``.
+    """The last stages of a backbone, which compute all maps from those of the first stages; parameters ``backbone.*``.
 
-    The last of the given maps is continued; the first ``kept`` are among the backbone's maps as they are.
+    They continue the last of the given maps; the first ``kept`` maps are passed on unchanged.
     """
 
     def __init__(self, stages: Stages, kept: int) -> None:
@@ -146,7 +146,7 @@ class LastStages(nn.Module):
 
 
 def strided_backbone(plan: Plan, strides: tuple[int, ...], activation: str) -> Stages:
-    """Build four convolutions of stride 2; maps at strides 8 and 16 may be asked for."""
+    """Build four convolutions of stride 2; maps at strides 8 and 16 are available."""
     stages: dict[str, nn.Module] = {}
     before = 3
     for number, (after, residual) in enumerate(zip(plan.widths, plan.residual, strict=True)):
@@ -168,8 +168,8 @@ def resnet_backbone(
 ) -> Stages:
     """Build a torchvision ResNet without its classifier.
 
-    With weights its batch normalisation is frozen; without, group normalisation stands in its place, because
-    a frozen normalisation that has seen no data normalises nothing.
+    With weights, its batch normalisation is frozen. Without weights, group normalisation replaces it, because a frozen
+    normalisation that has seen no data normalises nothing.
     """
     builder = {"resnet18": resnet.resnet18, "resnet50": resnet.resnet50}[architecture]
     body = builder(norm_layer=group_norm if weights is None else FrozenBatchNorm2d)
@@ -187,18 +187,18 @@ def resnet_backbone(
 def load_weights(architecture: str, weights: str) -> dict[str, Tensor]:
     """Load the state dictionary of a torchvision ResNet, without the classifier and counters.
 
-    ``weights`` is the path of a file holding such a state dictionary, else one of torchvision's weight names
+    ``weights`` is the path of a file with such a state dictionary, or the name of torchvision weights
     (``DEFAULT``, ``IMAGENET1K_V1``, ...), which torchvision downloads or takes from its cache.
 
     Raises:
-        ValueError: where neither a file nor a weight name is meant, or the file holds no state dictionary or one that
+        ValueError: ``weights`` is neither a file nor a weight name, or the file has no state dictionary or one that
             does not fit.
     """
     if Path(weights).is_file():
         try:
             state = torch.load(weights, map_location="cpu", weights_only=True)
         except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-            raise ValueError(f"detector.backbone.weights: {weights} is no file of torch.save") from error
+            raise ValueError(f"detector.backbone.weights: {weights} is not a torch.save file") from error
         if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
             raise ValueError(f"detector.backbone.weights: {weights} holds no state dictionary")
     else:
@@ -225,7 +225,7 @@ def build_backbone(
     """Build a backbone by name, with ``channels`` (stride -> width) and a tuple of maps as output.
 
     Raises:
-        ValueError: for weights that do not exist or do not fit.
+        ValueError: the weights do not exist or do not fit.
     """
     if architecture in PLANS:
         if weights is not None:

@@ -1,4 +1,4 @@
-"""A labelled set under a frozen backbone, whose features are computed once for all losses, products and scores."""
+"""A labelled set passed through a frozen backbone; its features are computed once for all losses and scores."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cached_features(
     They are computed batch by batch on the backbone's device, without a graph.
 
     Raises:
-        ValueError: for an empty set, such as a target set of no images, whose mean loss does not exist.
+        ValueError: the set is empty, such as a target set without images, and so has no mean loss.
     """
     if len(images) == 0:
         raise ValueError("cached_features: got no images, want at least one")
@@ -34,12 +34,12 @@ def cached_features(
 
 @dataclass(frozen=True)
 class CachedSet:
-    """The inputs of the predictor's loss on n images, under a frozen backbone.
+    """The inputs of the predictor's loss on n images, computed by a frozen backbone.
 
     Attributes:
         detector: the detector.
         features: one tensor [n, ...] for each level.
-        targets: those of the images' anchors.
+        targets: the targets of the images' anchors.
     """
 
     detector: Detector
@@ -64,12 +64,12 @@ class CachedSet:
     def streamed(
         detector: Detector, backbone: Parameters, sets: Iterable[LabelledImages], batch_size: int = 64
     ) -> CachedSet:
-        """Do as ``of`` with all images in one set, in the same batches.
+        """Compute the result of ``of`` on all images joined, in the same batches.
 
-        No more images are in memory than one of ``sets`` and a batch.
+        Only one of ``sets`` and a batch are in memory at a time.
 
         Raises:
-            ValueError: no set.
+            ValueError: there is no set.
         """
         parts: list[CachedSet] = []
         waiting: list[LabelledImages] = []
@@ -85,7 +85,7 @@ class CachedSet:
 
     @staticmethod
     def concatenate(parts: Sequence[CachedSet]) -> CachedSet:
-        """Join the images of all ``parts``, which are of one detector and size."""
+        """Join the images of all ``parts``, which must come from one detector and have one size."""
         targets = Targets(
             torch.cat([part.targets.labels for part in parts]),
             torch.cat([part.targets.deltas for part in parts]),
@@ -108,18 +108,18 @@ class CachedSet:
 
     @property
     def inputs(self) -> tuple[Tensor, ...]:
-        """Inputs of the losses that move with images and boxes: features by level, encoded boxes [n, anchors, 4]."""
+        """Inputs of the losses that depend on images and boxes: features by level, encoded boxes [n, anchors, 4]."""
         return (*self.features, self.targets.deltas)
 
     def losses_from(
         self, params: Parameters, inputs: tuple[Tensor, ...], index: Tensor
     ) -> Float[Tensor, "n"]:
-        """Compute losses of the images ``index`` from given rows of ``inputs``, differentiable in these."""
+        """Compute losses of the images ``index`` from given rows of ``inputs``, differentiable in these rows."""
         targets = Targets(self.targets.labels[index], inputs[-1])
         return self.detector.per_image_loss(params, inputs[:-1], targets)
 
     def select(self, index: Tensor) -> CachedSet:
-        """Return the set of the images ``index``."""
+        """Return the subset of the images ``index``."""
         index = index.to(self.device)
         features = tuple(level[index] for level in self.features)
         return CachedSet(self.detector, features, self.targets.select(index))

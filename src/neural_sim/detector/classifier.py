@@ -1,7 +1,7 @@
 """A classifier: a backbone, global average pooling, one linear layer.
 
-It is a detector of one anchor, the whole image, whose box nobody learns: its loss is the cross-entropy of the image's
-class, and its one detection is the best class, with its softmax probability as the score.
+It is a detector with one anchor, the whole image, whose box is not learned: its loss is the cross-entropy of the
+image's class, and its one detection is the best class, with its softmax probability as the score.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neural_sim.ranges import NonNegative, validated
 
 @validated
 class Classifier(BackboneDetector):
-    """A classifier of images of one size that show one object each.
+    """A classifier of images of one size, each of which shows one object.
 
     An image without an object (label -1) has no loss.
 
@@ -50,26 +50,26 @@ class Classifier(BackboneDetector):
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
         """Average the backbone's last map over the image, [n, c].
 
-        In the psi loop, which trains the last stages, return the map before them.
+        In the psi loop, which trains the last stages, return the map before these stages.
 
         Raises:
-            ValueError: where the images are not of the classifier's size.
+            ValueError: the images do not have the classifier's size.
         """
         (maps,) = super().features(backbone, images)
         return (maps.mean((2, 3)) if self._last is None else maps,)
 
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
-        """Return logits [n, 1, classes], and for the box a code of zeros [n, 1, 4], which says nothing."""
+        """Return logits [n, 1, classes], and zeros [n, 1, 4] in place of a box code."""
         predictor, (values,) = self.completed(trainable, features)
         pooled = values if self._last is None else values.mean((2, 3))
         logits = functional_call(self._predictor, predictor, (pooled,), strict=True)[:, None]
         return logits, logits.new_zeros((*logits.shape[:2], 4))
 
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Return the class of each image's boxes, ``IGNORED`` without one.
+        """Return the class of each image's boxes; ``IGNORED`` for an image without a box.
 
         Raises:
-            ValueError: where a label is not below ``num_classes``, or an image shows objects of two classes.
+            ValueError: a label is not below ``num_classes``, or an image shows objects of two classes.
         """
         self.check_labels(labels)
         own = class_of(labels)
@@ -77,7 +77,7 @@ class Classifier(BackboneDetector):
         return Targets(classes, boxes.new_zeros((len(classes), 1, 4)))
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Compute the cross-entropy of each image's class, 0 for an image without one."""
+        """Compute the cross-entropy of each image's class; 0 for an image without one."""
         logits, labels = outputs[0][:, 0], targets.labels
         wanted = logits.gather(1, labels.clamp(min=0))[:, 0]
         return (logits.logsumexp(1) - wanted) * (labels[:, 0] >= 0)
@@ -98,10 +98,10 @@ class Classifier(BackboneDetector):
 
 
 def class_of(labels: Int[Tensor, "n boxes"]) -> Int[Tensor, "n"]:
-    """Return the class of each image, -1 for an image without a box.
+    """Return the class of each image; -1 for an image without a box.
 
     Raises:
-        ValueError: an image with boxes of two classes.
+        ValueError: an image has boxes of two classes.
     """
     if labels.shape[1] == 0:
         return labels.new_full((len(labels),), -1)

@@ -1,4 +1,4 @@
-"""FCOS (Tian et al. 2019): every place of every level is a point that predicts its distances to the sides of a box."""
+"""FCOS (Tian et al. 2019): at every place of every level, a point predicts its distances to the sides of a box."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from neural_sim.ranges import NonNegative, PositiveInt, validated
 
 
 class FcosHead(nn.Module):
-    """torchvision's two branches.
+    """torchvision's head with two branches.
 
-    The code has the distances to the left, upper, right and lower side of the box in strides, and the centre-ness
-    logit. Softplus keeps distances positive: torchvision's ReLU, which ``activation`` relu keeps, has no curvature, and
-    no gradient at negative values.
+    The code holds the distances, in strides, to the left, upper, right and lower side of the box, and the centre-ness
+    logit. Softplus keeps the distances positive: torchvision's ReLU, which is kept if ``activation`` is relu, has no
+    curvature, and no gradient at negative values.
     """
 
     def __init__(self, settings: Head, num_classes: int, activation: str) -> None:
@@ -45,8 +45,8 @@ class FcosHead(nn.Module):
         )
         self.regression_head = FCOSRegressionHead(settings.channels, 1, settings.convs, norm_layer=norm)
         if settings.normalisation == "group":
-            # A shift that all channels of a group have in common is subtracted. Its gradient is a rounding error, by
-            # which AdamW divides, and which the derivative through a training would magnify.
+            # Normalisation subtracts any shift that all channels of a group share. Its gradient is a rounding error:
+            # AdamW divides by it, and the derivative through a training would magnify it.
             for branch in (self.classification_head, self.regression_head):
                 for layer in branch.conv:
                     if isinstance(layer, nn.Conv2d):
@@ -69,9 +69,9 @@ class Fcos(PyramidDetector):
 
     Args:
         points: which points should find which object.
-        focal_alpha, focal_gamma: of the focal loss (Lin et al. 2017, Eq. 5).
+        focal_alpha, focal_gamma: parameters of the focal loss (Lin et al. 2017, Eq. 5).
 
-    See ``PyramidDetector`` for the others, which it checks.
+    See ``PyramidDetector`` for the other arguments, which it checks.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Fcos(PyramidDetector):
             FcosHead(head, num_classes, activation), detections, activation, proximal,
         )  # fmt: skip
         self._focal, self._radius = (focal_alpha, focal_gamma), points.radius
-        # torchvision's points are the centres of anchors of a stride's size.
+        # torchvision's points are the centres of anchors as large as a stride.
         squares = Anchors(points.strides, [[stride] for stride in points.strides], None)
         cells, self.anchors_per_level = fixed_anchors(squares, self.image_size)
         self.points, self.strides = 0.5 * (cells[:, :2] + cells[:, 2:]), cells[:, 2] - cells[:, 0]
@@ -102,7 +102,7 @@ class Fcos(PyramidDetector):
         """Assign a target to every point, see ``losses.assign_points``.
 
         Raises:
-            ValueError: where a label is not below ``num_classes``, or a box has no area.
+            ValueError: a label is not below ``num_classes``, or a box has no area.
         """
         self.check_labels(labels)
         points, strides, ranges = (part.to(boxes) for part in (self.points, self.strides, self.ranges))
@@ -111,7 +111,7 @@ class Fcos(PyramidDetector):
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
         """Add up the focal, box and centre-ness losses of each image.
 
-        The box loss is that of the generalised intersection over union (Rezatofighi et al. 2019). Each is a sum over
+        The box loss uses the generalised intersection over union (Rezatofighi et al. 2019). Each loss is a sum over
         points divided by the number of foreground points.
         """
         (logits, code), labels = outputs, targets.labels
@@ -121,7 +121,7 @@ class Fcos(PyramidDetector):
         distances = targets.deltas.to(code.dtype)
         apart = 1.0 - generalised_iou(code[..., :4], distances)
         centred = centreness(distances)
-        # Cross-entropy of a logit, by softplus, which has derivatives of every order in both modes.
+        # Cross-entropy of a logit, written with softplus, which has derivatives of every order in both modes.
         off_centre = F.softplus(code[..., 4]) - centred * code[..., 4]
         return (focal + (apart + off_centre) * foreground).sum(-1) / foreground.sum(-1).clamp(min=1)
 
@@ -145,7 +145,7 @@ class Fcos(PyramidDetector):
 
 
 def generalised_iou(ours: Float[Tensor, "*n 4"], theirs: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
-    """Compute it for boxes about a common point, from its distances to their sides; ``theirs`` have an area."""
+    """Compute it for boxes around a shared point, from its distances to their sides; ``theirs`` have an area."""
     least, most = torch.minimum(ours, theirs), torch.maximum(ours, theirs)
     inside, hull, area, other = (_area(part) for part in (least, most, ours, theirs))
     union = area + other - inside

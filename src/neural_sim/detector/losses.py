@@ -1,6 +1,6 @@
 """Targets of anchors and points, and the losses of their predictions.
 
-Losses are elementwise and smooth, so that their Hessians say what a finite step sees.
+Losses are elementwise and smooth, so that their Hessians predict the effect of a finite step.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ IGNORED = -2
 
 @dataclass(frozen=True)
 class Targets:
-    """The class and the box that each anchor should predict; the anchors of an anchor-free detector are its points.
+    """The class and the box that each anchor should predict; an anchor-free detector's anchors are its points.
 
-    ``labels`` is the class index of the anchor's box, ``BACKGROUND`` or ``IGNORED`` (overlap between the two
-    thresholds). ``deltas`` is the box in the detector's code (of an anchor: centre shift in anchor sizes, log size
-    ratio; of a point: distances to the sides in strides), any finite value where there is none; it carries gradients
+    ``labels`` is the class index of the anchor's box, ``BACKGROUND``, or ``IGNORED`` (overlap between the two
+    thresholds). ``deltas`` is the box in the detector's code (for an anchor: centre shift in anchor sizes and log size
+    ratio; for a point: distances to the sides in strides), or any finite value if there is no box. It carries gradients
     with respect to the boxes.
     """
 
@@ -47,14 +47,14 @@ def assign_anchors(
     foreground_iou: float,
     background_iou: float,
 ) -> Targets:
-    """Match anchors to boxes as torchvision's ``Matcher`` with low-quality matches does, without its loop.
+    """Match anchors to boxes like torchvision's ``Matcher`` with low-quality matches, without its loop.
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding. An anchor takes the box it overlaps
-    most when that overlap reaches ``foreground_iou``, or when no anchor overlaps that box more; it is ignored
-    between the thresholds.
+    most if that overlap reaches ``foreground_iou``, or if no anchor overlaps that box more; it is ignored
+    if its overlap is between the thresholds.
 
     Raises:
-        ValueError: where a box that is no padding has no area.
+        ValueError: a box that is not padding has no area.
     """
     present = _present(boxes, labels)
     images, count = labels.shape
@@ -66,14 +66,14 @@ def assign_anchors(
         overlap = torch.where(present[..., None], overlap, -1.0)
         best, match = overlap.max(dim=1)
         most = overlap.amax(dim=2, keepdim=True)
-        # A box that no anchor touches would otherwise be claimed by every anchor at overlap 0.
+        # Without the second condition, a box that no anchor touches would be claimed by every anchor, at overlap 0.
         rescued = ((overlap == most) & (most > 0)).any(dim=1)
         foreground = (best >= foreground_iou) | rescued
         ignored = (best >= background_iou) & ~foreground
     anchor_labels = torch.where(foreground, labels.gather(1, match), BACKGROUND)
     anchor_labels = torch.where(ignored, IGNORED, anchor_labels)
     matched = boxes.gather(1, match[..., None].expand(-1, -1, 4))
-    # Background anchors are given themselves: padding rows have no logarithm, and zero times NaN is NaN.
+    # Background anchors get themselves as boxes: padding rows have no logarithm, and zero times NaN is NaN.
     matched = torch.where(foreground[..., None], matched, anchors)
     tiled = anchors.expand(images, -1, 4).reshape(-1, 4)
     deltas = encode_boxes(matched.reshape(-1, 4), tiled, boxes.new_ones(4)).view(images, -1, 4)
@@ -88,15 +88,15 @@ def assign_points(
     labels: Int[Tensor, "images boxes"],
     radius: float,
 ) -> Targets:
-    """Match points to boxes as torchvision's FCOS does.
+    """Match points to boxes like torchvision's FCOS.
 
-    A point takes the smallest box that it is inside of, whose centre is within ``radius`` strides of it along both
+    A point takes the smallest box around it whose centre is within ``radius`` strides of the point along both
     axes, and whose farthest side is at a distance within the point's range (low, high), in pixels.
 
     Boxes are (x0, y0, x1, y1) in pixels; rows with label -1 are padding.
 
     Raises:
-        ValueError: where a box that is no padding has no area.
+        ValueError: a box that is not padding has no area.
     """
     present = _present(boxes, labels)
     images, count = labels.shape
@@ -122,25 +122,25 @@ def assign_points(
 
 
 def _present(boxes: Tensor, labels: Tensor) -> Tensor:
-    """Find the rows that are no padding.
+    """Find the rows that are not padding.
 
     Raises:
-        ValueError: such a row without an area.
+        ValueError: such a row has no area.
     """
     present = labels >= 0
     empty = present & (boxes[..., 2:] - boxes[..., :2] <= 0).any(-1)
     if bool(empty.any()):
-        raise ValueError(f"assign: boxes want x0 < x1 and y0 < y1, got {boxes[empty][0].tolist()}")
+        raise ValueError(f"assign: want boxes with x0 < x1 and y0 < y1, got {boxes[empty][0].tolist()}")
     return present
 
 
 def focal_loss(
     logits: Float[Tensor, "*shape"], targets: Float[Tensor, "*shape"], alpha: float, gamma: float
 ) -> Float[Tensor, "*shape"]:
-    """Sigmoid focal loss per element (Lin et al. 2017, Eq. 5); ``targets`` are 0 or 1.
+    """Compute the sigmoid focal loss of each element (Lin et al. 2017, Eq. 5); ``targets`` are 0 or 1.
 
-    Written with softplus instead of binary_cross_entropy_with_logits: it is stable for large logits and has
-    derivatives of every order in forward and reverse mode.
+    It is written with softplus instead of binary_cross_entropy_with_logits: stable for large logits, with derivatives
+    of every order in forward and reverse mode.
     """
     sign = 2 * targets - 1
     cross_entropy = F.softplus(-sign * logits)
@@ -150,7 +150,7 @@ def focal_loss(
 
 
 def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Float[Tensor, "*shape"]:
-    """Loss of an encoded box coordinate's error, per element.
+    """Compute the loss of each element's error in an encoded box coordinate.
 
     ``pseudo_huber`` is delta (sqrt(1 + (r / delta)^2) - 1): quadratic within ``delta``, slope 1 far out like
     ``l1``, smooth everywhere. ``l1`` is torchvision's default and has no curvature.
@@ -158,13 +158,13 @@ def box_loss(residual: Float[Tensor, "*shape"], kind: str, delta: float) -> Floa
     if kind == "l1":
         return residual.abs()
     square = (residual / delta) ** 2
-    # sqrt(1 + square) - 1, without the difference that cancels every digit of a small residual.
+    # sqrt(1 + square) - 1, without the subtraction, which would cancel every digit of a small residual.
     return delta * square / (torch.sqrt(1 + square) + 1)
 
 
 def proximal_loss(
     params: Mapping[str, Tensor], anchor: Mapping[str, Tensor], proximal: float
 ) -> Float[Tensor, ""]:
-    """``proximal / 2 |params - anchor|^2`` over the names of ``params``; no derivative by the anchor."""
+    """Compute ``proximal / 2 |params - anchor|^2`` over the names in ``params``; not differentiated by the anchor."""
     squares = [(value - anchor[name].detach()).square().sum() for name, value in params.items()]
     return 0.5 * proximal * torch.stack(squares).sum()

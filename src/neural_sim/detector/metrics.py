@@ -18,11 +18,11 @@ from neural_sim.types import LabelledImages
 
 @dataclass(frozen=True)
 class AveragePrecision:
-    """Average precision; a class without a box is nan and stays out of the means.
+    """Average precision; a class without a box is nan and is left out of the means.
 
     Attributes:
-        ap: the mean over overlaps 0.50 to 0.95 and classes.
-        ap50: the mean over classes at an overlap of 0.50.
+        ap: mean over overlaps from 0.50 to 0.95 and over classes.
+        ap50: mean over classes at an overlap of 0.50.
         per_class: ``ap`` by class name.
         per_class_ap50: ``ap50`` by class name.
     """
@@ -40,10 +40,10 @@ class AveragePrecision:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Top-1 accuracy; a class without an image is nan and stays out of the mean.
+    """Top-1 accuracy; a class without an image is nan and is left out of the mean.
 
     Attributes:
-        accuracy: the mean over classes of the fraction of a class's images whose best class is right.
+        accuracy: mean over classes of the fraction of a class's images whose best class is right.
         per_class: that fraction by class name.
     """
 
@@ -58,11 +58,11 @@ class Accuracy:
 
 TestScore = AveragePrecision | Accuracy
 IN_FULL: dict[Score, str] = {"AP": "AP (0.50 to 0.95)", "accuracy": "Top-1 accuracy"}
-"""The names of scores in tables."""
+"""Names of the scores in tables."""
 
 
 def of_document(document: Mapping[str, Any]) -> TestScore:
-    """Return the score whose fields a document has, such as those that results.json or the store keeps."""
+    """Return the score that a document, such as one of results.json or the store, holds; its fields tell the kind."""
     return AveragePrecision(**document) if "ap" in document else Accuracy(**document)
 
 
@@ -77,11 +77,11 @@ def evaluate(
     class_names: Sequence[str],
     score: Score = "AP",
 ) -> TestScore:
-    """Score ``predictions`` (one dictionary an image, as ``Detector.predict`` gives).
+    """Score ``predictions``, one dictionary for each image, as from ``Detector.predict``.
 
     Raises:
-        ValueError: where there are no images, predictions and images differ in number, a label has no name, or an image
-            whose accuracy is asked for has objects of two classes.
+        ValueError: there are no images, predictions and images differ in number, a label has no name, or accuracy is
+            wanted of an image with objects of two classes.
     """
     if len(images) == 0:
         raise ValueError("evaluate: got no images, want at least one")
@@ -110,7 +110,7 @@ def evaluate(
 
 
 def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> str | None:
-    """Say in one line why a score tells nothing and what to do; None where it does."""
+    """Say in one line why a score is meaningless and what to do; None if it is not."""
     known = [value for value in score.per_class.values() if value == value]
     if not known:
         return "no class has a box in these images, so that nothing is scored: want labels of the classes"
@@ -124,7 +124,7 @@ def worthless(score: TestScore, predictions: Sequence[Mapping[str, Tensor]]) -> 
 
 
 def best_classes(predictions: Sequence[Mapping[str, Tensor]]) -> Int[Tensor, "images"]:
-    """Return the class of each image's best prediction, -1 without one."""
+    """Return the class of each image's best prediction; -1 without one."""
     best = [p["labels"][p["scores"].argmax()] if len(p["scores"]) else -1 for p in predictions]
     return torch.tensor([int(label) for label in best])
 

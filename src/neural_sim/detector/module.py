@@ -28,9 +28,9 @@ class Optimisation:
 
     Args:
         epochs, batch_size: the budget of steps.
-        learning_rate: the peak of the schedule; 0: parameters stay as they are.
+        learning_rate: peak of the schedule; 0: parameters do not change.
         weight_decay: decoupled weight decay of convolution weights (not of biases and normalisations).
-        warmup_fraction: part of the steps over which the learning rate rises.
+        warmup_fraction: fraction of the steps over which the learning rate rises.
     """
 
     epochs: PositiveInt
@@ -47,14 +47,14 @@ class DetectorModule(pl.LightningModule):
     else the features of the frozen backbone (one tensor for each level).
 
     Args:
-        learned: parameters that are trained; copied.
-        fixed: all others; never written to.
+        learned: the parameters that are trained; they are copied.
+        fixed: all other parameters; never written to.
         total_steps: optimiser steps until the learning rate reaches zero.
-        anchor: of the detector's proximal term, which is left out without it; holds the learned names.
-        recording: what is recorded of the steps, for ``trajectory``.
+        anchor: anchor of the detector's proximal term, for all learned names; without it the term is left out.
+        recording: which part of the steps ``trajectory`` records.
 
     Raises:
-        ValueError: for a recording that does not fit its memory.
+        ValueError: the recording does not fit its memory limit.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class DetectorModule(pl.LightningModule):
         return {name: value.detach().clone() for name, value in zip(self._names, self._values, strict=True)}
 
     def trajectory(self, rows: Sequence[Tensor]) -> Trajectory:
-        """Return the steps done, on batches of these ``rows``.
+        """Return the steps done so far; their batches had these ``rows``.
 
         Raises:
-            ValueError: where nothing was to be recorded.
+            ValueError: nothing was recorded.
         """
         if self._recorder is None:
             raise ValueError("DetectorModule: want a recording for a trajectory, got None")
@@ -114,7 +114,7 @@ class DetectorModule(pl.LightningModule):
 
     @override
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        # Lightning's own version refuses frozen dataclasses.
+        # Lightning's own method refuses frozen dataclasses.
         inputs, targets = batch
         moved = Targets(targets.labels.to(device), targets.deltas.to(device))
         return tuple(x.to(device) for x in inputs), moved
@@ -145,7 +145,7 @@ class DetectorModule(pl.LightningModule):
 
     @override
     def on_train_end(self) -> None:
-        # One transfer to the host for all losses: one in each epoch would stall the device.
+        # One transfer to the host for all losses: a transfer each epoch would stall the device.
         losses = torch.stack(self._losses).cpu().double().split(self._epochs)
         sizes = torch.tensor(self._sizes, dtype=torch.float64).split(self._epochs)
         pairs = zip(losses, sizes, strict=True)

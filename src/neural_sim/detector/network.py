@@ -1,6 +1,6 @@
-"""The network's shape, from torchvision's parts, and its random initial values.
+"""The network's shape, built from torchvision's parts, and its random initial values.
 
-The values always come in from outside. They are drawn by an explicit generator; torch's module constructors know only
+The values are always passed in. They are drawn with an explicit generator; torch's module constructors know only
 the global one.
 """
 
@@ -38,15 +38,14 @@ class NormalisedBackbone(nn.Module):
 
 
 def _channels(values: Sequence[float], like: Tensor) -> Float[Tensor, "3 1 1"]:
-    """Return a number for each channel, created on the device of ``like`` without a copy."""
+    """Return one number for each channel, created on the device of ``like`` without a copy."""
     return torch.cat([like.new_full((1, 1, 1), value) for value in values])
 
 
 class CoarserLevels(ExtraFPNBlock):
     """Levels past the backbone's last map C5 (Lin et al. 2017, Sec. 4).
 
-    P6 is a convolution of stride 2 on C5, P7 one on the activated P6, and so on. A level is never smaller than one
-    pixel.
+    P6 is a convolution of stride 2 on C5, P7 one on the activated P6, and so on. No level is smaller than one pixel.
     """
 
     def __init__(self, in_channels: int, channels: int, count: int, activation: str) -> None:
@@ -68,7 +67,7 @@ class CoarserLevels(ExtraFPNBlock):
 
 
 class Predictor(nn.Module):
-    """The feature pyramid and the head shared by its levels; parameters ``fpn.*`` and ``head.*``."""
+    """The feature pyramid, and the head that its levels share; parameters ``fpn.*`` and ``head.*``."""
 
     def __init__(self, fpn: FeaturePyramidNetwork, head: nn.Module) -> None:
         super().__init__()
@@ -85,7 +84,7 @@ class Predictor(nn.Module):
 def build_predictor(
     in_channels: list[int], levels: int, head: nn.Module, settings: Head, activation: str
 ) -> Predictor:
-    """Build the pyramid of ``levels``, those past the last of ``in_channels`` included, and the head."""
+    """Build the pyramid of ``levels``, including those past the last of ``in_channels``, and the head."""
     channels, norm = settings.channels, group_norm if settings.normalisation == "group" else None
     coarser = levels - len(in_channels)
     extra = CoarserLevels(in_channels[-1], channels, coarser, activation) if coarser else None
@@ -98,11 +97,11 @@ def build_predictor(
 def fixed_anchors(
     settings: Anchors, image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "anchors 4"], list[int]]:
-    """Return anchors of all levels in pixels, and how many each level has; the image size is fixed, so they are too."""
+    """Return the anchors of all levels in pixels, and each level's number; a fixed image size fixes them, too."""
     scale = 1.0 if settings.reference is None else min(image_size) / settings.reference
     sizes = tuple(tuple(scale * size for size in level) for level in settings.sizes)
     generator, strides = AnchorGenerator(sizes, (tuple(settings.ratios),) * len(sizes)), settings.strides
-    # A strided convolution of padding 1 leaves ceil(size / 2) pixels, so at least one.
+    # A strided convolution with padding 1 leaves ceil(size / 2) pixels, hence at least one.
     grids = [[-(-side // stride) for side in image_size] for stride in strides]
     steps = [[torch.tensor(stride), torch.tensor(stride)] for stride in strides]
     levels = generator.grid_anchors(grids, steps)
@@ -114,9 +113,9 @@ def initialise(
 ) -> dict[str, Tensor]:
     """Draw a state dictionary of ``module``: He-normal convolutions, unit normalisations, zero biases.
 
-    Convolutions with a bias start at standard deviation 0.01 in a predictor's ``head``, and the bias of its layer
-    ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1); others keep the variance of their
-    input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017).
+    In a predictor's ``head``, convolutions with a bias start at standard deviation 0.01, and the bias of the layer
+    ``cls_logits`` makes it predict ``prior_probability`` (Lin et al. 2017, Sec. 4.1). Other convolutions preserve the
+    variance of their input, as torchvision's do. A linear layer starts at standard deviation 0.01 (Goyal et al. 2017).
     """
     state = {name: value.detach().clone() for name, value in module.state_dict().items()}
     for name, part in module.named_modules():

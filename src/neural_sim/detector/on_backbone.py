@@ -1,8 +1,8 @@
-"""The common part of detectors on a backbone: initial values, which of them are trained, features of images.
+"""What detectors on a backbone share: initial values, which of them are trained, features of images.
 
-The modules here are only the network's shape. Their values always come in as an argument, so that training losses can
-be differentiated any number of times. Most detectors have torchvision's feature pyramid on the backbone, and a head
-that all its levels have in common.
+The modules here are only the network's shape. Their values are always passed in as an argument, so that training losses
+can be differentiated any number of times. Most detectors put torchvision's feature pyramid on the backbone, and one
+head on all its levels.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ ImageSize = PositiveInt | tuple[PositiveInt, PositiveInt]
 
 @validated
 class BackboneDetector(Detector):
-    """A detector whose images go through a backbone. A subclass sets ``_predictor``, the network on its features.
+    """A detector whose images pass through a backbone. A subclass sets ``_predictor``, the network on its features.
 
-    ``normalisation`` is what the backbone does first to the channels (red, green, blue) of images in [0, 1].
+    ``normalisation`` is how the backbone first scales the channels (red, green, blue) of images in [0, 1].
 
     Args:
-        num_classes: classes, from 0, without a background class.
+        num_classes: number of classes, counted from 0, without a background class.
         image_size: (height, width) in pixels, or one number for a square.
-        backbone: its settings.
-        strides: of its maps that are features.
+        backbone: settings of the backbone.
+        strides: strides of those of its maps that are features.
         activation: ``silu`` or ``relu`` (torchvision's own).
         proximal: see ``Detector``.
-        prior: foreground probability that the untrained predictor gives; None: it has no such output.
+        prior: foreground probability of the untrained predictor; None: it has no such output.
     """
 
     normalisation: ClassVar[dict[str, tuple[float, ...]]] = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
@@ -76,11 +76,11 @@ class BackboneDetector(Detector):
     def in_loop(self, layers: int | None) -> BackboneDetector:
         """Return the detector with its last stages trained in the psi loop, as the base class says.
 
-        None means the last stage of our small backbones, and none of a ResNet's, which have millions of parameters.
+        None means the last stage of our small backbones, but none of a ResNet's, which have millions of parameters.
 
         Raises:
-            ValueError: stages of a backbone with published weights, whose normalisation is frozen; fewer than 0
-                stages, or not fewer than there are.
+            ValueError: the backbone has published weights, whose normalisation is frozen; or the number of stages is
+                below 0 or not below that of all stages.
         """
         if layers is None:
             layers = int(self._settings.architecture in PLANS)
@@ -98,10 +98,10 @@ class BackboneDetector(Detector):
     def init(self, generator: torch.Generator) -> Parameters:
         """Draw parameters in float32 on the CPU; pretrained backbones keep their weights.
 
-        The dictionary also holds a frozen batch normalisation's statistics, so that it is complete.
+        The dictionary is complete: it includes the statistics of a frozen batch normalisation.
 
         Raises:
-            ValueError: a detector of a model file, whose parameters are there.
+            ValueError: the detector was read from a model file, which already has its parameters.
         """
         if self._settings.weights == SAVED:
             raise ValueError(
@@ -121,7 +121,7 @@ class BackboneDetector(Detector):
         return {name: tuple(value.shape) for name, value in state.items()}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Name everything that a full training changes: all but frozen statistics or a frozen backbone."""
+        """Name everything that a full training changes: all except frozen statistics or a frozen backbone."""
         learned = (self._predictor,) if self._settings.freeze else (self._backbone, self._predictor)
         names = {n for module in learned for n, _ in module.named_parameters()}
         return [name for name in params if name in names]
@@ -133,16 +133,16 @@ class BackboneDetector(Detector):
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Compute maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
+        """Compute the maps [n, c, h / stride, w / stride] of each level, worth caching while the backbone is frozen.
 
-        In the psi loop, which trains the last stages, these are the maps of the stages before.
+        In the psi loop, which trains the last stages, these are the maps before those stages.
 
         Raises:
-            ValueError: where the images are not of the detector's size.
+            ValueError: the images do not have the detector's size.
         """
         if tuple(images.shape[-3:]) != (3, *self.image_size):
             raise ValueError(
-                f"detector: images want shape [n, 3, {self.image_size}], got {tuple(images.shape)}"
+                f"detector: want images of shape [n, 3, {self.image_size}], got {tuple(images.shape)}"
             )
         dtype = next(value.dtype for value in backbone.values() if value.is_floating_point())
         return functional_call(self._first, backbone, (images.to(dtype),), strict=True)
@@ -161,27 +161,27 @@ class BackboneDetector(Detector):
         """Check that labels are below ``num_classes``.
 
         Raises:
-            ValueError: a label that is not.
+            ValueError: some label is not.
         """
         if labels.numel() and int(labels.max()) >= self.num_classes:
-            raise ValueError(f"assign: labels want to be below {self.num_classes}, got {int(labels.max())}")
+            raise ValueError(f"assign: want labels below {self.num_classes}, got {int(labels.max())}")
 
 
 class PyramidDetector(BackboneDetector):
     """A backbone, a feature pyramid and a head; a subclass makes the head, and its targets and losses.
 
     Args:
-        head: its settings, and the pyramid's.
-        strides: of the pyramid's levels; ``where`` is their key.
-        network: the head's module, of ``Head.channels`` channels; it returns ``cls_logits`` [n, anchors, classes]
+        head: settings of the head and the pyramid.
+        strides: strides of the pyramid's levels; ``where`` is their key.
+        network: the head's module, with ``Head.channels`` channels; it returns ``cls_logits`` [n, anchors, classes]
             and ``bbox_regression`` [n, anchors, code].
-        activation: ``silu`` or ``relu`` (torchvision's own), of backbone, pyramid and head.
+        activation: ``silu`` or ``relu`` (torchvision's own), for backbone, pyramid and head.
         detections: see ``Detector``.
 
-    See ``BackboneDetector`` for the others.
+    See ``BackboneDetector`` for the other arguments.
 
     Raises:
-        ValueError: strides that the backbone does not have, with the key and value.
+        ValueError: the backbone does not have these strides; the message has the key and the value.
     """
 
     def __init__(
@@ -217,6 +217,6 @@ class PyramidDetector(BackboneDetector):
 
 
 def _coarser(own: tuple[int, ...], strides: tuple[int, ...], available: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the strides of the levels past the backbone's last; none where its last map is not used."""
+    """Return the strides of the levels past the backbone's last; none if its last map is not used."""
     last, count = available[-1], len(strides) - len(own)
     return tuple(last * 2**n for n in range(1, count + 1)) if last in own else ()

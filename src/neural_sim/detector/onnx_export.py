@@ -1,4 +1,4 @@
-"""A detector as ONNX: images to the decoded boxes and scores of all anchors, or to detections."""
+"""A detector as ONNX: from images to the decoded boxes and scores of all anchors, or to detections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neural_sim.extras import require
 
 OPSET = 18
 TOLERANCE = 1e-4
-"""The largest difference of scores, and of boxes as fractions of the image's longer side."""
+"""Largest accepted difference of scores, and of boxes as fractions of the image's longer side."""
 
 
 class Decoded(nn.Module):
@@ -50,12 +50,12 @@ def export(saved: SavedDetector, path: Path, nms: bool = False) -> Path:
     """Write ``path``: input ``images`` [n, 3, h, w] in [0, 1], any n.
 
     Without ``nms`` the outputs are ``boxes`` [n, anchors, 4] and ``scores`` [n, anchors, classes], see
-    ``Decoded``. With it they are the detections of all images, as ``Detector.predict`` chooses them: ``image``
+    ``Decoded``. With it they are the detections in all images, chosen as by ``Detector.predict``: ``image``
     [d], ``boxes`` [d, 4], ``scores`` [d], ``labels`` [d], image by image, the best first. The file's metadata has the
     ``class_names`` as JSON.
 
     Raises:
-        ValueError: a package that is missing, or a detector that cannot decode the boxes of all anchors.
+        ValueError: a package is missing, or the detector cannot decode the boxes of all anchors.
     """
     require("onnx", "model.onnx")
     if not callable(getattr(saved.detector, "decode", None)):
@@ -112,7 +112,7 @@ def largest_difference(saved: SavedDetector, path: Path, images: Float[Tensor, "
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's notices, which nobody can act on."""
+    """Silence the exporter's notices, which call for no action."""
     noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in noisy]
     with warnings.catch_warnings():

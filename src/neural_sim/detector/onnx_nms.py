@@ -9,11 +9,11 @@ import torch
 from neural_sim.detector.saved import SavedDetector
 
 INPUTS = ("anchor_boxes", "anchor_scores")
-"""The network's outputs, which suppression takes as inputs."""
+"""The network's outputs, which are the inputs of suppression."""
 
 
 def with_nms(model: Any, saved: SavedDetector) -> Any:
-    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, as ``Detector.predict`` does.
+    """Continue ``model``, an ``onnx.ModelProto`` with the outputs ``INPUTS``, with the steps of ``Detector.predict``.
 
     It takes the best candidates of each level, suppresses within each class, and keeps the best ``limit`` of an image.
     """

@@ -1,7 +1,7 @@
-"""Optimiser steps as pure functions of flat vectors, differentiated to reverse a training.
+"""Optimiser steps as pure functions of flat vectors, which are differentiated to reverse a training.
 
-A state is theta, then the optimiser's buffers. A step consists of elementwise operations of torch, whose derivative
-autograd knows.
+A state is theta followed by the optimiser's buffers. A step consists of elementwise torch operations, which autograd
+can differentiate.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class AdamW:
         return theta, torch.zeros_like(theta), torch.zeros_like(theta)
 
     def step(self, state: State, gradient: Float[Tensor, "n"], rate: float, done: int) -> State:
-        """Return the state after a step; ``done`` are the steps before it."""
+        """Return the state after a step, of which ``done`` came before."""
         theta, first, second = state
         fast, slow = self.betas
         first = fast * first + (1.0 - fast) * gradient
@@ -47,17 +47,17 @@ class AdamW:
     def floored(self, end: State, done: int, fraction: float, sizes: Sequence[int]) -> AdamW:
         """Return the rule to differentiate instead, after a training of ``done`` steps that ended in ``end``.
 
-        Its least denominator is ``fraction`` times the larger of the entry's in the last step and the root mean square
-        of those of its tensor; itself for a ``fraction`` of 0. ``sizes`` are the numbers of entries of theta's tensors,
-        in their order.
+        Its least denominator is ``fraction`` times the larger of two numbers: the entry's denominator in the last step,
+        and the root mean square of those of its tensor. For a ``fraction`` of 0 the rule is unchanged. ``sizes`` are
+        the numbers of entries of theta's tensors, in their order.
 
-        Where an entry's gradients have been tiny so far (a level of the pyramid before the first batch with an object
-        of its size), a step is the moments' ratio, whatever their size, and its derivative is about 1 / |g|: thousands
-        of times that of other entries. A finite change of the batch's images brings a gradient of the usual size, moves
-        the moments with it, and changes the step by no more than the learning rate. The last step's second moment
-        averages the whole training, and is that usual size. Where the entry's gradients stayed tiny to the end (a
+        While an entry's gradients are tiny (a level of the pyramid before the first batch with an object of its size),
+        a step is the ratio of the moments, whatever their size, and its derivative is about 1 / |g|: thousands of times
+        that of other entries. Yet a finite change of the batch's images brings a gradient of the usual size, which
+        moves the moments too, and changes the step by no more than the learning rate. The last step's second moment
+        averages the whole training, and shows that usual size. If the entry's gradients stayed tiny to the end (a
         class's weight on a channel that is dark in all images of the present distribution), the other entries of its
-        tensor say what is usual.
+        tensor show what is usual.
         """
         if fraction == 0.0:
             return self
@@ -74,9 +74,9 @@ def pulled_back(
     done: int,
     cotangents: Sequence[Tensor],
 ) -> tuple[list[Tensor], Float[Tensor, "n"]]:
-    """Pull cotangents of a step's outcome back onto its state, and onto its gradient.
+    """Pull cotangents of a step's result back onto its state, and onto its gradient.
 
-    The caller adds that the gradient depends on theta: the batch's Hessian times the second.
+    The caller adds the dependence of the gradient on theta: the batch's Hessian times the second result.
     """
     leaves = [part.detach().requires_grad_() for part in (*state, gradient)]
     with torch.enable_grad():
@@ -86,6 +86,6 @@ def pulled_back(
 
 
 def _root(values: Tensor) -> Tensor:
-    """Take the square root with derivative 0 at 0, not infinity: there an entry has had no gradient so far."""
+    """Take the square root with derivative 0, not infinity, at 0, where an entry has had no gradient so far."""
     positive = values > 0.0
     return torch.where(positive, values, 1.0).sqrt() * positive

@@ -1,4 +1,4 @@
-"""The base class of detectors: what the psi loop, reports and model files need of one."""
+"""The base class of detectors: what the psi loop, reports and model files need from one."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from neural_sim.detector.settings import Detections
 
 Parameters = dict[str, Tensor]
 Score = Literal["AP", "accuracy"]
-"""The score of predictions: average precision (COCO's), or top-1 accuracy of each image's best class."""
+"""The score of predictions: COCO's average precision, or the top-1 accuracy of each image's best class."""
 Outputs = tuple[Float[Tensor, "n anchors classes"], Float[Tensor, "n anchors code"]]
 
 
 def score_of(make: Callable[..., Detector]) -> Score:
-    """Return the score of a constructor's detectors; the constructor is one that ``conf/detector`` makes."""
+    """Return the score of the detectors that a constructor from ``conf/detector`` makes."""
     while isinstance(make, functools.partial):
         make = make.func
     return getattr(make, "score", "AP")
@@ -33,8 +33,8 @@ def score_of(make: Callable[..., Detector]) -> Score:
 class Best:
     """The best detections of every class in every image, image by image and class by class, the best first.
 
-    ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs that they come
-    from; which outputs these are is fixed.
+    ``boxes`` are (x0, y0, x1, y1) in pixels. ``logits`` and ``boxes`` are differentiable in the outputs from which they
+    come; the choice of these outputs is fixed.
     """
 
     image: Int[Tensor, "m"]
@@ -46,21 +46,21 @@ class Best:
 class Detector(ABC):
     """A detector for images of one size.
 
-    It holds a shape and settings, never its parameters, which come in as an argument, so that losses can be
+    It holds a shape and settings, never its parameters, which are passed in as an argument, so that losses can be
     differentiated any number of times, in forward and in reverse mode.
 
     A class is constructed with ``num_classes`` and ``image_size``, (height, width) in pixels, by name; other arguments
     come from its file in ``conf/detector``. It sets both attributes, and may set the others:
 
-    - ``proximal``: lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, theta_0 the warm
-      start;
+    - ``proximal``: lambda of ``lambda / 2 |theta - theta_0|^2`` in the psi loop's inner problem, where theta_0 is the
+        warm start;
     - ``detections``: which predictions are detections;
-    - ``anchors_per_level``: how many anchors each level has, of which the best candidates are taken level by level;
-      None: one level;
-    - ``normalisation``: what features do first to the channels of images, for model files;
+    - ``anchors_per_level``: number of anchors of each level; the best candidates are taken level by level. None: one
+        level;
+    - ``normalisation``: how features first scale the channels of images, for model files;
     - ``score``: the kind of score.
 
-    "Anchors" are the places that outputs belong to, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
+    "Anchors" are the places to which outputs belong, of whatever kind: boxes (RetinaNet) or points (FCOS). A subclass
     defines the abstract methods; docs/extending.md has an example.
     """
 
@@ -76,11 +76,11 @@ class Detector(ABC):
 
     @abstractmethod
     def init(self, generator: torch.Generator) -> Parameters:
-        """Draw all parameters, in float32 on the CPU; names of the backbone's begin with ``backbone.``."""
+        """Draw all parameters, in float32 on the CPU; the backbone's names begin with ``backbone.``."""
 
     @abstractmethod
     def features(self, backbone: Parameters, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Compute the predictor's inputs from images in [0, 1]: tensors with a row for each image."""
+        """Compute the predictor's inputs from images in [0, 1], as tensors with one row for each image."""
 
     @abstractmethod
     def outputs(self, trainable: Parameters, features: Sequence[Tensor]) -> Outputs:
@@ -88,7 +88,7 @@ class Detector(ABC):
 
     @abstractmethod
     def assign(self, boxes: Float[Tensor, "n boxes 4"], labels: Int[Tensor, "n boxes"]) -> Targets:
-        """Assign a target to every anchor, differentiable in the boxes; rows of label -1 are no boxes."""
+        """Assign a target to every anchor, differentiable in the boxes; rows with label -1 are not boxes."""
 
     @abstractmethod
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
@@ -100,7 +100,7 @@ class Detector(ABC):
     ) -> Float[Tensor, "*n 4"]:
         """Decode boxes (x0, y0, x1, y1) in pixels, within the image, differentiable in the code.
 
-        The code is that of all anchors [n, anchors, code], or of those that ``anchor`` lists [m, code].
+        The code is that of all anchors [n, anchors, code], or only of the anchors ``anchor`` [m, code].
         """
 
     # --- what follows from it ---
@@ -108,11 +108,11 @@ class Detector(ABC):
     def in_loop(self, layers: int | None) -> Detector:
         """Return the detector as the psi loop trains it.
 
-        The last ``layers`` stages of its backbone are among what ``split`` leaves to train; None: as many as a kind
-        of detector proposes. The base class knows no stages.
+        ``split`` leaves the last ``layers`` stages of its backbone to train; None: as many as this kind of detector
+        proposes. The base class has no stages.
 
         Raises:
-            ValueError: where the backbone has no such stages.
+            ValueError: the backbone has no such stages.
         """
         if layers:
             raise ValueError(
@@ -121,12 +121,12 @@ class Detector(ABC):
         return self
 
     def split(self, params: Parameters) -> tuple[Parameters, Parameters]:
-        """Separate the backbone, which ``features`` takes and the psi loop freezes, from all other parameters."""
+        """Separate the backbone, which ``features`` uses and the psi loop freezes, from all other parameters."""
         backbone = {name: value for name, value in params.items() if name.startswith("backbone.")}
         return backbone, {name: value for name, value in params.items() if name not in backbone}
 
     def learnable(self, params: Parameters) -> list[str]:
-        """Name everything that a training outside the psi loop changes: all."""
+        """Name everything that a training outside the psi loop changes: by default all parameters."""
         return list(params)
 
     def per_image_loss(
@@ -134,19 +134,19 @@ class Detector(ABC):
     ) -> Float[Tensor, "n"]:
         """Compute the losses of the outputs.
 
-        A jvp along v gives every image's score <dl_i / dtheta, v> in one pass.
+        A jvp along v gives the score <dl_i / dtheta, v> of every image in one pass.
         """
         return self.losses_of(self.outputs(trainable, features), targets)
 
     def ranking(self, outputs: Outputs) -> Float[Tensor, "n anchors classes"]:
-        """Return logits of the scores by which detections are ranked: those of the classes."""
+        """Return logits of the scores by which detections are ranked: by default those of the classes."""
         return outputs[0]
 
     def best(self, outputs: Outputs, per_class: int, candidates: int = 100) -> Best:
         """Choose at most ``per_class`` detections of each class in each image.
 
-        They are of its ``candidates`` best logits after non-maximum suppression. No score is too low: a box that is
-        missed today should be able to rise.
+        They are chosen among its ``candidates`` best logits by non-maximum suppression. No score is too low: a box that
+        is missed today should be able to rise.
         """
         logits, code = self.ranking(outputs), outputs[1]
         top, index = logits.detach().flatten(1).topk(min(candidates, logits[0].numel()))
@@ -167,8 +167,7 @@ class Detector(ABC):
         """Detect objects in each image.
 
         Returns:
-            For each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see
-            ``Detections``.
+            For each image, best first, on the CPU: boxes [d, 4] in pixels, scores [d], labels [d]; see ``Detections``.
         """
         backbone, trainable = self.split(params)
         detections, device = [], next(iter(trainable.values())).device
@@ -180,7 +179,7 @@ class Detector(ABC):
     def _chosen(
         self, scores: Float[Tensor, "n anchors classes"], code: Float[Tensor, "n anchors code"]
     ) -> list[dict[str, Tensor]]:
-        """Choose the candidates of all images together and take them to the CPU, where each image has its own few."""
+        """Choose the candidates of all images at once and move them to the CPU, where each image has only a few."""
         levels, first = [], 0
         for level in scores.split(list(self.anchors_per_level or [scores.shape[1]]), 1):
             best, index = level.flatten(1).topk(min(self.detections.candidates, level[0].numel()))

@@ -1,4 +1,4 @@
-"""Labelled photographs in a training: which of them, and in what proportion to synthetic images."""
+"""Labelled photographs in a training: which of them are used, and in what proportion to synthetic images."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ Fewer = Literal["refuse", "all"]
 @validated
 @dataclass(frozen=True)
 class Real:
-    """The use of labelled photographs, of the target's part ``train``, in training.
+    """The use of labelled photographs, the target's training set, in training.
 
     Args:
-        mode: ``combined``: every training (warm start, psi loop, scored detectors) is on synthetic images and
+        mode: ``combined``: every training (warm start, psi loop, scored detectors) uses synthetic images and
             photographs. ``pretrain``: scored detectors are trained on synthetic images and then fine-tuned on
-            photographs; warm start and psi loop see synthetic images only. ``none``: no photographs.
-        count: how many photographs; 0 is ``none``. A smaller number takes some of those that a larger one takes.
-        fraction: of the photographs, instead of ``count``. Neither: all of them.
-        batch_fraction: ``combined``: fraction of every batch that are photographs, drawn again and again. A training
-            has as many steps as without them. None: photographs are images like all others, once in every epoch.
-        finetune: ``pretrain``: steps on photographs, as a fraction of those on synthetic images.
-        finetune_learning_rate: its peak learning rate.
-        fewer: what happens where there are fewer photographs than ``count``: ``refuse``, or take ``all`` of them with
+            photographs; the warm start and the psi loop see synthetic images only. ``none``: no photographs.
+        count: number of photographs; 0 means ``none``. A smaller number is a subset of a larger one.
+        fraction: fraction of the photographs, instead of ``count``. Neither: all of them.
+        batch_fraction: for ``combined``: fraction of every batch that are photographs, drawn repeatedly. A training
+            has as many steps as without them. None: photographs are treated like all other images, once in every epoch.
+        finetune: for ``pretrain``: number of steps on photographs, as a fraction of those on synthetic images.
+        finetune_learning_rate: peak learning rate of these steps.
+        fewer: what to do if there are fewer photographs than ``count``: ``refuse``, or take ``all`` of them with
             a warning.
 
     Raises:
-        ValueError: both numbers of photographs.
+        ValueError: both ``count`` and ``fraction`` are given.
     """
 
     mode: Mode = "none"
@@ -58,7 +58,7 @@ class Real:
 
     @property
     def used(self) -> bool:
-        """True if photographs train."""
+        """True if photographs are used."""
         return self.mode != "none" and self.count != 0
 
     @property
@@ -67,18 +67,16 @@ class Real:
         return self.used and self.mode == "combined"
 
     def number(self, available: int) -> int:
-        """Return how many of ``available`` photographs train.
+        """Return how many of ``available`` photographs are used.
 
         Raises:
-            ValueError: fewer photographs than ``count`` where that is refused, or none at all.
+            ValueError: there are fewer photographs than ``count`` and that is refused, or none at all.
         """
         count = available if self.count is None else self.count
         if self.fraction is not None:
             count = max(1, round(self.fraction * available))
         elif self.fewer == "all" and 0 < available < count:
-            _log.warning(
-                "training.real: %d photographs in the place of %d, there are no more", available, count
-            )
+            _log.warning("training.real: %d photographs instead of %d: there are no more", available, count)
             count = available
         if not 0 < count <= available:
             raise ValueError(
@@ -87,26 +85,26 @@ class Real:
         return count
 
     def of(self, available: int) -> Real:
-        """Return the settings in terms of a ``count``, so that equal trainings have equal keys.
+        """Return the settings expressed by a ``count``, so that equal trainings have equal keys.
 
         Raises:
-            ValueError: as ``number``.
+            ValueError: as for ``number``.
         """
         return replace(self, count=self.number(available), fraction=None, fewer="refuse")
 
     def chosen(self, photographs: LabelledImages | None, seed: int) -> LabelledImages:
-        """Choose those that train: the first of a random order that depends on ``seed`` alone.
+        """Choose the photographs that train: the first of a random order that depends on ``seed`` alone.
 
         Raises:
-            ValueError: as ``number``.
+            ValueError: as for ``number``.
         """
         available = 0 if photographs is None else len(photographs)
         count = self.number(available)
-        assert photographs is not None  # of which ``number`` found one at least
+        assert photographs is not None  # ``number`` found at least one
         return photographs.select(torch.randperm(available, generator=stream(seed, "photographs"))[:count])
 
     def sampling(self, synthetic: int, photographs: int, batch_size: int) -> Sampling | None:
-        """Return how batches are drawn of ``synthetic`` images and the ``photographs`` after them; None: all alike."""
+        """Return how batches of ``synthetic`` images and ``photographs`` after them are drawn; None: all alike."""
         if self.batch_fraction is None:
             return None
         real = min(max(1, round(self.batch_fraction * batch_size)), batch_size - 1)
@@ -116,15 +114,15 @@ class Real:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Batches with a fixed number of images of each pool, taken from shuffled passes over the pool.
+    """Batches with a fixed number of images from each pool, in shuffled passes over the pool.
 
     Args:
         pools: sizes of the pools, which are consecutive rows of a training set.
-        per_batch: images of each pool in every batch.
-        steps: batches of an epoch.
+        per_batch: number of images from each pool in every batch.
+        steps: number of batches in an epoch.
 
     Raises:
-        ValueError: any of these below 1, or of different lengths.
+        ValueError: a number is below 1, or the lengths differ.
     """
 
     pools: tuple[int, ...]
@@ -148,7 +146,7 @@ class Sampling:
 
     @property
     def weights(self) -> Float[Tensor, "N"]:
-        """The images' weights in a batch's mean loss, on average over batches; they sum to 1."""
+        """The images' weights in a batch's mean loss, averaged over batches; they sum to 1."""
         total = sum(self.per_batch)
         pools = zip(self.pools, self.per_batch, strict=True)
         return torch.cat([torch.full((size,), count / (total * size)) for size, count in pools])
@@ -159,7 +157,7 @@ def shuffled_passes(
 ) -> Iterator[Int[Tensor, "per_batch"]]:
     """Yield ``per_batch`` of the numbers below ``size`` at a time, from shuffled passes over all of them.
 
-    Each is equally likely in every batch.
+    Each number is equally likely in every batch.
     """
     remaining = torch.zeros(0, dtype=torch.long)
     while True:

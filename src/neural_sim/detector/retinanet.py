@@ -54,13 +54,13 @@ class RetinaNet(PyramidDetector):
         """Assign a target to every anchor, see ``losses.assign_anchors``.
 
         Raises:
-            ValueError: where a label is not below ``num_classes``, or a box has no area.
+            ValueError: a label is not below ``num_classes``, or a box has no area.
         """
         self.check_labels(labels)
         return assign_anchors(self.anchors.to(boxes), boxes, labels, *self._overlaps)
 
     def losses_of(self, outputs: Outputs, targets: Targets) -> Float[Tensor, "n"]:
-        """Add up focal and box loss of each image, each a sum over anchors by the number of foreground anchors."""
+        """Add up each image's focal and box loss, sums over anchors divided by the number of foreground anchors."""
         (logits, deltas), costs = outputs, self._losses
         labels = targets.labels
         classes = torch.arange(self.num_classes, device=labels.device)

@@ -1,7 +1,7 @@
 """A trained detector as two files, and what it finds in photographs.
 
-``model.safetensors`` has its parameters, ``model.json`` all else that it needs to be built again and used: its class
-and settings, class names, image size, normalisation, camera.
+``model.safetensors`` has its parameters. ``model.json`` has everything else that is needed to build and use it: its
+class and settings, class names, image size, normalisation, camera.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from neural_sim.target.photographs import letterbox
 from neural_sim.types import PinholeCamera
 
 SHAPE = ("num_classes", "image_size")
-"""Arguments of every detector, which a file names apart from its settings."""
+"""Arguments that every detector has; a file stores them apart from its settings."""
 FORMAT, VERSION = "neural-sim detector", 1
 WEIGHTS, DOCUMENT = "model.safetensors", "model.json"
 KEYS = ("format", "version", "weights", "class_names", "image", "detector", "camera")
@@ -44,9 +44,9 @@ KEYS = ("format", "version", "weights", "class_names", "image", "detector", "cam
 class SavedDetector:
     """A detector with its parameters.
 
-    ``make`` is its constructor as ``conf/detector`` makes it, still without classes and image size; ``class_names`` are
-    in the order of labels, ``image_size`` is (height, width) in pixels; ``camera`` is that of the images that it was
-    trained on, where it is known.
+    ``make`` is its constructor, as made by ``conf/detector``, without classes and image size; ``class_names`` are
+    in the order of labels, ``image_size`` is (height, width) in pixels; ``camera`` is the camera of the images it was
+    trained on, if known.
     """
 
     make: Callable[..., Detector]
@@ -68,7 +68,7 @@ class SavedDetector:
         """Write both files, ``model.json`` last, and return the path of the parameters.
 
         Raises:
-            ValueError: settings that JSON does not have, see ``described``.
+            ValueError: JSON has no value for some setting, see ``described``.
         """
         document = {
             "format": FORMAT,
@@ -93,13 +93,13 @@ class SavedDetector:
         """Read both files.
 
         Args:
-            path: their folder or one of them.
-            outside: ``module.class`` of a detector that is not this package's and may be imported. Without it such a
-                class must have been imported already: a file alone imports nothing.
+            path: the folder of both files, or one of them.
+            outside: ``module.class`` of a detector outside this package that may be imported. Without it, such a class
+                must have been imported already: a file alone imports nothing.
 
         Raises:
-            ValueError: files that are missing, unreadable, of another format or version, that do not belong together,
-                or whose parameters do not fit the detector; with the file, the key and what is wanted.
+            ValueError: files are missing, unreadable, of another format or version, do not belong together, or have
+                parameters that do not fit the detector. The message has the file, the key and what is wanted.
         """
         folder = path if path.is_dir() else path.parent
         named = path.is_file() and path.name in (WEIGHTS, DOCUMENT)
@@ -187,7 +187,7 @@ def _params(path: Path, weights: Mapping[str, Any], file: Path) -> Parameters:
 
 
 def _normalisation(detector: Detector) -> dict[str, list[float]] | None:
-    """Return what the detector does first to images in [0, 1], where it says so."""
+    """Return how the detector first scales images in [0, 1], if it says so."""
     stored = getattr(detector, "normalisation", None)
     return None if stored is None else {key: list(values) for key, values in stored.items()}
 
@@ -202,7 +202,7 @@ def _check_normalisation(stored: Any, detector: Detector, file: Path) -> None:
 
 def _check_params(params: Parameters, detector: Detector, path: Path) -> None:
     shapes = getattr(detector, "shapes", None)
-    if shapes is None:  # of a detector from outside the package
+    if shapes is None:  # a detector from outside the package
         shapes = {name: tuple(value.shape) for name, value in detector.init(torch.Generator()).items()}
     for name, shape in shapes.items():
         if name not in params:
@@ -224,7 +224,7 @@ def _sha256(path: Path) -> str:
 def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str, Tensor]]:
     """Detect objects in photographs.
 
-    Photographs are letterboxed as those of a target set are. Detections that lie in the grey border alone are left out.
+    Photographs are letterboxed like those of a target set. Detections that lie only in the grey border are left out.
 
     Returns:
         For each photograph, best first, on the CPU: boxes [d, 4] as (x0, y0, x1, y1) in its pixels and within it,
@@ -243,21 +243,21 @@ def detect(saved: SavedDetector, photos: Sequence[Image.Image]) -> list[dict[str
 
 
 def described(make: Callable[..., Detector]) -> dict[str, Any]:
-    """Describe a detector's constructor, which ``conf/detector`` makes: a class, or a partial call of one.
+    """Describe a detector's constructor as made by ``conf/detector``: a class, or a partial call of one.
 
-    ``settings`` has all arguments but the classes and the image size: defaults, too, since another version of the
-    project may change them.
+    ``settings`` has all arguments except the classes and the image size, defaults included, because another version
+    of the project may change them.
 
     Returns:
-        Its ``class`` and ``settings``.
+        The constructor's ``class`` and ``settings``.
 
     Raises:
-        ValueError: an argument that is no number, string, sequence, mapping or dataclass of these.
+        ValueError: an argument is not a number, string, sequence, mapping or dataclass of these.
     """
     kind, given = make, {}
     while isinstance(
         kind, functools.partial
-    ):  # Hydra's own is a subclass, which a partial call of it stays around
+    ):  # Hydra's own partial is a subclass, which stays when it is called partially again
         kind, given = kind.func, {**kind.keywords, **given}
     defaults = {
         name: parameter.default
@@ -272,13 +272,13 @@ def described(make: Callable[..., Detector]) -> dict[str, Any]:
 def rebuilt(
     description: Mapping[str, Any], file: Path, outside: str | None = None
 ) -> Callable[..., Detector]:
-    """Inverse of ``described``. Runs no code but the named class's own, which must derive from ``Detector``.
+    """Invert ``described``. No code runs except that of the named class, which must derive from ``Detector``.
 
-    ``outside`` as for ``SavedDetector.load``.
+    For ``outside`` see ``SavedDetector.load``.
 
     Raises:
-        ValueError: a class that cannot be imported or is no detector, a setting that it does not have or refuses;
-            with the file and the key.
+        ValueError: a class cannot be imported or is not a detector, or it refuses or does not have a setting. The
+            message has the file and the key.
     """
     kind = _detector_class(description.get("class"), f"{file}: detector.class", outside)
     where = f"{file}: detector.settings"
@@ -294,7 +294,7 @@ def _plain(value: Any, where: str) -> Any:
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Backbone) and value.weights is not None:
-        value = dataclasses.replace(value, weights=SAVED)  # their values are among the saved parameters
+        value = dataclasses.replace(value, weights=SAVED)  # the values are among the saved parameters
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
             f.name: _plain(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)
@@ -330,7 +330,7 @@ def _detector_class(name: Any, where: str, outside: str | None) -> type:
 
 
 def _arguments(make: type, given: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``given`` with mappings made into the dataclasses that the constructor's hints name."""
+    """Convert mappings in ``given`` to the dataclasses that the constructor's type hints name."""
     known = inspect.signature(make).parameters
     hints = typing.get_type_hints(make if dataclasses.is_dataclass(make) else make.__init__)
     made = {}

@@ -1,4 +1,4 @@
-"""The settings of detectors, by component."""
+"""Settings of detectors, by component."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from neural_sim.ranges import Ascending, Fraction, NonNegative, Positive, Positi
 
 Architecture = Literal["micro", "tiny", "resnet18", "resnet50"]
 Activation = Literal["silu", "relu"]
-"""The activation of backbone, pyramid and head; relu is torchvision's own."""
+"""Activation of backbone, pyramid and head; relu is torchvision's own."""
 BetweenZeroAndOne = Annotated[float, Gt(0), Lt(1)]
 Normalisation = Literal["group", "none"]
-"""The normalisation of the pyramid and the head, see ``backbones.group_norm``."""
+"""Normalisation of the pyramid and the head, see ``backbones.group_norm``."""
 BoxLoss = Literal["pseudo_huber", "l1"]
 ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
     "micro": (8, 16),
@@ -26,19 +26,19 @@ ARCHITECTURES: dict[Architecture, tuple[int, ...]] = {
 }
 """Strides of the backbones' maps."""
 SAVED = "saved"
-"""``Backbone.weights`` of a detector that is read from a model file, which has their values."""
+"""``Backbone.weights`` of a detector read from a model file, which contains their values."""
 
 
 @validated
 @dataclass(frozen=True)
 class Backbone:
-    """The network that makes feature maps of images.
+    """The network that turns images into feature maps.
 
     Args:
-        architecture: its layers.
+        architecture: which network it is.
         weights: initial weights of a ResNet: None (random), a file with a torchvision state dictionary, or
-            torchvision's name of the weights. Model files have ``saved``: the shape of a backbone that had weights.
-        freeze: train the predictor only, in every training. Of the psi loop see ``outer.loop_layers``.
+            torchvision's name of the weights. Model files have ``saved`` if the backbone had weights.
+        freeze: train only the predictor, in every training. For the psi loop see ``outer.loop_layers``.
     """
 
     architecture: Architecture = "tiny"
@@ -48,7 +48,7 @@ class Backbone:
     def __post_init__(self) -> None:
         if self.freeze and self.weights is None:
             raise ValueError(
-                "Backbone.weights: want some with freeze=true, since without them it is random, got None"
+                "Backbone.weights: want weights with freeze=true, because without them the backbone is random; got None"
             )
 
 
@@ -58,9 +58,9 @@ class Head:
     """The feature pyramid, and the head that is applied to all its levels.
 
     Args:
-        channels: width of both.
-        convs: convolutions in each branch of the head.
-        normalisation: of both, ``group`` or ``none`` (torchvision's own).
+        channels: width of the pyramid and the head.
+        convs: number of convolutions in each branch of the head.
+        normalisation: normalisation of the pyramid and the head, ``group`` or ``none`` (torchvision's own).
         prior: foreground probability that the untrained head predicts.
     """
 
@@ -73,16 +73,16 @@ class Head:
 @validated
 @dataclass(frozen=True)
 class Anchors:
-    """The boxes that predictions start from, and which of them should find which object.
+    """The boxes from which predictions start, and which of them should find which object.
 
     Args:
-        strides: of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last for each
-            of any coarser levels, see ``network.CoarserLevels``.
-        sizes: per level, side of the square of an anchor's area, in pixels of an image whose shorter side is
-            ``reference``; they scale with the image's.
-        reference: that side in pixels; None: sizes are pixels of any image, as in torchvision.
-        ratios: of every anchor, height / width.
-        foreground_iou, background_iou: overlaps from which an anchor is foreground, below which background.
+        strides: strides of the pyramid's levels, from 4, 8, 16 and 32 (micro and tiny: 8 and 16), then twice the last
+            for each coarser level, see ``network.CoarserLevels``.
+        sizes: for each level, the side of a square with an anchor's area, in pixels of an image whose shorter side is
+            ``reference``; they scale with the image.
+        reference: that side in pixels; None: sizes are in pixels of any image, as in torchvision.
+        ratios: aspect ratios of the anchors, height / width.
+        foreground_iou, background_iou: overlaps from which an anchor is foreground, and below which it is background.
     """
 
     strides: Sequence[PositiveInt] = (8, 16)
@@ -111,11 +111,11 @@ class Points:
     """The points of an FCOS, and which of them should find which object.
 
     Args:
-        strides: of the pyramid's levels, as of ``Anchors``; a level has a point in every stride.
-        limits: of all levels but the last, the largest distance from a point to a side of its box, in pixels of an
-            image whose shorter side is ``reference``; larger ones are for the next level.
-        reference: that side in pixels; None: limits are pixels of any image.
-        radius: distance in strides, along each axis, within which a point may be of its box's centre.
+        strides: strides of the pyramid's levels, as in ``Anchors``; a level has a point in every stride.
+        limits: for all levels but the last, the largest distance from a point to a side of its box, in pixels of an
+            image whose shorter side is ``reference``; larger distances belong to the next level.
+        reference: that side in pixels; None: limits are in pixels of any image.
+        radius: largest distance, in strides and along each axis, from a point to the centre of its box.
     """
 
     strides: Sequence[PositiveInt] = (8, 16)
@@ -128,7 +128,7 @@ class Points:
             raise ValueError(f"Points.limits: want one for each stride but the last, got {list(self.limits)}")
 
     def ranges(self, shorter_side: float) -> list[tuple[float, float]]:
-        """Each level's distances to the farthest side, in pixels of an image of this size."""
+        """Return each level's distances to the farthest side, in pixels of an image of this size."""
         scale = 1.0 if self.reference is None else shorter_side / self.reference
         bounds = [0.0, *(scale * limit for limit in self.limits), float("inf")]
         return list(itertools.pairwise(bounds))
@@ -142,7 +142,7 @@ class Losses:
     Args:
         box: ``pseudo_huber`` or ``l1`` (torchvision's own).
         box_delta: delta of the pseudo-Huber loss, in units of the box code (centre shifts in anchor sides, log size
-        ratios).
+            ratios).
         focal_alpha, focal_gamma: alpha and gamma of the focal loss (Lin et al. 2017, Eq. 5).
     """
 
@@ -155,7 +155,7 @@ class Losses:
 @validated
 @dataclass(frozen=True)
 class Detections:
-    """The choice of detections among predictions.
+    """How detections are chosen among predictions.
 
     The ``candidates`` best scores of each level above ``score_threshold`` go through non-maximum suppression within
     each class at ``nms_iou``; the best ``limit`` of an image are kept.

@@ -1,9 +1,9 @@
-"""Smooth scores, which the psi loop differentiates in the place of the validation loss.
+"""Smooth scores, which the psi loop differentiates instead of the validation loss.
 
-Of the average precision the detections are those of the forward pass, after non-maximum suppression. Their anchors are
-fixed; their scores and boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is
-a true positive (of its overlap), and whether it ranks below another one (of the difference of logits; Brown et al.
-2020, Smooth-AP, Eq. 6). Of the top-1 accuracy the step of the right class being the best becomes its probability.
+Average precision: detections come from the forward pass, after non-maximum suppression. Their anchors are fixed; their
+scores and boxes are differentiated. Two steps of COCO's definition become sigmoids: whether a detection is a true
+positive (a sigmoid of its overlap), and whether it ranks below another (of the difference of logits; Brown et al. 2020,
+Smooth-AP, Eq. 6). Top-1 accuracy: the step of the right class being the best becomes its probability.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ THRESHOLDS = tuple(0.5 + 0.05 * step for step in range(10))
 
 @dataclass(frozen=True)
 class Ranked:
-    """One class's detections in all images, and the nearest box of each; image by image, in order of falling score.
+    """One class's detections in all images, and the nearest box of each; image by image, by falling score.
 
-    ``overlaps`` (intersection over union) are with the nearest box of the class in the image, 0 without one. ``image``
-    is each detection's image, ``box`` the number of that box among all, -1 for none. ``boxes`` counts the class's
-    boxes.
+    ``overlaps`` (intersection over union) are those with the nearest box of the class in the image, 0 if there is none.
+    ``image`` is each detection's image; ``box`` is the number of the nearest box among all boxes, -1 for none.
+    ``boxes`` counts the class's boxes.
     """
 
     logits: Float[Tensor, "m"]
@@ -48,8 +48,8 @@ class SmoothAP:
         temperature: width of the ranks' sigmoid, in logits; AP is the limit at 0.
         width: width of the true positives' sigmoid, in intersection over union; AP is the limit at 0.
         per_class: number of an image's best detections that count for each class.
-        loss: weight of the training loss that is added. The AP of a class without true positives has no gradient; its
-            loss has.
+        loss: weight of the training loss that is added: the AP of a class without true positives has no gradient, but
+            its loss has.
     """
 
     temperature: Positive = 0.2
@@ -60,7 +60,7 @@ class SmoothAP:
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
     ) -> Float[Tensor, "classes images"]:
-        """Each image's contribution to every class's AP, the sum of a row; nan for a class without boxes."""
+        """Compute each image's contribution to every class's AP, the sum of a row; nan for a class without boxes."""
         rows = []
         for detections in ranked(detector, outputs, images, self.per_class):
             row = detections.logits.new_zeros(len(images))
@@ -72,17 +72,17 @@ class SmoothAP:
         return torch.stack(rows)
 
     def of_class(self, detections: Ranked) -> Float[Tensor, "m"]:
-        """Each detection's contribution to one class's AP, the mean over ``THRESHOLDS``.
+        """Compute each detection's contribution to one class's AP, the mean over ``THRESHOLDS``.
 
         Raises:
-            ValueError: a class without boxes, whose AP is not defined.
+            ValueError: the class has no boxes, so that its AP is undefined.
         """
         if detections.boxes == 0:
             raise ValueError("smooth_ap: want at least one box of the class")
         true = self.true_positives(detections)
         candidates = (detections.box >= 0).nonzero().flatten()  # only these can be true positives
         above = torch.sigmoid((detections.logits - detections.logits[candidates, None]) / self.temperature)
-        # The sigmoid counts half of a detection in its own rank; it counts as 1.
+        # In its own rank the sigmoid counts a detection as a half; it must count as 1.
         above = above + 0.5 * (candidates[:, None] == torch.arange(len(detections.box), device=above.device))
         precision = (above @ true) / above.sum(1, keepdim=True)
         added = (true[candidates] * precision).mean(1) / detections.boxes
@@ -91,15 +91,15 @@ class SmoothAP:
     def true_positives(self, detections: Ranked) -> Float[Tensor, "m thresholds"]:
         """Compute the degree in [0, 1] to which each detection is a true positive, at each threshold.
 
-        It is that of its overlap, times that to which no better detection of the same box is one. The degrees of a box
-        sum to at most 1.
+        It is the degree from the overlap, times the degree to which no better detection of the same box is one. The
+        degrees of a box sum to at most 1.
         """
         levels = detections.overlaps.new_tensor(THRESHOLDS)
         matched = torch.sigmoid((detections.overlaps[:, None] - levels) / self.width)
         matched = torch.where((detections.box >= 0)[:, None], matched, 0.0)
         unclaimed = torch.ones_like(matched)
         for back in range(1, self.per_class):
-            # The detection ``back`` places before, if it has the same box (of the same image).
+            # The detection ``back`` places earlier, if it has the same box (in the same image).
             before, box = matched.roll(back, 0), detections.box
             same = (box == box.roll(back)) & (box >= 0)
             same = same & (torch.arange(len(same), device=same.device) >= back)
@@ -108,7 +108,7 @@ class SmoothAP:
 
 
 def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_class: int) -> list[Ranked]:
-    """Each class's detections in these images, at most ``per_class`` of an image; differentiable in the outputs."""
+    """Rank each class's detections, at most ``per_class`` in an image; differentiable in the outputs."""
     best = detector.best(outputs, per_class)
     labels, boxes = images.labels.to(best.image.device), images.boxes.to(best.boxes)
     classes = []
@@ -124,7 +124,7 @@ def ranked(detector: Detector, outputs: Outputs, images: LabelledImages, per_cla
 def nearest_box(
     boxes: Float[Tensor, "m 4"], truth: Float[Tensor, "m boxes 4"], present: Bool[Tensor, "m boxes"]
 ) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """Each detection's largest intersection over union with a box of its image, and that box; 0 and -1 without one."""
+    """Find each detection's largest intersection over union with a box of its image, and that box; 0 and -1 without."""
     if truth.shape[1] == 0:
         return boxes.new_zeros(len(boxes)), torch.full_like(boxes[:, 0], -1, dtype=torch.long)
     overlaps = torch.where(present, overlap(boxes[:, None], truth), 0.0)
@@ -133,7 +133,7 @@ def nearest_box(
 
 
 def overlap(a: Float[Tensor, "*#n 4"], b: Float[Tensor, "*#n 4"]) -> Float[Tensor, "..."]:
-    """Intersection over union of boxes (x0, y0, x1, y1), pair by pair; differentiable in both."""
+    """Compute the intersection over union of boxes (x0, y0, x1, y1), pair by pair; differentiable in both."""
     sides = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp_min(0.0)
     shared = sides.prod(-1)
     areas = [(box[..., 2:] - box[..., :2]).clamp_min(0.0).prod(-1) for box in (a, b)]
@@ -143,12 +143,12 @@ def overlap(a: Float[Tensor, "*#n 4"], b: Float[Tensor, "*#n 4"]) -> Float[Tenso
 @validated
 @dataclass(frozen=True)
 class SmoothAccuracy:
-    """Settings of the smooth accuracy: the step of the right class being the best one becomes its softmax probability.
+    """Settings of the smooth accuracy: whether the right class is best becomes its softmax probability.
 
     Args:
-        temperature: of the softmax, in logits; accuracy is the limit at 0.
-        loss: weight of the training loss that is added. An image whose class is far from the best has hardly a
-            gradient of its own; its loss has.
+        temperature: temperature of the softmax, in logits; accuracy is the limit at 0.
+        loss: weight of the training loss that is added: an image whose class is far from the best has hardly a gradient
+            of its own, but its loss has.
     """
 
     temperature: Positive = 0.5
@@ -157,7 +157,7 @@ class SmoothAccuracy:
     def __call__(
         self, detector: Detector, outputs: Outputs, images: LabelledImages
     ) -> Float[Tensor, "classes images"]:
-        """Each image's contribution to the accuracy of its class, the sum of a row; nan for a class without images."""
+        """Compute each image's part of its class's accuracy, the sum of a row; nan for a class without images."""
         logits = outputs[0][:, 0]
         labels = class_of(images.labels).to(logits.device)
         probabilities = (logits / self.temperature).softmax(-1)

@@ -1,4 +1,4 @@
-"""Train a detector to the end of a fixed budget of steps."""
+"""Train a detector for a fixed budget of steps."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from neural_sim.types import LabelledImages
 class Training:
     """Training settings of every detector, whatever the method that chose its images.
 
-    ``image_size`` is the side of the square images in pixels; ``warm_start`` says which distribution the images of the
-    warm start have, all parameters uniform or psi's initial one; ``warm_epochs`` are its epochs, ``cold_epochs`` those
-    of the detectors that are scored; ``real`` says whether labelled photographs train too. For the rest see
-    ``Optimisation``.
+    ``image_size`` is the side of the square images in pixels. ``warm_start`` says which distribution the images of the
+    warm start have: all parameters uniform, or psi's initial one. ``warm_epochs`` are the epochs of the warm start,
+    ``cold_epochs`` those of the detectors that are scored. ``real`` says whether labelled photographs train too. For
+    the rest see ``Optimisation``.
 
     Raises:
-        ValueError: batches of one image that should have photographs and synthetic images.
+        ValueError: a batch of one image should hold photographs and synthetic images.
     """
 
     image_size: Annotated[int, Ge(16)] = 96
@@ -57,7 +57,7 @@ class Training:
             )
 
     def of(self, epochs: int) -> Optimisation:
-        """Return the settings of a training of this many epochs."""
+        """Return the settings of a training with this many epochs."""
         return Optimisation(epochs, self.batch_size, self.learning_rate, self.weight_decay)
 
 
@@ -66,9 +66,9 @@ class TrainingHistory:
     """The course of a training.
 
     Attributes:
-        losses: mean training loss of each epoch, as met by the steps.
+        losses: mean training loss of each epoch, as seen by the steps.
         steps: optimiser steps done.
-        trajectory: the steps themselves, where they were to be recorded.
+        trajectory: the steps themselves, if they were recorded.
     """
 
     losses: tuple[float, ...]
@@ -82,7 +82,7 @@ class Batches:
     ``drawn`` has the rows of each batch so far.
 
     Raises:
-        ValueError: a sampling of another number of images.
+        ValueError: the sampling is for another number of images.
     """
 
     def __init__(
@@ -127,25 +127,25 @@ def train_detector(
     recording: Recording | None = None,
     sampling: Sampling | None = None,
 ) -> tuple[Parameters, TrainingHistory]:
-    """Train from ``params``, which stay as they are.
+    """Train from ``params``, which are not changed.
 
     Args:
         detector: the detector.
         params: where the training starts.
         generator: shuffles the batches.
         how: the optimiser and its budget.
-        images: on the device of ``params``; where they come as features, or the detector freezes its backbone, the
-            pyramid and the head alone are trained.
-        anchor: theta_0, which adds the detector's proximal term over what is trained to the loss; None: without it.
-        recording: what the history keeps of the steps (None: nothing).
-        sampling: how batches are drawn of ``images`` (None: each image once in every epoch).
+        images: the images, on the device of ``params``. If they are given as features, or the detector freezes its
+            backbone, only the pyramid and the head are trained.
+        anchor: theta_0; adds the detector's proximal term, over what is trained, to the loss. None: no such term.
+        recording: which part of the steps the history keeps (None: nothing).
+        sampling: how batches are drawn from ``images`` (None: each image once in every epoch).
 
     Returns:
-        New parameters, detached, all of them (the frozen ones are the given tensors), and the history, whose losses
-        leave the proximal term out.
+        New, detached parameters, all of them (frozen ones are the given tensors), and the history, whose losses
+        exclude the proximal term.
 
     Raises:
-        ValueError: without images; for a recording that does not fit its memory; where the loss stops being finite.
+        ValueError: there are no images, the recording does not fit its memory limit, or the loss stops being finite.
     """
     if len(images) == 0:
         raise ValueError("train_detector: got no images, want at least one")
@@ -170,17 +170,17 @@ def train_detector(
 
 
 def _check_finite(losses: Sequence[float], how: Optimisation) -> None:
-    """Refuse a training that has diverged: its parameters are not numbers, and would detect nothing in silence."""
+    """Refuse a training that diverged: its parameters are not numbers, and would silently detect nothing."""
     for epoch, loss in enumerate(losses, 1):
         if not math.isfinite(loss):
             raise ValueError(
                 f"detector: the training loss is {loss} in epoch {epoch} of {how.epochs}, at a learning rate of "
-                f"{how.learning_rate:g}: want a smaller training.learning_rate, in the psi loop outer.learning_rate"
+                f"{how.learning_rate:g}: want a smaller training.learning_rate, or in the psi loop outer.learning_rate"
             )
 
 
 def _fit(module: DetectorModule, batches: Batches, device: torch.device) -> None:
-    """Run Lightning's loop without files and messages."""
+    """Run Lightning's loop without files or messages."""
     talker = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     level = talker.level
     talker.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""The record of a training, for its reverse pass: batches, learning rates, states and gradients of the steps."""
+"""The record of a training for its reverse pass: batches, learning rates, states and gradients of the steps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Recording:
     """The part of a training that is recorded.
 
     Args:
-        part: fraction of the steps, the last ones, that can be reversed.
+        part: fraction of the steps, counted from the end, that can be reversed.
         max_memory_mb: limit in MB. The record has the states of every sqrt(steps)-th step and all gradients; the states
             in between are recomputed elementwise. If the gradients do not fit, they are recomputed, at the cost of one
             more training.
@@ -38,14 +38,14 @@ class Recording:
         return steps - max(1, math.ceil(self.part * steps))
 
     def keeps_gradients(self, steps: int, state_bytes: int, vector_bytes: int) -> bool:
-        """Tell whether the gradients of all recorded steps fit into the limit with the states.
+        """Tell whether the gradients of all recorded steps fit into the limit together with the states.
 
         Raises:
             ValueError: not even the states fit.
         """
         count = steps - self.first(steps)
         length = segment_length(count)
-        # States at the segments' first steps, then one segment's states and gradients while it is reversed.
+        # States at the first step of each segment, plus one segment's states and gradients while it is reversed.
         least = (math.ceil(count / length) + length) * state_bytes + length * vector_bytes
         if least > self.max_memory_mb * MEGABYTE:
             raise ValueError(
@@ -60,8 +60,8 @@ class Trajectory:
     """A recorded training. Vectors are flat, in the order of the learned parameters.
 
     ``rows`` are each step's batch, as rows of the training set; the step's gradient is that of the batch's mean loss
-    (and proximal term). ``rates`` are the learning rates. ``checkpoints`` are the states before some steps,
-    ``gradients`` those of all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
+    (plus the proximal term). ``rates`` are the learning rates. ``checkpoints`` are the states before some steps;
+    ``gradients`` are those of all steps from the first checkpoint on, or none. ``end`` is theta after the last step.
     """
 
     rule: AdamW
@@ -97,7 +97,7 @@ class Trajectory:
         return [range(begin, end) for begin, end in zip(starts, ends, strict=True)][::-1]
 
     def replayed(self, segment: range, gradient_at: GradientAt) -> list[tuple[State, Float[Tensor, "n"]]]:
-        """Return the state before each step of a segment, and its gradient: recorded, or by ``gradient_at``."""
+        """Return the state before each step of a segment, and its gradient: recorded, or from ``gradient_at``."""
         replayed, state = [], self.checkpoints[segment.start]
         for step in segment:
             gradient = self.gradients.get(step)
@@ -110,7 +110,7 @@ class Trajectory:
 
 
 def segment_length(steps: int) -> int:
-    """Return the distance of checkpoints at which they and one segment's states take the least memory together."""
+    """Return the distance between checkpoints that minimises the memory of all of them and one segment's states."""
     return max(1, math.isqrt(max(0, steps - 1)) + 1)
 
 
@@ -137,9 +137,7 @@ class Recorder:
         vector = theta.numel() * theta.element_size()
         self._keeps_gradients = recording.keeps_gradients(steps, len(rule.begin(theta)) * vector, vector)
         if not self._keeps_gradients:
-            logger.info(
-                "unrolled: gradients do not fit %g MB and are computed again", recording.max_memory_mb
-            )
+            logger.info("unrolled: gradients do not fit %g MB and are recomputed", recording.max_memory_mb)
 
     def step(self, state: Callable[[], State], gradient: Callable[[], Tensor], rate: float) -> None:
         """Record a step before it is taken. ``state`` and ``gradient`` return copies and are called only if needed."""
@@ -153,7 +151,7 @@ class Recorder:
             self._gradients[number] = gradient()
 
     def trajectory(self, rows: tuple[Int[Tensor, "_"], ...], end: Float[Tensor, "n"]) -> Trajectory:
-        """Return the recorded training, of these batches; ``end`` is theta after the last step."""
+        """Return the recorded training; ``rows`` are its batches and ``end`` is theta after the last step."""
         return Trajectory(self.rule, rows, tuple(self._rates), self._checkpoints, self._gradients, end)
 
 
