@@ -1,4 +1,4 @@
-"""What the mesh renderers share."""
+"""The base class of the mesh renderers."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class MeshRenderer(ABC):
         camera_to_world: Float[Tensor, "n 4 4"],
         lighting: Lighting | None = None,
     ) -> Float[Tensor, "n h w 4"]:
-        """RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
+        """Render RGBA in [0, 1] with straight alpha, float32 on the CPU; colour is 0 where alpha is.
 
-        ``lighting`` is that of these views; None: the renderer's own.
+        ``lighting`` lights these views; None: the renderer's own.
         """
         size = (camera.width * self.supersample, camera.height * self.supersample)
         drawn = self._draw(
@@ -55,7 +55,7 @@ class MeshRenderer(ABC):
     def _draw(
         self, surface: Surface, camera: PinholeCamera, poses: Float64[np.ndarray, "n 4 4"]
     ) -> Iterator[Float32[np.ndarray, "height width 4"]]:
-        """Premultiplied RGBA at every sample, pose by pose."""
+        """Yield premultiplied RGBA at every sample, pose by pose."""
 
 
 def straight_alpha(
@@ -63,8 +63,8 @@ def straight_alpha(
 ) -> Float32[np.ndarray, "height width 4"]:
     """Average ``factor`` x ``factor`` premultiplied RGBA samples, then divide colour by alpha (0 where alpha is 0).
 
-    Straight colours must not be averaged themselves: the colour of an empty sample would count. NumPy rather than
-    torch: torch's threads wait for OpenGL's software rasteriser's and lose 20 ms an image.
+    Straight colours must not be averaged directly: the colours of empty samples would count. This uses NumPy because
+    torch's threads wait for those of OpenGL's software rasteriser and lose 20 ms an image.
     """
     if factor > 1:
         height, width = premultiplied.shape[0] // factor, premultiplied.shape[1] // factor

@@ -13,7 +13,7 @@ from neural_sim.ranges import Fraction, Matching, NonNegative, check, validated
 
 Vector = tuple[float, float, float]
 Kelvin = Annotated[float, Ge(1500.0), Le(40000.0)]
-"""Temperatures whose colour is known; colder bodies are outside sRGB's gamut."""
+"""Temperatures whose colour can be computed; colder bodies are outside sRGB's gamut."""
 
 SECOND_RADIATION_CONSTANT = 1.438777e7  # h c / k in nm K
 SRGB_FROM_XYZ = np.array(
@@ -30,10 +30,10 @@ LOBES = (
 @validated
 @dataclass(frozen=True)
 class Light:
-    """A directional light. ``direction`` points towards it, in the world frame; it need not be of unit length.
+    """A directional light. ``direction`` points towards it, in the world frame, and may have any length but zero.
 
-    ``colour`` is sRGB and multiplies ``intensity``; a negative intensity takes light away (affine mixtures do).
-    ``fill`` is the part that arrives from all sides, as a room's walls scatter it.
+    ``colour`` is sRGB and multiplies ``intensity``; a negative intensity removes light (as in affine mixtures).
+    ``fill`` is the fraction that arrives from all sides, as if scattered by the walls of a room.
     """
 
     direction: Annotated[Vector, Matching(any, "three numbers, not all of them zero")]
@@ -45,9 +45,10 @@ class Light:
 @validated
 @dataclass(frozen=True)
 class Lighting:
-    """A white surface has the colour ``ambient`` plus what each of ``lights`` sheds on it.
+    """A white surface has the colour ``ambient`` plus the contributions of ``lights``.
 
-    Linear in the lights' intensities as long as nothing leaves [0, 1]. Colours are sRGB values without gamma handling.
+    This is linear in the lights' intensities as long as nothing leaves [0, 1]. Colours are sRGB values; gamma is
+    ignored.
     """
 
     lights: tuple[Light, ...] = (Light((0.3, 0.4, 1.0), 0.3),)
@@ -55,7 +56,7 @@ class Lighting:
 
 
 def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.ndarray, "n 3"]:
-    """Return the factor of albedo for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
+    """Return the factor on the albedo for unit normals: ambient + sum_i I_i c_i (f_i + (1 - f_i) max(n . l_i, 0))."""
     shade = np.full((len(normals), 3), lighting.ambient)
     for light in lighting.lights:
         towards = np.asarray(light.direction, dtype=np.float64)
@@ -66,7 +67,7 @@ def lambert(normals: Float[np.ndarray, "n 3"], lighting: Lighting) -> Float[np.n
 
 
 def temperature_colour(kelvin: float) -> Vector:
-    """SRGB (gamma encoded, largest channel 1) of a black body, by Planck's law and the CIE 1931 observer.
+    """Return the sRGB colour (gamma encoded, largest channel 1) of a black body, by Planck's law and CIE 1931.
 
     Raises ``ValueError`` outside ``Kelvin``'s range.
     """

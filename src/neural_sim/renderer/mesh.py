@@ -1,4 +1,4 @@
-"""Meshes through OpenGL: pyrender offscreen. Importing this module imports pyrender; choose through ``views``."""
+"""Meshes through OpenGL: pyrender offscreen. Importing this module imports pyrender; use ``views`` to choose it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
 
 with contextlib.suppress(ImportError):
-    # Mesa's software rasteriser loads LLVM, and triton (which torch's optimisers import) brings its own: loaded second,
-    # triton crashes the process; loaded first, both live. Machines without triton have no such trouble.
+    # Mesa's software rasteriser loads LLVM, and triton (which torch's optimisers import) has its own. If triton is
+    # loaded second, it crashes the process; if it is loaded first, both work. Without triton there is no such trouble.
     import triton  # noqa: F401
 
-# Closer than this to the camera nothing is drawn; objects have radius 1 and cameras keep outside of them.
+# Nothing closer to the camera than this is drawn; objects have radius 1, and cameras stay outside them.
 NEAR, FAR = 0.01, 100.0
 WRAPS = {"repeat": GLTF.REPEAT, "mirror": GLTF.MIRRORED_REPEAT, "clamp": GLTF.CLAMP_TO_EDGE}
 
@@ -30,9 +30,9 @@ WRAPS = {"repeat": GLTF.REPEAT, "mirror": GLTF.MIRRORED_REPEAT, "clamp": GLTF.CL
 class PyrenderRenderer(MeshRenderer):
     """Renders with pyrender's unlit pass over a surface whose light is baked into its vertices.
 
-    pyrender's own lights are physically based and scaled by pi; baking gives Lambert's law exactly. Each pixel
-    averages ``supersample``^2 samples, each of four of OpenGL's own. One OpenGL context serves all views and all
-    renderers of the process. Needs PYOPENGL_PLATFORM set before this module is imported.
+    pyrender's own lights are physically based and scaled by pi; baking follows Lambert's law exactly. Each pixel
+    averages ``supersample``^2 samples, each of which averages four OpenGL samples. One OpenGL context serves all views
+    and all renderers of the process. PYOPENGL_PLATFORM must be set before this module is imported.
     """
 
     name = "pyrender"
@@ -50,15 +50,15 @@ class PyrenderRenderer(MeshRenderer):
         context = _shared_context(camera.width, camera.height)
         for pose in poses:
             scene.set_pose(eye, pose)
-            # Returns colour and depth, or None for flags that are not used here.
+            # Returns colour and depth, or None with flags that are not used here.
             rendered = context.render(scene, flags=flags)[0]  # pyright: ignore[reportOptionalSubscript]
             yield np.asarray(rendered) / np.float32(255.0)
 
 
 def _primitives(surface: Surface) -> pyrender.Mesh:
-    """Front faces of each texture, and the same faces turned round with the light of their inner side.
+    """Build the front faces of each texture, and the same faces reversed with the light on their inner side.
 
-    Each is culled where it faces away, so exactly one of the two is seen and they never fight for depth.
+    Faces are culled if they face away, so that exactly one of the two is seen and they never overlap in depth.
     """
     sides = []
     for page in np.unique(surface.page).tolist():
@@ -92,7 +92,7 @@ def _material(texture: Texture | None) -> pyrender.MetallicRoughnessMaterial:
     )
 
 
-# One context a process: freeing one of two EGL contexts ends the display they share, and with it the other.
+# One context a process: freeing one of two EGL contexts closes the display that they share, and the other with it.
 _context: pyrender.OffscreenRenderer | None = None
 
 
@@ -104,7 +104,7 @@ def _shared_context(width: int, height: int) -> pyrender.OffscreenRenderer:
     return _context
 
 
-# PyOpenGL's modules are gone by the time the garbage collector would get here.
+# The garbage collector would come too late: PyOpenGL's modules are gone by then.
 @atexit.register
 def _free_context() -> None:
     if _context is not None:

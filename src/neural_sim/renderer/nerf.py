@@ -1,4 +1,4 @@
-"""Images of a radiance field, and their derivative with respect to the rays."""
+"""Images of a radiance field, and their derivatives with respect to the rays."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Quality = Literal["draft", "normal", "final"]
 
 @dataclass(frozen=True)
 class Omissions:
-    """The approximations of a quality.
+    """The approximations that a quality makes.
 
-    Samples behind a transmittance of ``termination`` are skipped, and ``step`` multiplies the field's step.
+    Samples behind a transmittance of ``termination`` are skipped; ``step`` is a factor on the field's step.
     """
 
     termination: float
@@ -43,14 +43,14 @@ QUALITIES: dict[Quality, Omissions] = {
 class NerfRenderer:
     """Renders whole views at once, or any bundle of rays with derivatives.
 
-    Which samples are taken depends on the rays alone, so a replay is identical, and values and derivatives of one
-    quality are those of the same function.
+    The choice of samples depends on the rays alone, so that a replay is identical, and values and derivatives at one
+    quality belong to the same function.
 
     Args:
         quality: the approximations; conf/renderer/nerf.yaml has the measured error of each.
-        rays_per_chunk: rays rendered at once, which bounds the working memory.
-        termination: transmittance behind which samples are skipped (0: none), instead of the quality's.
-        step: factor of the field's step, instead of the quality's.
+        rays_per_chunk: number of rays rendered at once, which bounds the working memory.
+        termination: transmittance behind which samples are skipped (0: none); overrides the quality's.
+        step: factor on the field's step; overrides the quality's.
         cull: cast rays only for pixels that may see the field's occupied cells; changes no pixel.
         skip_empty: step over space that the field knows to be empty; changes no pixel.
     """
@@ -91,7 +91,7 @@ class NerfRenderer:
         camera_to_world: Float[Tensor, "views 4 4"],
         exact: bool = False,
     ) -> tuple[Float[Tensor, "views height width 3"], Float[Tensor, "views height width"]]:
-        """Premultiplied colour and opacity; ``exact`` leaves out nothing, at the field's own step."""
+        """Render premultiplied colour and opacity; ``exact`` skips nothing and uses the field's own step."""
         if exact:
             image = render_views(field, camera, camera_to_world, 0.0, self.rays_per_chunk, False, False)
         else:
@@ -109,9 +109,9 @@ class NerfRenderer:
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """Render as ``render`` does, and the depth along the view axis, in object radii.
+        """Render like ``render``, with the depth along the view axis in object radii.
 
-        The depth is where a pixel's ray has lost half of its light; 0 where it loses less, at opacities below 1/2.
+        The depth is where a pixel's ray has lost half of its light; it is 0 at opacities below 1/2, where none has.
         """
         image = render_views(
             field.with_step(self.step), camera, camera_to_world, self.termination, self.rays_per_chunk,
@@ -127,10 +127,10 @@ class NerfRenderer:
         camera_to_world: Float[Tensor, "views 4 4"],
         rates: Float[Tensor, "m views 4 4"],
     ) -> tuple[Maps, list[Maps]]:
-        """Render as ``render`` does, with m derivatives where the cameras move at ``rates`` (then a moving light's).
+        """Render like ``render``, with m derivatives for cameras that move at ``rates`` (then those of a moving light).
 
-        Rays' directions stay of unit length whatever the rates, so that those of a focal length can be among them.
-        One pass computes both; memory beyond the maps is that of ``rays_per_chunk`` rays.
+        Ray directions keep unit length whatever the rates, so that the rates may include that of a focal length.
+        One pass computes both; beyond the maps, it takes the memory of ``rays_per_chunk`` rays.
         """
         field, shape = field.with_step(self.step), (len(camera_to_world), camera.height, camera.width, 4)
         value = camera_to_world.new_zeros(shape)
@@ -147,10 +147,10 @@ class NerfRenderer:
     def render_rays(
         self, field: RadianceField, rays: Rays
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-        """Premultiplied colour and opacity of rays (rays, 3), zero where a ray misses.
+        """Render premultiplied colour and opacity of rays (rays, 3); zero where a ray misses.
 
         Differentiable in origins and directions, in reverse and forward mode; the sample distances are constants,
-        chosen without noise. Raises ValueError for another shape of rays.
+        chosen without noise. Raises ValueError for rays of another shape.
         """
         if (
             rays.origins.ndim != 2
@@ -165,7 +165,7 @@ class NerfRenderer:
 
 
 def _view_cosines(camera: PinholeCamera, like: Tensor) -> Float[Tensor, "height width"]:
-    """Cosines of the angles between the rays of pixels and the view axis."""
+    """Return the cosines of the angles between the pixels' rays and the view axis."""
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     x = (torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5 - cx) / fx
     y = (torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5 - cy) / fy

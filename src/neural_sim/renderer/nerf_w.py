@@ -17,10 +17,10 @@ from neural_sim.types import Maps, PinholeCamera, Rays
 
 
 class NerfWRenderer(NerfRenderer):
-    """``NerfRenderer`` whose views have weights over the field's anchors, normally adding up to 1.
+    """A ``NerfRenderer`` whose views have weights over the field's anchors, normally adding up to 1.
 
     A view's code is ``weights @ field.anchors`` (paper, Sec. 3.2). Views of equal weights are rendered as one batch
-    under one code. Opacity depends on no weight. Without weights the anchors count equally.
+    under one code. Opacity does not depend on the weights. Without weights the anchors count equally.
     """
 
     @override
@@ -40,7 +40,7 @@ class NerfWRenderer(NerfRenderer):
         exact: bool = False,
         weights: Float[Tensor, "views k"] | None = None,
     ) -> tuple[Float[Tensor, "views height width 3"], Float[Tensor, "views height width"]]:
-        """Premultiplied colour and opacity; ``exact`` leaves out nothing, at the field's own step."""
+        """Render premultiplied colour and opacity; ``exact`` skips nothing and uses the field's own step."""
         field, weights = _checked(field, weights, len(camera_to_world))
         shape = (len(camera_to_world), camera.height, camera.width)
         rgb, opacity = camera_to_world.new_empty(*shape, 3), camera_to_world.new_empty(shape)
@@ -63,7 +63,7 @@ class NerfWRenderer(NerfRenderer):
         Float[Tensor, "views height width"],
         Float[Tensor, "views height width"],
     ]:
-        """Render as ``render`` does, and depth, see ``NerfRenderer.render_surface``."""
+        """Render like ``render``, with depth, see ``NerfRenderer.render_surface``."""
         field, weights = _checked(field, weights, len(camera_to_world))
         maps = camera_to_world.new_empty(len(camera_to_world), camera.height, camera.width, 5)
         for light, views in _groups(weights, maps.device):
@@ -82,9 +82,9 @@ class NerfWRenderer(NerfRenderer):
         weights: Float[Tensor, "views k"] | None = None,
         weight_rates: Float[Tensor, "q views k"] | None = None,
     ) -> tuple[Maps, list[Maps]]:
-        """Render as ``render`` does, with m derivatives where cameras move at ``rates``, then q where weights do.
+        """Render like ``render``, with m derivatives for cameras that move at ``rates``, then q for weights that do.
 
-        m or q may be 0. Opacity's derivatives by weights are exactly 0.
+        m or q may be 0. The derivatives of opacity by weights are exactly 0.
         """
         field, weights = _checked(field, weights, len(camera_to_world))
         if weight_rates is None:
@@ -108,10 +108,10 @@ class NerfWRenderer(NerfRenderer):
     def render_rays(
         self, field: RadianceField, rays: Rays, weights: Tensor | None = None
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-        """Premultiplied colour and opacity of rays (rays, 3), zero where a ray misses.
+        """Render premultiplied colour and opacity of rays (rays, 3); zero where a ray misses.
 
-        ``weights`` are those of all rays (k) or one row a ray (rays, k). Differentiable in origins, directions and
-        weights, in reverse and forward mode.
+        ``weights`` are shared by all rays (k) or have one row for each ray (rays, k). Differentiable in origins,
+        directions and weights, in reverse and forward mode.
         """
         if weights is None or weights.ndim == 1:
             field, row = _checked(field, None if weights is None else weights[None], 1)
@@ -127,7 +127,7 @@ class NerfWRenderer(NerfRenderer):
 def _checked(
     field: RadianceField, weights: Float[Tensor, "n k"] | None, count: int
 ) -> tuple[AppearanceField, Float[Tensor, "n k"]]:
-    """Return the field, which must have appearance codes, and weights [count, k] in its type.
+    """Return the field, which must have appearance codes, and weights [count, k] in its dtype.
 
     The weights stay on their own device: draws are on the CPU.
     """

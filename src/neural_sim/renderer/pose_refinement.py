@@ -1,8 +1,8 @@
-"""Camera poses of photographs, corrected until the photographs agree with one field of the object.
+"""Camera poses of photographs, corrected until the photographs agree on one field of the object.
 
-Each round fits a small field at the poses so far and moves each camera by Gauss-Newton steps towards what its
-photograph shows of that field: image alignment as in Lucas and Kanade (1981) against a radiance field. BARF (Lin et al.
-2021) moves field and poses by one optimiser instead.
+Each round fits a small field at the present poses and moves each camera by Gauss-Newton steps towards agreement of its
+photograph with that field: image alignment as in Lucas and Kanade (1981), against a radiance field. BARF (Lin et al.
+2021) moves field and poses with a single optimiser instead.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from neural_sim.types import Maps, PosedViews
 _log = logging.getLogger(__name__)
 
 FAIR = 0.1
-"""Scale of Fair's robust loss (1974), in units of colour and opacity. Larger differences, as of highlights and
+"""Scale of Fair's robust loss (1974), in units of colour and opacity. Larger differences, such as from highlights and
 passers-by, count by their size, smaller ones by their square."""
 DAMPING = 1e-3
-"""Of the normal equations, relative to their diagonal (Marquardt 1963)."""
+"""Damping of the normal equations, relative to their diagonal (Marquardt 1963)."""
 VIEWS_AT_ONCE = 16
 
 
 @validated
 @dataclass(frozen=True)
 class PoseRefinement:
-    """Corrects poses in rounds of a small field and steps of each camera.
+    """Corrects poses in rounds, each with a small field and steps of each camera.
 
-    Coarse fields find cameras that are far off and move right ones; the last third of the rounds has fields of twice
-    the resolution and steps, which put those back.
+    Coarse fields find cameras that are far off, but also move correct ones; the fields of the last third of the rounds
+    have twice the resolution and steps, and move those back.
 
     Args:
-        rounds: how often a field is fitted; 0: poses stay as they are given.
+        rounds: number of times a field is fitted; 0: the given poses are kept.
         updates: Gauss-Newton steps of each camera in a round.
         image_size: longer side in pixels to which larger views are reduced.
-        resolution: cells of the first rounds' fields along the unit sphere's diameter.
-        steps: optimiser steps of each of these fields.
-        batch_rays: rays of a step.
-        seed: of the order of rays; not the run's seed, so that runs share views.
+        resolution: cells along the unit sphere's diameter in the fields of the first rounds.
+        steps: optimiser steps for each of these fields.
+        batch_rays: rays in a step.
+        seed: seed of the order of rays; separate from the run's seed, so that runs share views.
     """
 
     rounds: NonNegativeInt = 0
@@ -68,13 +68,13 @@ class PoseRefinement:
     seed: NonNegativeInt = 0
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
-        """Return the views at corrected poses: the last ``held_out`` too, which train no field.
+        """Return the views at corrected poses, including the last ``held_out``, which train no field.
 
-        What the photographs leave open, a similarity of all cameras, is chosen such that the cameras stay where they
-        were on average.
+        Photographs determine the cameras only up to a similarity of all of them; it is chosen such that the cameras
+        stay where they were on average.
 
         Raises:
-            ValueError: as ``visual_hull``, where the silhouettes share no cell.
+            ValueError: as for ``visual_hull``, if the silhouettes share no cell.
         """
         if self.rounds == 0:
             return views
@@ -90,7 +90,7 @@ class PoseRefinement:
         turned = rotation_angle(poses[:, :3, :3], given[:, :3, :3])
         _log.info(
             "%d cameras corrected: by %.4f radii and %.2f degrees (medians; largest %.4f and %.2f); robust error of "
-            "renders by rounds %s",
+            "renders by round %s",
             len(views), float(shifted.median()), math.degrees(float(turned.median())), float(shifted.max()),
             math.degrees(float(turned.max())), ", ".join(f"{error:.5f}" for error in errors),
         )  # fmt: skip
@@ -112,7 +112,7 @@ class PoseRefinement:
 def reduce_views(views: PosedViews, size: int) -> PosedViews:
     """Reduce views to a longer side of at most ``size`` pixels, by the mean over each pixel's area.
 
-    A reduced pixel is known where all of its area is.
+    A reduced pixel is known if all of its area is.
     """
     camera = views.camera
     factor = size / max(camera.width, camera.height)
@@ -132,9 +132,9 @@ def reduce_views(views: PosedViews, size: int) -> PosedViews:
 def align(
     field: RadianceField, views: PosedViews, updates: int, renderer: NerfRenderer | None = None
 ) -> tuple[Float[Tensor, "views 4 4"], float]:
-    """Poses after ``updates`` Gauss-Newton steps on Fair's loss of renders against views, and the mean loss there.
+    """Return the poses after ``updates`` Gauss-Newton steps on Fair's loss of renders against views, and its mean.
 
-    Of the poses that a camera passes, the given one among them, the one of the least loss is returned: a step that
+    Of the poses that a camera passes, including the given one, the one with the least loss is returned: a step that
     overshoots is not kept.
     """
     renderer = renderer or NerfRenderer("draft")
@@ -169,8 +169,8 @@ def gauss_newton_step(
 ) -> Float[Tensor, "views 6"]:
     """Minimise the weighted squares of residual - jacobian step.
 
-    The weights are those of Fair's loss (iteratively reweighted least squares). The step is zero for a camera whose
-    image no motion changes.
+    The weights come from Fair's loss (iteratively reweighted least squares). The step is zero for a camera whose
+    image does not change with any motion.
     """
     weighted = jacobian / (1.0 + residual.abs() / FAIR)[..., None]
     normal = weighted.transpose(1, 2) @ jacobian
@@ -181,13 +181,13 @@ def gauss_newton_step(
 
 
 def fair_loss(residual: Tensor) -> Tensor:
-    """Fair's loss: r^2 / 2 for small residuals, c |r| for large ones."""
+    """Compute Fair's loss: r^2 / 2 for small residuals, c |r| for large ones."""
     ratio = residual.abs() / FAIR
     return FAIR**2 * (ratio - ratio.log1p())
 
 
 def _residuals(values: Maps, views: PosedViews) -> Float[Tensor, "views n"]:
-    """Return what the views show less the render, premultiplied."""
+    """Return what the views show minus the render, premultiplied."""
     alpha = views.images[..., 3:]
     shown = Maps(views.images[..., :3] * alpha, alpha[..., 0])
     return _shown(_flat(shown) - _flat(values), views)
@@ -212,7 +212,7 @@ def pose_rates(poses: Float[Tensor, "views 4 4"]) -> Float[Tensor, "6 views 4 4"
 
 
 def moved(poses: Float[Tensor, "views 4 4"], step: Float[Tensor, "views 6"]) -> Float[Tensor, "views 4 4"]:
-    """Cameras turned by a rotation vector in radians and shifted in object radii, both along their own axes."""
+    """Turn cameras by a rotation vector in radians and shift them in object radii, both along their own axes."""
     result = poses.clone()
     result[:, :3, :3] = poses[:, :3, :3] @ torch.linalg.matrix_exp(_cross(step[:, :3]))
     result[:, :3, 3] += (poses[:, :3, :3] @ step[:, 3:, None])[..., 0]
@@ -228,15 +228,16 @@ def _cross(vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def rotation_angle(a: Float[Tensor, "*n 3 3"], b: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:
-    """Return the angle in radians between rotations, exact for small ones, where arccos is not."""
+    """Return the angle in radians between rotations, exact for small angles, where arccos is not."""
     chord = (a - b).flatten(-2).norm(dim=-1) / math.sqrt(8.0)  # sine of half the angle
     return 2.0 * torch.asin(chord.clamp_max(1.0))
 
 
 def onto(poses: Float[Tensor, "views 4 4"], given: Float[Tensor, "views 4 4"]) -> Float[Tensor, "views 4 4"]:
-    """Move the poses by the similarity of least squares that takes their cameras to the given ones (Umeyama 1991).
+    """Move the poses by the least-squares similarity that takes their cameras to the given ones (Umeyama 1991).
 
-    It takes cameras' places, and points at one radius along each camera's axes, so that two cameras determine it.
+    It is fitted to the cameras' positions and to points at one radius along each camera's axes, so that two cameras
+    determine it.
     """
     matrix, _, _ = procrustes(_points(poses), _points(given), reflection=False)
     similarity = torch.from_numpy(matrix).to(poses)

@@ -17,8 +17,8 @@ from neural_sim.renderer.base import MeshRenderer
 from neural_sim.renderer.surface import Surface
 from neural_sim.types import PinholeCamera
 
-# Offsets from a pixel's centre, right and down: the usual rotated grid of OpenGL's 4x multisampling, which
-# pyrender uses, so that both renderers' silhouettes agree to a sample.
+# Offsets from a pixel's centre, right and down: the usual rotated grid of OpenGL's 4x multisampling, which pyrender
+# uses; with it, both renderers' silhouettes agree to a sample.
 EDGE_SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 
 
@@ -39,7 +39,7 @@ class RaycastRenderer(MeshRenderer):
 def _cast(
     mesh: trimesh.Trimesh, surface: Surface, pyramids: Sequence[Pyramid], camera: PinholeCamera, pose: Tensor
 ) -> Float[np.ndarray, "h w 4"]:
-    """Premultiplied RGBA: a ray through each pixel's centre, and four more where the silhouette runs."""
+    """Cast a ray through each pixel's centre, and four more along the silhouette; return premultiplied RGBA."""
     bundle = rays(camera, pose)
     origins, directions = bundle.origins.reshape(-1, 3).numpy(), bundle.directions.reshape(-1, 3).numpy()
     image = _trace(mesh, surface, pyramids, camera, origins, directions)
@@ -72,7 +72,7 @@ def _trace(
 
 
 def _silhouette(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels with both hit and empty ones among themselves and their eight neighbours."""
+    """Find pixels with both hit and empty ones among themselves and their eight neighbours."""
     padded = np.pad(mask, 1, mode="edge")
     height, width = mask.shape
     near = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
@@ -109,7 +109,7 @@ def _colours(
     for number, pyramid in enumerate(pyramids):
         of = page == number
         texels = uv_area[of] * pyramid.texels / np.maximum(area[of], 1e-12)
-        # OpenGL's isotropic filter takes the longer side of the footprint, which a slanted face stretches.
+        # OpenGL's isotropic filter uses the longer side of the footprint, which a slanted face stretches.
         texels_a_side = np.sqrt(texels) * sample[of] / np.maximum(np.abs(cosine[of]), 0.05)
         colour[of] = colour[of] * pyramid.sample(place[of], np.log2(texels_a_side + 1e-12))
     return np.clip(colour, 0.0, 1.0)
@@ -118,7 +118,7 @@ def _colours(
 def _barycentric(
     triangles: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Weights [n, 3] of each ray's hit on its triangle, distance, cosine (ray . outward normal) and area [n]."""
+    """Return each ray's weights [n, 3] on its triangle, distance, cosine (ray . outward normal) and area [n]."""
     edge_1, edge_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(edge_1, edge_2)
     length = np.maximum(np.linalg.norm(normal, axis=-1), 1e-20)
@@ -135,7 +135,7 @@ def _barycentric(
 
 
 class Pyramid:
-    """A texture and its halvings; ``sample`` blends the two levels next to the wanted footprint."""
+    """A texture and its halvings; ``sample`` blends the two levels nearest to the wanted footprint."""
 
     def __init__(
         self, texture: UInt8[np.ndarray, "h w 3"], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
@@ -151,7 +151,7 @@ class Pyramid:
             self._levels.append(np.asarray(image))
 
     def sample(self, uv: Float[np.ndarray, "n 2"], level: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """Colours in [0, 1]; ``uv`` has v upwards; ``level`` is log2 of texels a sample, 0 or less: full size."""
+        """Sample colours in [0, 1]; ``uv`` has v upwards; ``level``: log2 of texels a sample (0 or less: full size)."""
         level = np.clip(level, 0.0, len(self._levels) - 1.0)
         low = np.floor(level).astype(np.int64)
         part = (level - low)[:, None]
@@ -179,7 +179,7 @@ def _bilinear(texture: np.ndarray, uv: np.ndarray, wrap: tuple[Wrap, Wrap]) -> n
 
 
 def _wrapped(index: Int[np.ndarray, "n"], size: int, wrap: Wrap) -> Int[np.ndarray, "n"]:
-    """Return the texels that stand for indices beyond the edges."""
+    """Return the texels that replace indices beyond the edges."""
     if wrap == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap == "mirror":

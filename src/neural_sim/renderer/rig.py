@@ -1,4 +1,4 @@
-"""The anchor lights whose weights are an illumination, and the lights that training views see."""
+"""The anchor lights that an illumination weighs, and the lights of training views."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 class LightRig:
     """k anchor lights around an object, and mixtures of them: shade = ambient + sum_i w_i light_i.
 
-    Directions lie on a spherical Fibonacci lattice; temperatures are even in mired over ``temperature_range`` (kelvin)
-    and intensities even over ``intensity_range``, each in an order of its own, so that neither goes along with the
-    direction. ``fill`` is the part of each light that comes from all sides. White surfaces stay within [0, 1] where
-    ``ambient`` and the largest intensity add up to at most 1 and weights are those of a simplex.
+    Directions lie on a spherical Fibonacci lattice. Temperatures are even in mired over ``temperature_range`` (kelvin)
+    and intensities even over ``intensity_range``, each in another order, so that neither correlates with the direction.
+    ``fill`` is the fraction of each light that comes from all sides. White surfaces stay within [0, 1] if ``ambient``
+    and the largest intensity add up to at most 1 and the weights lie on a simplex.
     """
 
     anchors: Annotated[int, Ge(2)] = 6
@@ -61,7 +61,7 @@ class LightRig:
         )
 
     def _light(self, height: float, turn: float, warm: float, bright: float) -> Light:
-        """Height of the direction in [-1, 1], its turn about +z, and places within the ranges in [0, 1]."""
+        """Make a light from its height in [-1, 1], its turn about +z, and places in [0, 1] within both ranges."""
         radius = math.sqrt(1.0 - height * height)
         direction = (radius * math.cos(turn), radius * math.sin(turn), height)
         (low, high), (dim, full) = self.temperature_range, self.intensity_range
@@ -69,10 +69,10 @@ class LightRig:
         return Light(direction, dim + bright * (full - dim), temperature_colour(kelvin), self.fill)
 
     def lighting(self, weights: Sequence[float] | Float[Tensor, "k"]) -> Lighting:
-        """Return the anchors at these weights, of either sign.
+        """Return the mix of the anchors at these weights, which may have either sign.
 
         Raises:
-            ValueError: another number of weights.
+            ValueError: the number of weights is not that of the anchors.
         """
         values = [float(weight) for weight in weights]
         if len(values) != self.anchors:
@@ -90,8 +90,8 @@ class LightRig:
 class VariedLight:
     """The lights under which a field's training views are rendered.
 
-    A share ``anchored`` of the views, evenly spread, sees one anchor each, in turn; the rest sees mixtures, in turn
-    too: ``mixtures`` different ones, uniform over the simplex.
+    A fraction ``anchored`` of the views, evenly spread, sees one anchor each, in turn. The rest sees mixtures, also in
+    turn: ``mixtures`` different ones, uniform over the simplex.
     """
 
     rig: LightRig = field(default_factory=LightRig)
@@ -99,9 +99,9 @@ class VariedLight:
     mixtures: PositiveInt = 12
 
     def weights(self, count: int, generator: torch.Generator) -> Float[Tensor, "count k"]:
-        """Each view's weights over the anchors, float32.
+        """Return each view's weights over the anchors, float32.
 
-        Raises ``ValueError`` where so few views leave an anchor out.
+        Raises ``ValueError`` if there are too few views to show every anchor.
         """
         k = self.rig.anchors
         if math.floor(count * self.anchored) < k:
@@ -117,6 +117,6 @@ class VariedLight:
 
 
 def _spread(count: int, ratio: float) -> list[float]:
-    """0 to 1 in ``count`` even places, in the order of the fractions of multiples of an irrational ratio."""
+    """Return ``count`` even places from 0 to 1, in the order of the fractions of multiples of an irrational ratio."""
     order = sorted(range(count), key=lambda i: (i * ratio) % 1.0)
     return [order.index(i) / (count - 1) for i in range(count)]

@@ -17,12 +17,12 @@ from neural_sim.renderer.lighting import Lighting, lambert
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh with its light baked in: albedo times shade, both interpolated over each triangle, is the colour.
+    """A mesh with baked light: its colour is albedo times shade, both interpolated over each triangle.
 
-    The light and the object share one frame, so the shade belongs to the vertex and no renderer has to agree with
-    another about lights or materials. ``front`` holds where a face is seen from outside, ``back`` from inside (open
-    and badly wound meshes). ``albedo`` per vertex in [0, 1] is white where a texture carries the colour. ``page`` is
-    each face's texture, -1: none.
+    The light and the object share one frame. The shade therefore belongs to the vertex, and renderers need not agree on
+    lights or materials. ``front`` applies where a face is seen from outside, ``back`` from inside (open and badly wound
+    meshes). ``albedo``, per vertex in [0, 1], is white where a texture carries the colour. ``page`` is each face's
+    texture, -1: none.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -36,10 +36,10 @@ class Surface:
 
 
 def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
-    """Read geometry, colours and texture out of a trimesh, whichever of its visual kinds holds them.
+    """Read geometry, colours and texture from a trimesh, whichever of its visual kinds holds them.
 
-    Raises ``ValueError`` for a mesh without faces or with vertices or normals that are not finite
-    (``neural_sim.objects.mesh.repair`` mends those).
+    Raises ``ValueError`` for a mesh without faces, or with vertices or normals that are not finite
+    (``neural_sim.objects.mesh.repair`` repairs those).
     """
     if len(mesh.faces) == 0:
         raise ValueError("renderer: the mesh has no faces")
@@ -70,7 +70,7 @@ def shaded_surface(mesh: trimesh.Trimesh, lighting: Lighting) -> Surface:
 
 
 def _textured(visual: TextureVisuals, count: int) -> tuple[np.ndarray, Texture | None]:
-    """Albedo and texture; a material without an image has only its one colour."""
+    """Return albedo and texture; a material without an image has only its one colour."""
     material = visual.material
     image, factor = getattr(material, "image", None), np.ones(3)
     if isinstance(material, PBRMaterial):

@@ -1,4 +1,4 @@
-"""Posed views of an object, by whichever mesh renderer this machine can run."""
+"""Posed views of an object, drawn by a mesh renderer that works on this machine."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from neural_sim.types import PinholeCamera, PosedViews
 log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "pyrender", "raycast"]
-"""What draws meshes; auto: pyrender over EGL, else over OSMesa, else ray casting, which the log then says."""
+"""What draws meshes. auto: pyrender over EGL, else over OSMesa, else ray casting, with a line in the log."""
 
 PROBE_SECONDS = 60
-# Draws one triangle: a context can be made and still fail at the first shader.
+# Draws one triangle: a context may be created and still fail at its first shader.
 PROBE = """
 import numpy, pyrender
 scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
@@ -54,7 +54,7 @@ def choose_mesh_renderer(
 
     Raises:
         ValueError: an unknown backend.
-        RuntimeError: ``pyrender`` is demanded, and no OpenGL answers.
+        RuntimeError: ``pyrender`` is required, but no OpenGL works.
     """
     check(backend, Backend, "renderer.backend")
     if backend == "raycast":
@@ -67,7 +67,7 @@ def choose_mesh_renderer(
             )
         log.warning("No OpenGL (EGL, OSMesa) on this machine: meshes are drawn by ray casting, more slowly")
         return RaycastRenderer(supersample, lighting)
-    # PyOpenGL picks its platform when it is first imported, so the variable comes before the import.
+    # PyOpenGL chooses its platform when it is first imported, so the variable is set before.
     os.environ["PYOPENGL_PLATFORM"] = platform
     from neural_sim.renderer.mesh import PyrenderRenderer
 
@@ -77,10 +77,10 @@ def choose_mesh_renderer(
 
 @functools.cache
 def opengl_platform() -> str | None:
-    """``egl`` or ``osmesa``, the first that draws a triangle in a process of its own; None if neither does.
+    """Return ``egl`` or ``osmesa``, the first that draws a triangle in another process; None if neither does.
 
-    Trying in this process is no choice: PyOpenGL keeps the first platform, and a broken driver may abort. A
-    PYOPENGL_PLATFORM set by the user is the only one tried.
+    This process cannot try them: PyOpenGL keeps the first platform, and a broken driver may abort. If the user has set
+    PYOPENGL_PLATFORM, only that is tried.
     """
     wanted = os.environ.get("PYOPENGL_PLATFORM")
     for platform in (wanted,) if wanted else ("egl", "osmesa"):
@@ -107,9 +107,9 @@ def render_views(
     rig: LightRig | None = None,
     weights: Float[Tensor, "views k"] | None = None,
 ) -> PosedViews:
-    """Render views of a normalised object with their cameras (OpenGL axes, object radii).
+    """Render views of a normalised object, and return them with their cameras (OpenGL axes, object radii).
 
-    With a ``rig`` each view is lit by the anchors at its ``weights``; views that share weights are rendered together.
+    With a ``rig``, each view is lit by the anchors at its ``weights``; views that share weights are rendered together.
     """
     if rig is None or weights is None:
         images = renderer.render(item.mesh, camera, camera_to_world)
@@ -123,7 +123,7 @@ def render_views(
 
 
 OutsideSphere = Annotated[float, Gt(1)]
-"""Distance of a camera outside of the object's bounding sphere, in object radii."""
+"""Distance of a camera that is outside the object's bounding sphere, in object radii."""
 
 
 @validated
@@ -131,8 +131,8 @@ OutsideSphere = Annotated[float, Gt(1)]
 class Views:
     """Posed views that train a field: uniform poses over both angles, uniform distances (paper, Secs. 4 and B.2).
 
-    ``count`` views are trained on; ``held_out`` more, the last, only score the field. ``image_size`` in pixels,
-    ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
+    ``count`` views are used for training; ``held_out`` more, the last ones, only score the field. ``image_size`` is in
+    pixels, ``distance_range`` in object radii. ``lights`` vary over the views; None: one fixed light.
     """
 
     count: PositiveInt = 100
@@ -147,7 +147,7 @@ class Views:
 
     def __post_init__(self) -> None:
         if self.lights is not None:
-            self.lights.weights(self.count, torch.Generator())  # each anchor lights a trained view
+            self.lights.weights(self.count, torch.Generator())  # each anchor must light a view
 
     def camera(self, image_size: int) -> PinholeCamera:
         """Return the square camera of this field of view."""
@@ -155,11 +155,11 @@ class Views:
 
     @property
     def rig(self) -> LightRig | None:
-        """The anchor lights, None where the light is fixed."""
+        """The anchor lights; None if the light is fixed."""
         return self.lights.rig if self.lights is not None else None
 
     def render(self, renderer: MeshRenderer, item: ObjectMesh) -> PosedViews:
-        """All views of one object, those held out last; equal seeds give equal poses and lights whatever the object."""
+        """Render all views of one object, held-out ones last; equal seeds give all objects equal poses and lights."""
         generator, total = torch.Generator().manual_seed(self.seed), self.count + self.held_out
         uniform = torch.rand((3, total), generator=generator)
         near, far = self.distance_range

@@ -1,4 +1,4 @@
-"""From objects rendered alone to labelled images of one or several of them, which can be composed again."""
+"""From objects rendered alone to labelled images of one or more of them, which can be composed again."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, Maps, SceneDraw
 
 CHUNK = 64
-"""Images composed together, which bounds the memory."""
+"""Number of images composed together, which bounds the memory."""
 
 Compose = Callable[[Float[Tensor, "m h w 3"], Float[Tensor, "m h w"]], LabelledImages]
 
 
 @dataclass(frozen=True)
 class RenderedObject:
-    """One object alone, m times: premultiplied colour and opacity, and the scene parameters of each.
+    """One object alone, m times: premultiplied colour and opacity, and the scene parameters of each render.
 
-    ``noise`` reproduces the draw; None for renders from a pool or of probes. ``relaxed`` is None for hard draws.
+    ``noise`` reproduces the draw; it is None for renders from a pool or of probes. ``relaxed`` is None for hard draws.
     ``tangents``, if rendered, are the maps' derivatives by the named numbers of the draw.
     """
 
@@ -40,22 +40,22 @@ class RenderedObject:
 
     @property
     def bins(self) -> Int[Tensor, "m"]:
-        """Bins of the first binned factor, for reports; -1 where nothing is binned."""
+        """Bins of the first binned factor, for reports; -1 if no factor is binned."""
         bins = self.draw.bins
         return bins[:, 0] if bins.shape[1] else torch.full((len(bins),), -1)
 
     def select(self, index: Int[Tensor, "k"]) -> RenderedObject:
-        """Return some of the renders, without what reproduces or differentiates them."""
+        """Return some of the renders, without the fields that reproduce or differentiate them."""
         there = index.to(self.rgb.device)
         return RenderedObject(self.draw.select(index), self.rgb[there], self.opacity[there])
 
 
 @dataclass(frozen=True)
 class RenderedImages:
-    """Labelled images with what they are made of, class by class.
+    """Labelled images with the renders they are made of, class by class.
 
-    ``rows[c]`` are the images of ``objects[c]``, which shows in each at most once. ``compose[c]`` makes these images
-    again from other maps of that object, with all else as it was; it is differentiable in the maps.
+    ``rows[c]`` are the images of ``objects[c]``, each of which shows it at most once. ``compose[c]`` makes these images
+    again from other maps of that object, with everything else unchanged; it is differentiable in the maps.
     """
 
     images: LabelledImages
@@ -69,7 +69,7 @@ class RenderedImages:
     def without_maps(self) -> RenderedImages:
         """Return the images without the maps that compose them again, which take more memory than the images.
 
-        Empty maps stay in their place: clones, since an empty view would keep all of the memory.
+        Empty maps remain in their place. They are clones, because an empty view would keep all of the memory.
         """
         objects = tuple(
             replace(part, rgb=part.rgb[:0].clone(), opacity=part.opacity[:0].clone()) for part in self.objects
@@ -83,7 +83,7 @@ def one_each(
     labels: Sequence[int],
     synthesizer: Synthesizer,
 ) -> RenderedImages:
-    """Compose an image of every render, object by object; ``labels`` are the objects' classes."""
+    """Compose one image of every render, object by object; ``labels`` are the objects' classes."""
     images, rows, compose, first = [], [], [], 0
     for part, nuisance, label in zip(objects, nuisances, labels, strict=True):
 
@@ -106,7 +106,7 @@ def one_each(
 
 @dataclass(frozen=True)
 class Shared:
-    """Images of several objects. ``place[i, l]`` is which render of its object is layer l of image i, -1 for none."""
+    """Images of several objects. ``place[i, l]`` is the render that is layer l of image i, -1 for none."""
 
     objects: tuple[RenderedObject, ...]
     layout: Layout
@@ -122,7 +122,7 @@ class Shared:
         nuisance: Nuisance,
         synthesizer: Synthesizer,
     ) -> Shared:
-        """Return the images of ``objects``, each class's renders in the order in which ``layout`` shows it."""
+        """Return the images of ``objects``, with each class's renders in the order in which ``layout`` shows it."""
         place = torch.full_like(layout.labels, -1)
         own = torch.full((len(layout),), -1)
         for label, part in enumerate(objects):
@@ -150,7 +150,7 @@ class Shared:
     def images(
         self, rows: Int[Tensor, "m"], columns: Int[Tensor, "m"] | None = None, maps: Maps | None = None
     ) -> LabelledImages:
-        """Compose the images ``rows``; ``maps`` take the place of their layers ``columns``."""
+        """Compose the images ``rows``; ``maps`` replace their layers ``columns``."""
         labels, place = self.layout.labels[rows], self.place[rows]
         like = self.objects[0]
         size = (*place.shape, *like.opacity.shape[1:])

@@ -19,7 +19,7 @@ from neural_sim.objects.files import content_digest
 from neural_sim.pictures import PHOTO_SUFFIXES, check_headers, picture_files, read_picture
 from neural_sim.ranges import Fraction, NonNegative, NonNegativeInt, PositiveFraction, PositiveInt, validated
 
-# Images worked on together: few enough to stay in the cache. Part of what a seed means, so not a setting.
+# Images processed together: few enough to stay in the cache. It is not a setting, because seeds depend on it.
 CHUNK = 16
 
 
@@ -45,8 +45,8 @@ class ProceduralClutter:
     Args:
         octaves: octaves of noise, from 2 cells across the image and doubling.
         contrast: amplitude of the noise.
-        shapes: shapes an image, drawn far to near.
-        distractors: fraction of shapes that are saturated red or blue, so that colour alone finds no object.
+        shapes: shapes in an image, drawn from far to near.
+        distractors: fraction of shapes that are saturated red or blue, so that no object can be found by colour alone.
         grain: standard deviation of pixel noise.
     """
 
@@ -69,7 +69,7 @@ class ProceduralClutter:
         generator: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """``n`` images, float32; random numbers are drawn on the CPU, all else is computed on ``device``."""
+        """Draw ``n`` images, float32; random numbers come from the CPU, everything else is computed on ``device``."""
         images = torch.empty(n, 3, height, width, device=device)
         for start in range(0, n, CHUNK):
             part = images[start : start + CHUNK]
@@ -85,7 +85,7 @@ class ProceduralClutter:
         wall, shapes = uniform[: 2 + 2 * self.octaves], uniform[2 + 2 * self.octaves :]
         images = self._wall(wall, height, width)
         for depth in range(self.shapes):
-            # Far shapes are large, near ones small, so that none hides all the others.
+            # Far shapes are large and near ones small, so that no shape hides all the others.
             size = 0.45 * 0.5 ** (2.0 * depth / max(self.shapes - 1, 1))
             cover, level = self._shape(shapes[2 * depth], height, width, size)
             colour = self._colour(shapes[2 * depth + 1])
@@ -94,7 +94,7 @@ class ProceduralClutter:
         return images.clamp_(0.0, 1.0)
 
     def _numbers(self, n: int) -> Iterator[tuple[int, ...]]:
-        """Shapes of the uniform numbers of n images, in the order in which they are drawn."""
+        """Yield the shapes of the uniform numbers for n images, in the order in which they are drawn."""
         yield from ((n, 1, 1, 1), (n, 3, 1, 1))
         for octave in range(self.octaves):
             cells = 2 ** (octave + 1) + 1
@@ -117,7 +117,7 @@ class ProceduralClutter:
     def _shape(
         self, u: Float[Tensor, "12 n 1 1"], height: int, width: int, size: float
     ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
-        """Coverage and brightness of one textured shape an image."""
+        """Return the coverage and brightness of one textured shape in each image."""
         extent = float(min(height, width))
         angle = math.pi * torch.where(u[0] < 0.5, 0.08 * (u[1] - 0.5), u[1])  # half of them nearly upright
         x = torch.arange(width, device=u.device) + 0.5 - width * (1.2 * u[2] - 0.1)
@@ -136,7 +136,7 @@ class ProceduralClutter:
         return cover, level
 
     def _colour(self, u: Float[Tensor, "5 n"]) -> Float[Tensor, "n 3 1 1"]:
-        """Any hue, mostly dull; a fraction ``distractors`` is saturated, near red or near blue."""
+        """Draw colours of any hue, mostly dull; a fraction ``distractors`` is saturated, near red or near blue."""
         strong = u[0] < self.distractors
         centre = torch.where(u[1] < 0.5, torch.zeros_like(u[1]), 0.61)
         hue = torch.where(strong, centre + 0.1 * (u[2] - 0.5), u[2])
@@ -154,7 +154,7 @@ class PhotoFolder:
     ``smallest`` is the side of the smallest crop relative to the largest.
 
     Raises:
-        ValueError: no folder, no photograph in it, or one that is none by its header.
+        ValueError: the folder does not exist or has no photograph, or a file in it is not an image by its header.
     """
 
     def __init__(self, root: str | Path, smallest: PositiveFraction = 0.4) -> None:
@@ -174,7 +174,7 @@ class PhotoFolder:
         generator: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> Float[Tensor, "n 3 height width"]:
-        """``n`` crops, float32. Raises ``ValueError`` naming a file that cannot be read."""
+        """Draw ``n`` crops, float32. Raises ``ValueError``, with the file, for a file that cannot be read."""
         chosen = torch.randint(len(self.files), (n,), generator=generator).tolist()
         uniform = torch.rand((n, 3), generator=generator, dtype=torch.float64).tolist()
         images = torch.empty(n, 3, height, width)
@@ -189,7 +189,7 @@ class PhotoFolder:
         return content_digest({path.relative_to(self.root).as_posix(): path for path in self.files})
 
     def digest(self) -> str:
-        """SHA-256 of the photographs' names and contents, for store keys."""
+        """Return the SHA-256 of the photographs' names and contents, for store keys."""
         return self._digest
 
     def _crop(self, photo: Image.Image, height: int, width: int, u: float, v: float, w: float) -> Tensor:

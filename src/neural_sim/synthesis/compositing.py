@@ -10,7 +10,7 @@ from torch import Tensor
 def composite(
     rgb: Float[Tensor, "n h w 3"], opacity: Float[Tensor, "n h w"], background: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "n 3 h w"]:
-    """``rgb + (1 - opacity) * background``, with ``rgb`` premultiplied by opacity as a radiance field gives it."""
+    """Compute ``rgb + (1 - opacity) * background``, with ``rgb`` premultiplied by opacity as in a radiance field."""
     if rgb.shape != (*opacity.shape, 3) or background.shape != (len(opacity), 3, *opacity.shape[1:]):
         raise ValueError(
             "composite: want rgb [n, h, w, 3], opacity [n, h, w], background [n, 3, h, w], got "
@@ -22,7 +22,7 @@ def composite(
 def draw_shift(
     n: int, fraction: float, height: int, width: int, generator: torch.Generator
 ) -> Int[Tensor, "n 2"]:
-    """Shifts (right, down) in whole pixels, uniform in +- ``fraction`` of width and height."""
+    """Draw shifts (right, down) in whole pixels, uniform in +- ``fraction`` of width and height."""
     if not 0.0 <= fraction <= 1.0:
         raise ValueError(f"shift must lie in [0, 1] (a fraction of the image's size), got {fraction}")
     reach = torch.tensor([int(fraction * width), int(fraction * height)])
@@ -31,7 +31,7 @@ def draw_shift(
 
 
 def apply_shift(image: Float[Tensor, "n h w *c"], shift: Int[Tensor, "n 2"]) -> Float[Tensor, "n h w *c"]:
-    """Move every image by its own (right, down); what comes in from outside is zero."""
+    """Move every image by its own shift (right, down); pixels that enter from outside are zero."""
     if shift.shape != (len(image), 2):
         raise ValueError(f"apply_shift: want shift [{len(image)}, 2], got {tuple(shift.shape)}")
     if not shift.any():
@@ -44,7 +44,7 @@ def apply_shift(image: Float[Tensor, "n h w *c"], shift: Int[Tensor, "n 2"]) -> 
     source = rows.clamp(0, height - 1)[:, :, None] * width + columns.clamp(0, width - 1)[:, None]
     pixels = image.reshape(n, height * width, -1)
     moved = pixels.gather(1, source.reshape(n, -1, 1).expand(-1, -1, pixels.shape[-1]))
-    # where, not a product: a NaN at the image's edge must not enter from outside.
+    # where instead of a product: a NaN at the image's edge must not enter from outside.
     return torch.where(inside.reshape(n, -1, 1), moved, 0.0).reshape(image.shape)
 
 
@@ -55,11 +55,11 @@ def stacked(
 ) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n layers h w"]]:
     """Composite layers, the nearest first, over a background; ``rgb`` is premultiplied by ``opacity``.
 
-    Each object lies in a plane of its own: the nearer hides the farther, whole objects at a time.
+    Each object is a plane at one depth: the nearer object hides the farther one as a whole.
 
     Returns:
-        The images, and how much of each layer's opacity is visible: ``T_l o_l`` with ``T_l`` the product of ``1 - o``
-        of the layers before.
+        The images, and how much of each layer's opacity is visible: ``T_l o_l``, with ``T_l`` the product of ``1 - o``
+        over the layers before.
     """
     clear = torch.ones_like(opacity[:, :1])
     before = torch.cat([clear, (1.0 - opacity).cumprod(1)], 1)
@@ -71,7 +71,7 @@ def stacked(
 def by_depth(
     distance: Float[Tensor, "n layers"], order: Float[Tensor, "n layers"]
 ) -> Int[Tensor, "n layers"]:
-    """Return the indices of the layers, the nearest first; among equal distances by ``order``."""
+    """Return the indices of the layers, the nearest first; ``order`` decides among equal distances."""
     first = order.argsort(dim=1, stable=True)
     return first.gather(1, distance.gather(1, first).argsort(dim=1, stable=True))
 
@@ -83,10 +83,10 @@ def visible_boxes(
     minimum_area: float,
     min_visibility: float,
 ) -> tuple[Float[Tensor, "n layers 4"], Bool[Tensor, "n layers"]]:
-    """Return the box round each layer's visible pixels, and whether it has one.
+    """Return the box around each layer's visible pixels, and whether it has one.
 
-    Fewer than ``minimum_area`` visible pixels, or a smaller part than ``min_visibility`` of those that the image would
-    show of the object alone, have none.
+    A layer has no box if it has fewer than ``minimum_area`` visible pixels, or less than the fraction
+    ``min_visibility`` of the pixels that the image would show of the object alone.
     """
     n, layers = opacity.shape[:2]
     boxes, present = boxes_from_opacity(visible.flatten(0, 1), threshold, minimum_area)
@@ -98,10 +98,10 @@ def visible_boxes(
 def boxes_from_opacity(
     opacity: Float[Tensor, "n h w"], threshold: float = 0.5, minimum_area: float = 1.0
 ) -> tuple[Float[Tensor, "n 1 4"], Bool[Tensor, "n"]]:
-    """Return the tight box (x0, y0, x1, y1) round pixels of opacity above ``threshold``, and whether there is one.
+    """Return the tight box (x0, y0, x1, y1) around pixels of opacity above ``threshold``, and whether there is one.
 
-    Boxes run along pixel edges, so a single pixel gives a box of 1 x 1. An image whose mask has fewer than
-    ``minimum_area`` pixels (or none) has no box: zeros and False. No derivative passes through.
+    Boxes run along pixel edges, so that a single pixel has a box of 1 x 1. An image whose mask has fewer than
+    ``minimum_area`` pixels (or none) has no box: zeros and False. Not differentiable.
     """
     if opacity.ndim != 3:
         raise ValueError(f"boxes_from_opacity: want opacity [n, h, w], got shape {tuple(opacity.shape)}")
@@ -114,7 +114,7 @@ def boxes_from_opacity(
 
 
 def _span(occupied: Bool[Tensor, "n s"]) -> tuple[Tensor, Tensor]:
-    """First occupied index, and one past the last."""
+    """Return the first occupied index, and one past the last."""
     first = occupied.int().argmax(-1)
     last = occupied.shape[-1] - occupied.flip(-1).int().argmax(-1)
     return first, last

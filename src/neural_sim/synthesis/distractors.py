@@ -1,4 +1,4 @@
-"""Things that are no class, pasted behind and in front of the objects: cut-outs, pictures with an alpha channel."""
+"""Distractors: things of no class, cut out of pictures with an alpha channel, behind and in front of the objects."""
 
 from __future__ import annotations
 
@@ -41,16 +41,17 @@ class Cover:
 @validated
 @dataclass(frozen=True)
 class Distractors:
-    """Random cut-outs of a folder, at random places and sizes, behind the objects or in front of them.
+    """Random cut-outs from a folder, at random places and sizes, behind the objects or in front of them.
 
     Args:
         root: a folder with pictures that have an alpha channel (png, webp, tif); None: no distractors.
-        count: fewest and most an image.
-        size: smallest and largest longer side, as a fraction of the image's shorter one.
-        front: probability of being in front of the objects, which it then hides.
+        count: smallest and largest number in an image.
+        size: smallest and largest longer side, as a fraction of the image's shorter side.
+        front: probability that one is in front of the objects, which it then hides.
 
     Raises:
-        ValueError: no folder, no picture in it, or one that by its header is none or has no alpha channel.
+        ValueError: the folder does not exist or has no picture, or a file's header shows no picture with an alpha
+            channel.
     """
 
     root: str | Path | None = None
@@ -75,12 +76,12 @@ class Distractors:
 
     @property
     def used(self) -> bool:
-        """Whether an image may have one."""
+        """Whether an image may have a distractor."""
         return self.root is not None and self.count[1] > 0
 
     @property
     def hide(self) -> bool:
-        """Whether one may be in front of objects."""
+        """Whether a distractor may be in front of objects."""
         return self.used and self.front > 0.0
 
     @cached_property
@@ -97,18 +98,18 @@ class Distractors:
         return content_digest({path.relative_to(self._folder).as_posix(): path for path in self.files})
 
     def digest(self) -> str | None:
-        """SHA-256 of the pictures' names and contents, for store keys; None without a folder."""
+        """Return the SHA-256 of the pictures' names and contents, for store keys; None without a folder."""
         return self._digest
 
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> tuple[Cover, Cover] | None:
-        """Draw what is behind the objects of n images and what is in front of them.
+        """Draw the distractors behind the objects of n images, and those in front of them.
 
         Without distractors both are None, and no random number is drawn.
 
         Raises:
-            ValueError: a picture that cannot be read, with its file.
+            ValueError: a picture cannot be read; the message has its file.
         """
         if not self.used:
             return None
@@ -135,7 +136,7 @@ class Distractors:
             picture = self._pictures[file] = read_picture(self.files[file]).convert("RGBA")
         scale = side / max(picture.size)
         size = max(1, round(scale * picture.width)), max(1, round(scale * picture.height))
-        # "RGBa" is premultiplied, so that the colour of clear pixels does not enter.
+        # "RGBa" is premultiplied, so that the colour of transparent pixels has no influence.
         resized = picture.convert("RGBa").resize(
             size, Image.Resampling.BOX if scale < 0.5 else Image.Resampling.BILINEAR
         )
@@ -149,7 +150,7 @@ class Distractors:
 def _paste(
     layer: Float[np.ndarray, "h w 4"], cutout: Float[np.ndarray, "a b 4"], across: float, down: float
 ) -> None:
-    """Paste a cut-out over a layer, in place, its centre at a fraction of the layer's width and height."""
+    """Paste a cut-out over a layer, in place, with its centre at a fraction of the layer's width and height."""
     height, width = layer.shape[:2]
     high, wide = cutout.shape[:2]
     left, top = round(across * width - 0.5 * wide), round(down * height - 0.5 * high)

@@ -1,7 +1,7 @@
-"""Which objects share an image, and which lies in front: what p_psi does not say, drawn before anything is rendered.
+"""Which objects share an image, and which is in front: not part of p_psi, and drawn before anything is rendered.
 
-An image's number of objects is uniform in a range, and its classes are different ones, each set of them as likely as
-any other. Every image has a class of its own, so that all classes get equally many; the others follow at random.
+The number of objects in an image is uniform in a range, and their classes differ; each set of classes is equally
+likely. Every image has one class of its own, so that all classes get equally many; the others follow at random.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ObjectCount:
-    """Objects an image, uniform from ``fewest`` to ``most``.
+    """The number of objects in an image, uniform from ``fewest`` to ``most``.
 
     Raises:
-        ValueError: a negative number, or ``most`` below ``fewest`` or 1.
+        ValueError: ``fewest`` is negative, or ``most`` is below ``fewest`` or 1.
     """
 
     fewest: int = 1
@@ -38,10 +38,10 @@ class ObjectCount:
         return 0.5 * (self.fewest + self.most)
 
     def draw(self, n: int, generator: torch.Generator, present: bool = False) -> Int[Tensor, "n"]:
-        """Draw the numbers of objects of n images; if ``present``, of images that show one given class.
+        """Draw the numbers of objects in n images; if ``present``, in images that show one given class.
 
-        That class is in an image of c objects with a probability in proportion to c, so that such images have c objects
-        in proportion to c.
+        An image of c objects shows that class with a probability proportional to c; hence, among the images that show
+        it, the probability of c objects is proportional to c.
         """
         numbers = torch.arange(self.fewest, self.most + 1)
         weights = numbers.double() if present else torch.ones(len(numbers), dtype=torch.float64)
@@ -50,10 +50,10 @@ class ObjectCount:
 
 @dataclass(frozen=True)
 class Layout:
-    """The classes of n images, and which object lies in front.
+    """The classes of n images, and which object is in front.
 
-    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. ``order`` in [0, 1) says
-    which lies in front among objects at equal distances: the smaller.
+    ``labels`` are the classes in each image, -1 for none; column 0 has the image's own class. Of objects at equal
+    distances, the one with the smaller ``order``, in [0, 1), is in front.
     """
 
     labels: Int[Tensor, "n most"]
@@ -67,7 +67,7 @@ class Layout:
         return Layout(self.labels[index], self.order[index])
 
     def places(self, label: int) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
-        """Images (rows) and columns in which a class appears; in an image at most once."""
+        """Return the images (rows) and columns in which a class appears, at most once in an image."""
         row, column = (self.labels == label).nonzero().unbind(1)
         return row, column
 
@@ -75,10 +75,10 @@ class Layout:
 def draw_layout(
     own: Int[Tensor, "n"], classes: int, count: ObjectCount, generator: torch.Generator, present: bool = False
 ) -> Layout:
-    """Of images whose own classes are ``own``; see ``ObjectCount.draw`` for ``present``.
+    """Draw the layout of images whose own classes are ``own``; for ``present`` see ``ObjectCount.draw``.
 
     Raises:
-        ValueError: for more objects an image than classes.
+        ValueError: an image should have more objects than there are classes.
     """
     if count.most > classes:
         raise ValueError(
@@ -93,5 +93,5 @@ def draw_layout(
 
 
 def own_labels(counts: Sequence[int]) -> Int[Tensor, "n"]:
-    """Class by class, as many images of each as ``counts`` says."""
+    """Return labels class by class, as many of each as ``counts`` says."""
     return torch.arange(len(counts)).repeat_interleave(torch.tensor(list(counts)))

@@ -13,13 +13,13 @@ from neural_sim.parameter.factor import COORDINATES
 from neural_sim.types import SceneDraw
 
 RIGID = ("phi", "rho", "distance")
-"""The coordinates that place the camera; the fourth, the magnification, does not."""
+"""The coordinates that place the camera; the fourth coordinate, the magnification, does not."""
 SHRINK = (-1.0, -1.0, 0.0, 0.0)
-"""What a camera's axes x and y do to a pixel's direction, by the logarithm of the focal length."""
+"""The effect of the logarithm of the focal length on the x and y of a pixel's direction."""
 
 
 def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tensor, "K"]) -> tuple[str, ...]:
-    """Names of the draw's numbers that depend on psi; the others need no tangent."""
+    """Name the draw's numbers that depend on psi; the others need no tangent."""
     with torch.enable_grad():
         draw = relaxed(psi.detach().requires_grad_())
     values = {name: getattr(draw, name) for name in COORDINATES}
@@ -27,12 +27,12 @@ def moved_by(relaxed: Callable[[Float[Tensor, "K"]], SceneDraw], psi: Float[Tens
 
 
 def light_names(count: int) -> tuple[str, ...]:
-    """Names of the derivatives by each weight of a draw's light."""
+    """Name the derivatives by each weight of a draw's light."""
     return tuple(f"weights_{i}" for i in range(count))
 
 
 def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
-    """One number of every draw by its name, a coordinate's or that of a light's weight."""
+    """Return one number of every draw by its name: a coordinate, or the weight of a light."""
     if name.startswith("weights_") and draw.weights is not None:
         return draw.weights[:, int(name.removeprefix("weights_"))]
     return getattr(draw, name)
@@ -41,12 +41,11 @@ def number_of(draw: SceneDraw, name: str) -> Float[Tensor, "n"]:
 def pose_rates(draw: SceneDraw, names: Sequence[str]) -> Float[Tensor, "m n 4 4"]:
     """Differentiate every image's camera-to-world matrix by each of its draw's ``names``.
 
-    The matrix takes a pixel's direction into the world. At a camera of focal length m, a longer one narrows that
-    direction's x and y as a matrix with shorter axes would, d(x/m)/dm = -(x/m)/m, but for the direction's length, which
-    ``ray_rates`` keeps.
+    The matrix maps a pixel's direction into the world. A focal length m shrinks that direction's x and y like a matrix
+    with shorter axes: d(x/m)/dm = -(x/m)/m. Only the direction's length differs, and ``ray_rates`` preserves it.
 
     Raises:
-        ValueError: no name, or one that no camera follows.
+        ValueError: there is no name, or one that moves no camera.
     """
     drawn = {name: getattr(draw, name) for name in COORDINATES if getattr(draw, name) is not None}
     if not names or set(names) - set(drawn):

@@ -1,4 +1,4 @@
-"""Objects in scenes by given pictures, such as the views that their fields are fitted to."""
+"""Objects shown in scenes by given pictures, such as the views to which their fields are fitted."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from neural_sim.types import PinholeCamera, PosedViews, SceneDraw
 
 @dataclass(frozen=True)
 class PictureSubject:
-    """Pictures of an object, drawn with replacement whatever psi is.
+    """Pictures of an object, drawn with replacement, whatever psi is.
 
     Args:
         name: name of the object.
-        pictures: premultiplied RGBA of the size of the scene's images.
-        seen: from where each was taken, without bins.
+        pictures: premultiplied RGBA with the size of the scene's images.
+        seen: the pose from which each picture was taken, without bins.
     """
 
     name: str
@@ -33,7 +33,7 @@ class PictureSubject:
 
     @staticmethod
     def of(name: str, views: PosedViews, camera: PinholeCamera, radius: float = 1.0) -> PictureSubject:
-        """Return the subject of views, as large as fits into images of ``camera``, in their middle.
+        """Return a subject made of views, in the middle of images of ``camera`` and as large as fits.
 
         Args:
             name: name of the object.
@@ -58,7 +58,7 @@ class PictureSubject:
         generator: torch.Generator,
         how: Draws = HARD,
     ) -> RenderedObject:
-        """Draw ``count`` of the pictures; psi has no part in them."""
+        """Draw ``count`` of the pictures; psi has no influence."""
         if isinstance(how, RelaxedDraws):
             raise not_differentiable(self.name, how)
         chosen = torch.randint(len(self.pictures), (count,), generator=generator)
@@ -74,7 +74,7 @@ class PictureSubject:
         psi: Float[Tensor, "K"],
         generator: torch.Generator,
     ) -> RenderedObject:
-        """Refuse: there are no pictures of given bins."""
+        """Refuse: there are no pictures of a given bin."""
         raise ValueError(f"{self.name}: pictures are not drawn by bins, want a field or a mesh")
 
 
@@ -88,7 +88,7 @@ def _fitted(maps: Float[Tensor, "n h w 4"], height: int, width: int) -> Float[Te
 
 
 def _seen(views: PosedViews, radius: float) -> SceneDraw:
-    """From where views were taken: angles in radians, distances in the unit of ``radius``, the object's."""
+    """Return the poses of the views: angles in radians, distances in the unit of the object's ``radius``."""
     centres = views.camera_to_world[:, :3, 3].cpu()
     distance, (x, y, z) = centres.norm(dim=-1), centres.unbind(-1)
     none = torch.zeros(len(views), 0, dtype=torch.long)

@@ -1,7 +1,7 @@
-"""Rendered maps of every bin of every object, from which training images are composed with new backgrounds and shifts.
+"""Renders of every bin of every object, from which training images are composed with new backgrounds and shifts.
 
-Fields do not change while psi is learned, so every bin is rendered once and its maps are reused in all iterations,
-which saves most rendering of the psi loop. Pathwise estimators cannot use a pool: they differentiate draws from psi.
+Fields do not change while psi is learned. Every bin is rendered once, and its maps are reused in all iterations, which
+saves most of the psi loop's rendering. Pathwise estimators cannot use a pool: they differentiate draws from psi.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neural_sim.types import PinholeCamera, SceneDraw
 
 
 def pool_cells(factors: Sequence[BinnedFactor], per_bin: int) -> tuple[int, int]:
-    """Return the number of combinations of bins, and of maps of each that give every bin at least ``per_bin``."""
+    """Return the number of combinations of bins, and of maps of each so that every bin has at least ``per_bin``."""
     cells = math.prod(factor.bins for factor in factors)
     return cells, math.ceil(per_bin * max((factor.bins for factor in factors), default=1) / cells)
 
@@ -34,9 +34,9 @@ class PooledSubject:
     Args:
         name: name of the object.
         maps: premultiplied RGBA in 8 bits, ``per_cell`` of every combination of the factors' bins, one combination
-            after the other, the last factor's bins changing fastest.
-        drawn: scene parameters of each.
-        per_cell: maps of each combination.
+            after the other; the last factor's bins change fastest.
+        drawn: scene parameters of each map.
+        per_cell: number of maps of each combination.
     """
 
     name: str
@@ -60,7 +60,7 @@ class PooledSubject:
     ) -> RenderedObject:
         """See ``Subject``."""
         if not isinstance(how, HardDraws):
-            raise ValueError(f"outer.pool_per_bin: a pool has exact draws alone, got {how}")
+            raise ValueError(f"outer.pool_per_bin: a pool only has exact draws, got {how}")
         noise = how.noise(distribution, count, generator, torch.float32)
         within = torch.randint(self.per_cell, (count,), generator=generator)
         return self._taken(distribution, distribution.hard(psi.float(), noise).bins, within)
@@ -96,17 +96,17 @@ class PooledSubject:
 
 
 def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: bool = False) -> Scene:
-    """Render at least ``per_bin`` maps of every bin of every factor and object, and return a scene that draws these.
+    """Render at least ``per_bin`` maps of every bin of every factor and object; return a scene that draws from them.
 
     Args:
-        scene: of subjects that can be rendered.
-        per_bin: maps of every bin; also of every anchor light, if ``lights``.
-        generator: of what the bins do not say.
+        scene: a scene of subjects that can be rendered.
+        per_bin: number of maps of every bin; also of every anchor light, if ``lights``.
+        generator: source of everything that the bins leave open.
         lights: render each map under lights of random weights, Dirichlet with parameter 1/2, instead of refusing lights
-            that move. Draws from this pool then follow psi in their bins, not in their light.
+            that move. Draws from this pool then follow psi in their bins but not in their light.
 
     Raises:
-        ValueError: for fewer than one, a light that moves with psi, or a subject that there are only pictures of.
+        ValueError: ``per_bin`` is below 1, a light moves with psi, or a subject has only pictures.
     """
     if per_bin < 1:
         raise ValueError(f"outer.pool_per_bin must be at least 1 for a pool, got {per_bin}")
@@ -123,7 +123,7 @@ def pool_of(scene: Scene, per_bin: int, generator: torch.Generator, *, lights: b
     named = dict(zip((factor.name for factor in factors), bins.unbind(1), strict=True))
     subjects = []
     for label, subject in enumerate(scene.rendered):
-        # The same numbers in every cell: differences between bins then owe nothing to what is not their own.
+        # All cells use the same random numbers, so that bins differ only by what the bin changes.
         noise = distribution.draw_noise(per_cell, generator, subject.dtype)
         noise = noise.select(torch.arange(per_cell).repeat(cells))
         draw = distribution.at_bins(named, noise)

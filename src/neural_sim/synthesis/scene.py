@@ -18,8 +18,8 @@ from neural_sim.synthesis.synthesizer import Nuisance, Synthesizer
 from neural_sim.types import LabelledImages, PinholeCamera, SceneDraw
 
 CHUNK = 64
-"""Images of given draws that are rendered and composed together, which bounds the memory. What a seed means depends on
-it, so it is no setting."""
+"""Number of images of given draws that are rendered and composed together, which bounds the memory. It is not a
+setting, because seeds depend on it."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Scene:
     Args:
         subjects: the objects, in the order of their class labels.
         camera: camera of the images.
-        synthesizer: what composes subjects with each other and with a background.
+        synthesizer: composes subjects with each other and with a background.
         distribution: p_psi, from which scene parameters are drawn.
 
     Raises:
-        ValueError: where distances are in metres, for a subject of unknown size or one that the camera would enter.
+        ValueError: distances are in metres, and a subject's size is unknown or the camera would enter it.
     """
 
     subjects: tuple[Subject, ...]
@@ -52,7 +52,7 @@ class Scene:
 
     @property
     def radii(self) -> tuple[float, ...]:
-        """Radii of rendered objects in the unit of distances: 1 for radii."""
+        """Radii of rendered objects in the unit of distances: 1 if that is the radius."""
         metres = self.distribution.distance_unit == "metres"
         return tuple(
             subject.radius if metres and isinstance(subject, RenderedSubject) and subject.radius else 1.0
@@ -69,7 +69,7 @@ class Scene:
         """The subjects, all of which can be rendered from every pose.
 
         Raises:
-            ValueError: for one that there are only pictures of.
+            ValueError: a subject has only pictures.
         """
         return tuple(_able(subject) for subject in self.subjects)
 
@@ -78,7 +78,7 @@ class Scene:
         """The subjects as fields.
 
         Raises:
-            ValueError: for a subject that is none.
+            ValueError: a subject is not a field.
         """
         found = tuple(subject for subject in self.subjects if isinstance(subject, FieldSubject))
         if len(found) < len(self.subjects):
@@ -97,14 +97,14 @@ class Scene:
         """Render object ``label`` alone at given scene parameters, without derivatives.
 
         Raises:
-            ValueError: for an object that there are only pictures of.
+            ValueError: the object has only pictures.
         """
         return _able(self.subjects[label]).render(self.camera, self.distribution, draw)
 
     def draw(
         self, label: int, psi: Float[Tensor, "K"], count: int, generator: torch.Generator, how: Draws = HARD
     ) -> RenderedObject:
-        """Draw object ``label`` alone ``count`` times from p_psi, as an estimator wants it."""
+        """Draw object ``label`` alone ``count`` times from p_psi, in the way that an estimator needs."""
         return self.subjects[label].draw(self.camera, self.distribution, psi, count, generator, how)
 
     # --- images ---
@@ -140,7 +140,7 @@ class Scene:
         how: Draws,
         known: Mapping[int, RenderedObject] | None = None,
     ) -> Shared:
-        """Draw images of the layout, every object from its own p_psi except for classes with ``known`` renders."""
+        """Draw images of the layout, every object from its own p_psi, except classes with ``known`` renders."""
         nuisance = self._nuisance(len(layout), generator, layout.labels.shape[1])
         known = known or {}
         objects = [
@@ -158,12 +158,12 @@ class Scene:
 
         Args:
             draws: scene parameters of every object's images.
-            generator: source of backgrounds and of whatever else p_psi does not say.
-            layout: which objects share an image; an object's draws are then those of the images that show it, in their
-                order. None: one object an image, object by object.
+            generator: source of backgrounds and of whatever else p_psi does not determine.
+            layout: which objects share an image; an object's draws then belong to the images that show it, in their
+                order. None: one object in each image, object by object.
 
         Raises:
-            ValueError: for another number of draws than of objects, or none.
+            ValueError: the number of draws is not that of the objects, or is zero.
         """
         if len(draws) != len(self.subjects) or not draws:
             raise ValueError(
@@ -191,11 +191,11 @@ class Scene:
     ) -> tuple[LabelledImages, SceneDraw]:
         """Draw ``per_bin`` images of every bin of a factor of one object, in the order of its bins.
 
-        All else is as in an image of the training set in which the object shows, and the same in all bins: other
-        factors from p_psi, other objects from theirs, backgrounds.
+        Everything else is as in a training image that shows the object, and is the same in all bins: its other factors
+        come from its p_psi, other objects from theirs, with the same backgrounds.
 
         Returns:
-            The images, and the scene parameters of the object in each.
+            The images, and the object's scene parameters in each.
         """
         subject, synthesizer = self.subjects[label], self.synthesizer
         part = subject.probe(self.camera, self.distribution, factor, per_bin, psi[label], generator)

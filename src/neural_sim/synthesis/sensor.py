@@ -1,4 +1,4 @@
-"""What a camera does to an image: blur and noise. Drawn first, so that every pass can be replayed."""
+"""Blur and noise of a camera. They are drawn first, so that every pass can be replayed."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 from neural_sim.ranges import Ascending, NonNegative, validated
 
 Deviations = Annotated[tuple[NonNegative, NonNegative], Ascending()]
-"""The smallest and the largest standard deviation."""
+"""Smallest and largest standard deviation."""
 
 
 @dataclass(frozen=True)
 class SensorDraw:
-    """The sensor's marks on n images.
+    """Blur and noise of n images.
 
-    ``blur`` is the standard deviation of a Gaussian in pixels, ``grain`` is added to sRGB values; None leaves either
-    out.
+    ``blur`` is the standard deviation of a Gaussian in pixels; ``grain`` is added to sRGB values; None means that there
+    is none.
     """
 
     blur: Float[Tensor, "n"] | None
@@ -35,11 +35,11 @@ class SensorDraw:
 @validated
 @dataclass(frozen=True)
 class Sensor:
-    """Blur and noise of an image, each uniform in a range.
+    """Blur and noise of a camera, each with a strength uniform in a range.
 
     Args:
         blur: smallest and largest standard deviation of the blur, in pixels.
-        noise: smallest and largest standard deviation of the noise, of sRGB values in [0, 1].
+        noise: smallest and largest standard deviation of the noise, in sRGB values in [0, 1].
     """
 
     blur: Deviations = (0.0, 0.0)
@@ -48,7 +48,7 @@ class Sensor:
     def draw(
         self, n: int, height: int, width: int, generator: torch.Generator, device: torch.device | str = "cpu"
     ) -> SensorDraw | None:
-        """Of n images; None, and no random number is drawn, where neither blur nor noise is asked for."""
+        """Draw them for n images; with neither blur nor noise return None and draw no random number."""
         if self.blur[1] == self.noise[1] == 0.0:
             return None
         blur = grain = None
@@ -72,7 +72,7 @@ def seen_by(images: Float[Tensor, "n 3 h w"], sensor: SensorDraw | None) -> Floa
 
 
 def blurred(images: Float[Tensor, "n c h w"], deviation: Float[Tensor, "n"]) -> Float[Tensor, "n c h w"]:
-    """Each image convolved with its own Gaussian, cut at three of the largest standard deviations; edges repeat."""
+    """Convolve each image with its own Gaussian, cut at three of the largest standard deviations; edges repeat."""
     n, channels, height, width = images.shape
     reach = max(1, int(torch.ceil(3.0 * deviation.max())))
     offset = torch.arange(-reach, reach + 1, device=images.device, dtype=images.dtype)

@@ -1,4 +1,4 @@
-"""What a scene shows: objects that draw and render themselves, by their radiance fields or by their meshes."""
+"""The objects of a scene, which draw and render themselves by their radiance fields or their meshes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ CPU = torch.device("cpu")
 class Subject(Protocol):
     """One object of a scene, which draws itself from p_psi alone; the scene composes it with others and a background.
 
-    Every kind gives exact draws. Draws with derivatives by psi (``RelaxedDraws``) come from a
-    ``FieldSubject`` only; the other kinds refuse them with a ``ValueError`` that names the object.
+    All kinds have exact draws. Only a ``FieldSubject`` has draws with derivatives by psi (``RelaxedDraws``); other
+    kinds refuse them with a ``ValueError`` that names the object.
     """
 
     @property
@@ -69,7 +69,8 @@ class Subject(Protocol):
     ) -> RenderedObject:
         """Draw and render the object ``per_bin`` times in every bin of a factor, in the order of the bins.
 
-        All else is drawn from p_psi and is the same in all bins. The bins of an illumination are its anchor lights.
+        Everything else is drawn from p_psi and is the same in all bins. The bins of an illumination are its anchor
+        lights.
         """
         ...
 
@@ -80,7 +81,7 @@ class RenderedSubject(ABC):
 
     Args:
         name: name of the object.
-        radius: radius of the bounding sphere in metres, None if unknown; distances in metres need it.
+        radius: radius of the bounding sphere in metres, None if unknown; needed for distances in metres.
     """
 
     name: str
@@ -103,18 +104,18 @@ class RenderedSubject(ABC):
         camera_to_world: Float[Tensor, "n 4 4"],
         weights: Float[Tensor, "n lights"] | None = None,
     ) -> Maps:
-        """Render views of the object before nothing.
+        """Render views of the object over nothing.
 
         Args:
             camera: camera of all views.
             camera_to_world: its poses in the object's normalised frame (OpenGL axes).
-            weights: each view's weights of the anchor lights; None for the light that the object has by itself.
+            weights: each view's weights of the anchor lights; None for the object's own light.
 
         Returns:
             Premultiplied colour and opacity.
 
         Raises:
-            ValueError: for an object that cannot be rendered, or not under these lights.
+            ValueError: the object cannot be rendered, or not under these lights.
         """
 
     @torch.no_grad()
@@ -125,7 +126,7 @@ class RenderedSubject(ABC):
         draw: SceneDraw,
         noise: SceneNoise | None = None,
     ) -> RenderedObject:
-        """Render the object at given scene parameters; ``noise`` is what they were drawn with."""
+        """Render the object at given scene parameters; ``noise`` is the noise that they were drawn with."""
         draw = self._with_radius(distribution, draw)
         poses = orbit(draw.phi, draw.rho, draw.distance, radius=draw.radius)
         maps = _joined(
@@ -183,7 +184,7 @@ class FieldSubject(RenderedSubject):
         name: name of the object.
         radius: see ``RenderedSubject``.
         field: the field, which may have appearance codes.
-        renderer: its renderer; one that weighs lights where the field has appearance codes.
+        renderer: its renderer; it must weigh lights if the field has appearance codes.
     """
 
     field: RadianceField
@@ -201,10 +202,10 @@ class FieldSubject(RenderedSubject):
 
     @property
     def lit_renderer(self) -> NerfWRenderer:
-        """The renderer where lights have weights.
+        """The renderer, which must support weights of lights.
 
         Raises:
-            ValueError: for a renderer without lights.
+            ValueError: the renderer has no lights.
         """
         if not isinstance(self.renderer, NerfWRenderer):
             raise ValueError(
@@ -299,7 +300,7 @@ class FieldSubject(RenderedSubject):
 
 @dataclass(frozen=True)
 class PhotographedField(RenderedSubject):
-    """A field as photographs would show it: straight alpha in [0, 1], in float32 on the CPU, under their light.
+    """A field with straight alpha in [0, 1], in float32 on the CPU, under the light of its photographs.
 
     Args:
         name: name of the object.
@@ -319,9 +320,9 @@ class PhotographedField(RenderedSubject):
         weights: Float[Tensor, "n lights"] | None = None,
     ) -> Maps:
         if self.field is None:
-            raise ValueError(f"{self.name}: nothing to render, since this target asked for no field")
+            raise ValueError(f"{self.name}: nothing to render, because this target asked for no field")
         if weights is not None:
-            raise ValueError(f"{self.name}: a field of photographs can be rendered under their light alone")
+            raise ValueError(f"{self.name}: a field of photographs can only be rendered under their light")
         maps = FieldSubject(self.name, self.field, self.renderer).maps(camera, camera_to_world)
         opacity = maps.opacity[..., None]
         colour = torch.where(opacity > 0.0, maps.rgb / opacity.clamp_min(1e-6), 0.0)
@@ -338,7 +339,7 @@ class MeshSubject(RenderedSubject):
         radius: see ``RenderedSubject``.
         mesh: the mesh in its normalised frame.
         renderer: its renderer, with the light of images whose lights have no weights.
-        rig: lights whose weights draws may have; None where the light is fixed.
+        rig: lights that draws may weigh; None if the light is fixed.
     """
 
     mesh: trimesh.Trimesh
@@ -364,12 +365,12 @@ class MeshSubject(RenderedSubject):
 
 
 def not_differentiable(name: str, how: Draws) -> ValueError:
-    """Return the refusal of draws with derivatives by a subject that has none."""
-    return ValueError(f"{name}: want hard draws, since only fields are differentiated by psi, got {how}")
+    """Return the error that refuses draws with derivatives by a subject that has none."""
+    return ValueError(f"{name}: want hard draws, because only fields are differentiated by psi, got {how}")
 
 
 def _joined(parts: Sequence[Maps]) -> Maps:
-    """Return maps of consecutive images as one."""
+    """Join the maps of consecutive images."""
     if len(parts) == 1:
         return parts[0]
     return Maps(torch.cat([part.rgb for part in parts]), torch.cat([part.opacity for part in parts]))

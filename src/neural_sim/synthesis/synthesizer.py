@@ -1,4 +1,4 @@
-"""Rendered maps to labelled images; all randomness is drawn first, so that every pass can be replayed."""
+"""From rendered maps to labelled images; all randomness is drawn first, so that every pass can be replayed."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _log = logging.getLogger(__name__)
 class Nuisance:
     """What varies between images and is never learned.
 
-    ``shifts`` are (right, down) in pixels, on the CPU, one for each object in an image; ``sensor`` is what the camera
-    does to it (None: nothing); ``front`` is what hides the objects (None: nothing).
+    ``shifts`` are (right, down) in pixels, on the CPU, one for each object in an image; ``sensor`` is the camera's blur
+    and noise (None: nothing); ``front`` is what hides the objects (None: nothing).
     """
 
     backgrounds: Float[Tensor, "n 3 h w"]
@@ -48,7 +48,7 @@ class Nuisance:
         return self.backgrounds.shape[0]
 
     def select(self, index: Tensor | slice) -> Nuisance:
-        """Return those of some images."""
+        """Return the nuisance of some images."""
         sensor = None if self.sensor is None else self.sensor.select(index)
         front = None if self.front is None else self.front.select(index)
         return Nuisance(self.backgrounds[index], self.shifts[index], sensor, front)
@@ -60,18 +60,19 @@ class Synthesizer:
     """How a rendered object becomes a labelled training image.
 
     Args:
-        background: where backgrounds come from.
-        shift: largest in-image shift, as a fraction of the image's width and height.
+        background: source of backgrounds.
+        shift: largest shift within the image, as a fraction of the image's width and height.
         threshold: opacity above which a pixel belongs to the object.
-        minimum_area: fewest visible pixels of an object that get a box; below, it has none.
-        objects_per_image: fewest and most objects of an image, each of another class; [0, 6] has images without any.
-        min_visibility: smallest part of an object's pixels, of those within the image, that other objects leave visible
+        minimum_area: smallest number of visible pixels for which an object gets a box.
+        objects_per_image: smallest and largest number of objects in an image, all of different classes; [0, 6] includes
+            images without objects.
+        min_visibility: smallest fraction of an object's pixels within the image that other objects must leave visible
             for it to get a box.
         sensor: blur and noise of the camera.
-        distractors: things without a label, behind and in front of the objects.
+        distractors: unlabelled things, behind and in front of the objects.
 
     Raises:
-        ValueError: a background that does not draw.
+        ValueError: the background has no method ``draw``.
     """
 
     background: Background
@@ -91,12 +92,12 @@ class Synthesizer:
 
     @property
     def count(self) -> ObjectCount:
-        """Of objects an image."""
+        """The number of objects in an image."""
         return ObjectCount(*self.objects_per_image)
 
     @property
     def several(self) -> bool:
-        """Whether an image may have another number of objects than one."""
+        """Whether an image may have a number of objects other than one."""
         return self.count != ObjectCount(1, 1)
 
     def draw_nuisance(
@@ -114,7 +115,7 @@ class Synthesizer:
             camera: their camera.
             generator: source of randomness.
             device: device of backgrounds and covers.
-            objects: number of shifts of each image; None for one shift without that axis.
+            objects: number of shifts in each image; None for one shift without that axis.
         """
         height, width = camera.height, camera.width
         backgrounds = self.background.draw(n, height, width, generator, device)
@@ -133,10 +134,10 @@ class Synthesizer:
         label: int,
         bins: Int[Tensor, "n"],
     ) -> LabelledImages:
-        """One object's images with their boxes, on the device and in the dtype of ``rgb``.
+        """Compose one object's images with their boxes, on the device and in the dtype of ``rgb``.
 
-        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes are not. An
-        object that is out of frame or below ``minimum_area`` gives an image without a box.
+        A pure function; the images are differentiable in ``rgb`` (premultiplied) and ``opacity``, the boxes are not. If
+        the object is out of frame or below ``minimum_area``, the image has no box.
         """
         rgb, opacity = apply_shift(rgb, nuisance.shifts), apply_shift(opacity, nuisance.shifts)
         images = composite(rgb, opacity, nuisance.backgrounds.to(rgb))
@@ -163,10 +164,10 @@ class Synthesizer:
         nuisance: Nuisance,
         bins: Int[Tensor, "n"],
     ) -> LabelledImages:
-        """Images of several objects, a layer for each column of ``layout``, with the boxes of what is visible.
+        """Compose images of several objects, a layer for each column of ``layout``, with boxes of what is visible.
 
-        Layers of no object are zeros. A pure function, differentiable in ``rgb`` (premultiplied) and ``opacity``;
-        boxes carry no derivative.
+        Layers without an object are zeros. A pure function, differentiable in ``rgb`` (premultiplied) and ``opacity``;
+        the boxes are not differentiable.
         """
         shifts = nuisance.shifts.flatten(0, 1)
         rgb = apply_shift(rgb.flatten(0, 1), shifts).view(rgb.shape)
@@ -189,16 +190,16 @@ class Synthesizer:
 
 
 def _clear(front: Cover, like: Tensor) -> Float[Tensor, "n 1 h w"]:
-    """How much of what is behind can be seen."""
+    """Return the fraction of what is behind that stays visible."""
     return (1.0 - front.opacity.to(like))[:, None]
 
 
 def unshown(images: LabelledImages, names: Sequence[str]) -> list[str]:
-    """Return the classes of which no image has a box."""
+    """Return the classes that have no box in any image."""
     shown = set(images.labels[images.present].tolist())
     return [name for label, name in enumerate(names) if label not in shown]
 
 
 def images_without_boxes(images: LabelledImages) -> int:
-    """How many images hold no box at all."""
+    """Count the images without any box."""
     return int((~images.present.any(-1)).sum())

@@ -1,4 +1,4 @@
-"""Small pictures of an object in every bin of a factor, for pages that name bins."""
+"""Small pictures of an object in every bin of a factor, for pages that refer to bins."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def bin_thumbnails(
 ) -> Float[Tensor, "bins h w 3"]:
     """Render an object over white from the middle of every bin of one factor.
 
-    What the others draw is at the middle of its range, or of the middle bin; lights have equal weights.
+    Coordinates of other factors are at the middle of their range, or of their middle bin; lights have equal weights.
     """
     learned = {f.coordinate for f in distribution.binned}
     count = next(f.bins for f in distribution.binned if f.name == factor)

@@ -1,1 +1,1 @@
-"""Data sets of drawn images in the formats that others read."""
+"""Data sets of drawn images in formats that other programs read."""

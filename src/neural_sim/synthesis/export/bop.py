@@ -1,7 +1,8 @@
 """A BOP data set: https://github.com/thodan/bop_toolkit, docs/bop_datasets_format.md. Millimetres, OpenCV axes.
 
-``train/<scene>/{rgb,depth,mask,mask_visib}`` with ``scene_gt.json``, ``scene_gt_info.json`` and ``scene_camera.json``;
-``models/models_info.json`` and the meshes, where there are some. All objects are listed, labelled or hidden.
+It has ``train/<scene>/{rgb,depth,mask,mask_visib}`` with ``scene_gt.json``, ``scene_gt_info.json`` and
+``scene_camera.json``; and ``models/models_info.json`` with the meshes, if there are any. All objects are listed,
+whether labelled or hidden.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from neural_sim.synthesis.export.images import ExportImage
 
 SPLIT = "bop/train"
 OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's camera axes to OpenCV's."""
+"""Converts OpenGL's camera axes to OpenCV's."""
 LARGEST = 65535
-"""The largest number of a depth image."""
+"""The largest value in a depth image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An object as BOP knows it.
+    """An object as BOP describes it.
 
-    ``millimetres`` is the radius of its bounding sphere, ``to_model`` maps the object's normalised frame to its
-    model's, in millimetres; ``mesh`` is in that frame, None where there is none.
+    ``millimetres`` is the radius of its bounding sphere; ``to_model`` maps the object's normalised frame to its
+    model's, in millimetres; ``mesh`` is in that frame, or None if there is none.
     """
 
     name: str
@@ -47,7 +48,7 @@ class Model:
     mesh: trimesh.Trimesh | None = None
 
     def info(self) -> dict[str, float]:
-        """Return the entry of ``models_info.json``: the bounding box and the largest distance of two points.
+        """Return the entry of ``models_info.json``: the bounding box and the largest distance between two points.
 
         Without a mesh they are those of the bounding sphere.
         """
@@ -63,7 +64,7 @@ class Model:
         return {"diameter": diameter, **sides}
 
     def pose(self, camera_to_world: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
-        """Model to camera, rigid, from the camera's pose in the object's normalised frame."""
+        """Return the rigid model-to-camera matrix, from the camera's pose in the object's normalised frame."""
         # Both frames measure the same object: the scales cancel.
         to_camera = (
             np.diag([self.millimetres] * 3 + [1.0]) @ OPENCV @ np.linalg.inv(np.asarray(camera_to_world))
@@ -72,24 +73,24 @@ class Model:
 
 
 def object_ids(class_names: Sequence[str]) -> list[int]:
-    """BOP's ids: the numbers of names such as ``obj_000003`` where all classes have such, else 1, 2, ..."""
+    """Return BOP's ids: the numbers in names such as ``obj_000003`` if all classes have such names, else 1, 2, ..."""
     found = [re.fullmatch(r"obj_(\d+)", name) for name in class_names]
     numbers = [int(match[1]) for match in found if match]
     return numbers if len(set(numbers)) == len(found) else list(range(1, len(found) + 1))
 
 
 def depth_scale(farthest: float) -> float:
-    """Millimetres of one step of a depth image, a power of ten that reaches ``farthest`` millimetres."""
+    """Return the millimetres of one step of a depth image, a power of ten that reaches ``farthest`` millimetres."""
     return 10.0 ** math.ceil(math.log10(farthest / LARGEST))
 
 
 def place(number: int, scene_size: int) -> tuple[str, int]:
-    """Return the folder of an image's scene below the data set's, and the image's number there."""
+    """Return the folder of an image's scene, relative to the data set, and the image's number in it."""
     return f"{SPLIT}/{number // scene_size:06d}", number % scene_size
 
 
 def image_files(image: ExportImage, number: int, scene_size: int, scale: float) -> dict[str, bytes]:
-    """Depth and masks of an image, by path."""
+    """Encode the depth and masks of an image, by path."""
     folder, own = place(number, scene_size)
     depth = np.rint(image.depth / scale).clip(0, LARGEST).astype(np.uint16)
     files = {f"{folder}/depth/{own:06d}.png": _png(depth)}
@@ -102,7 +103,7 @@ def image_files(image: ExportImage, number: int, scene_size: int, scale: float) 
 def write_bop(
     folder: Path, records: Sequence[Mapping[str, Any]], models: Sequence[Model], scene_size: int, scale: float
 ) -> None:
-    """All of a data set but depth and masks, which are written with the images."""
+    """Write a whole data set except depth and masks, which are written with the images."""
     names = [model.name for model in models]
     ids = object_ids(names)
     scenes: dict[str, dict[str, dict[str, Any]]] = {}
@@ -156,7 +157,7 @@ def _info(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _toolkit_box(box: Sequence[int]) -> list[int]:
-    """As the toolkit counts: width and height are differences of the last and the first pixel."""
+    """Return a box as the toolkit counts: width and height are differences between the last and the first pixel."""
     return [box[0], box[1], box[2] - 1, box[3] - 1]
 
 

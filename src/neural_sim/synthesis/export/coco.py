@@ -1,4 +1,4 @@
-"""Drawn sets as COCO: a training set in memory, as PNG images and one JSON, and an exported set, from its records."""
+"""Drawn sets as COCO: a training set in memory as PNG images and one JSON, and an exported set from its records."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def write_coco(
     folder: str | Path,
     poses: Sequence[Sequence[Mapping[str, Any]]] | None = None,
 ) -> Path:
-    """Write ``folder/images/*.png`` (8 bit) and ``folder/annotations.json``, whose path is returned.
+    """Write ``folder/images/*.png`` (8 bit) and ``folder/annotations.json``; return the latter's path.
 
-    ``poses`` are those of the objects in each image, labelled or hidden: their ``category_id``, phi, rho (radians),
+    ``poses`` has, for each image, those of its objects, labelled or hidden: their ``category_id``, phi, rho (radians),
     distance (object radii), camera_to_world [4, 4] (OpenGL axes) and whatever else made the image. They become each
-    image's ``poses``, beside its ``bin``. The JSON comes last and at once, so that where it exists all its images do.
+    image's ``poses``, next to its ``bin``. The JSON is written last and at once: if it exists, all its images do.
 
     Raises:
-        ValueError: a label without a name, or poses of another number of images.
+        ValueError: a label has no name, or ``poses`` has another length than the images.
     """
     folder = Path(folder)
     _check(images, class_names, poses)
@@ -66,7 +66,7 @@ def _check(
 
 
 def _annotation(number: int, image: int, label: int, box: Sequence[float]) -> dict[str, Any]:
-    """COCO counts ids from 1 and gives boxes as x, y, width, height."""
+    """Make one annotation; COCO counts ids from 1 and gives boxes as x, y, width, height."""
     x0, y0, x1, y1 = box
     return {
         "id": number,
@@ -84,12 +84,12 @@ def coco_document(
     class_names: Sequence[str],
     camera: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """COCO's document of an exported set, from its images' records in the order of their numbers.
+    """Assemble COCO's document of an exported set from its images' records, in the order of their numbers.
 
-    ``bbox``, ``area`` and ``segmentation`` (compressed run lengths) are of what is visible. Further entries of an
-    annotation: ``bbox_full``, round the whole silhouette, also beyond the image; ``segmentation_full``, the silhouette
-    within the image; ``visibility``, the visible fraction of the silhouette's pixels; ``pose``. Objects of which too
-    little is visible have no annotation. ``camera`` is that of all images, where they have one.
+    ``bbox``, ``area`` and ``segmentation`` (compressed run lengths) describe what is visible. An annotation has more
+    entries: ``bbox_full``, the box around the whole silhouette, also beyond the image; ``segmentation_full``, the
+    silhouette within the image; ``visibility``, the visible fraction of the silhouette's pixels; ``pose``. Objects of
+    which too little is visible have no annotation. ``camera`` is the camera of all images, if they share one.
     """
     entries, annotations = [], []
     for record in records:

@@ -1,4 +1,4 @@
-"""A data set of drawn images: every image with all its files, then the annotations of all in each format."""
+"""A data set of drawn images: first every image with all its files, then the annotations of all in each format."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ FORMATS: tuple[Format, ...] = get_args(Format)
 
 @dataclass(frozen=True)
 class ImageWriter:
-    """Writes an image with all files that are its own, the image itself last, and returns its record.
+    """Writes an image and all files that belong to it, the image itself last, and returns its record.
 
-    ``scene_size`` and ``scale`` are those of BOP; ``scene_size`` is None where it is not asked for.
+    ``scene_size`` and ``scale`` are those of BOP; ``scene_size`` is None if BOP is not requested.
     """
 
     source: ImageSource
@@ -42,14 +42,14 @@ class ImageWriter:
     scale: float
 
     def __call__(self, number: int) -> dict[str, Any]:
-        """Write the image of that number."""
+        """Write the image with this number."""
         image = self.source.image(number)
         if self.scene_size is not None:
             files = bop.image_files(image, number, self.scene_size, self.scale)
             for path, content in files.items():
                 write_whole(self.root / path, content)
         file, stream = f"images/{number:06d}.{self.image_format}", io.BytesIO()
-        # Fine edges keep their colour only without chroma subsampling.
+        # Only without chroma subsampling do fine edges keep their colour.
         options = {"quality": 95, "subsampling": 0} if self.image_format == "jpg" else {"compress_level": 1}
         Image.fromarray(image.pixels).save(stream, "JPEG" if self.image_format == "jpg" else "PNG", **options)
         write_whole(self.root / file, stream.getvalue())
@@ -59,10 +59,10 @@ class ImageWriter:
 
 @dataclass(frozen=True)
 class DataSet:
-    """``count`` images of ``source`` in ``root``, in ``formats``.
+    """``count`` images from ``source`` in ``root``, in ``formats``.
 
-    Images that are there already stay, with their ids; one with a number of ``count`` or more stays in the set, too.
-    ``identity`` is what all images depend on, see ``ExportFolder``; ``models`` are the objects as BOP has them.
+    Existing images stay, with their ids; those numbered ``count`` or more stay in the set, too. ``identity`` is what
+    all images depend on, see ``ExportFolder``; ``models`` are the objects as BOP describes them.
     """
 
     source: ImageSource
@@ -77,10 +77,10 @@ class DataSet:
     workers: int = 0
 
     def write(self, shown: Callable[[Iterable[int]], Iterable[int]]) -> list[dict[str, Any]]:
-        """All images that are missing, then the annotations; returns the records of all. ``shown`` is a progress bar.
+        """Write all missing images, then the annotations; return the records of all. ``shown`` is a progress bar.
 
         Raises:
-            ValueError: a folder with images of another identity, or one that cannot be written.
+            ValueError: the folder has images of another identity, or cannot be written.
         """
         folder, with_bop = ExportFolder(self.root, self.identity), "bop" in self.formats
         scale = bop.depth_scale(self.farthest)
@@ -124,10 +124,10 @@ T = TypeVar("T")
 
 
 def each(task: Callable[[int], T], numbers: Sequence[int], workers: int) -> Generator[T, None, None]:
-    """``task`` of each number, in their order.
+    """Yield the results of ``task`` for each number, in order.
 
-    Every process computes with one thread of torch's, so that results do not depend on how many there are. ``workers``
-    is their number, 0: this process alone. The task, which they get once, must be picklable.
+    Every process computes with one torch thread, so that results do not depend on the number of processes. That number
+    is ``workers``; 0: this process alone. Each process gets the task once, so that it must be picklable.
     """
     if workers == 0:
         yield from _here(task, numbers)

@@ -1,4 +1,4 @@
-"""The folder of an exported data set: what it is of, a record of each image, files that are whole or not there."""
+"""The folder of an exported data set: its identity, a record of each image, files that are whole or do not exist."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from neural_sim.types import PinholeCamera
 MANIFEST = "manifest.json"
 RECORDS = "records.jsonl"
 LONGEST = 60
-"""Characters of a value in a message."""
+"""Longest value, in characters, that a message quotes."""
 
 
 @dataclass(frozen=True)
 class ExportFolder:
-    """Images of one ``identity`` (all that they depend on but their number), which can be continued and extended."""
+    """Images of one ``identity`` (all that they depend on except their number), which can be continued and extended."""
 
     root: Path
     identity: Mapping[str, Any]
 
     @contextmanager
     def opened(self) -> Iterator[dict[int, dict[str, Any]]]:
-        """Yield the records of the images that are there, in a folder that is ready for more.
+        """Yield the records of the existing images, in a folder that is ready for more.
 
         Raises:
-            ValueError: a folder of something else, or of images with another identity; the message names the first
+            ValueError: the folder holds something else, or images with another identity; the message names the first
                 difference.
         """
         self.check()
@@ -47,7 +47,7 @@ class ExportFolder:
         yield read_records(self.root)
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Remember an image whose files are written."""
+        """Add the record of an image whose files are written."""
         path = self.root / RECORDS
         try:
             with path.open("a", encoding="utf-8") as stream:
@@ -58,7 +58,7 @@ class ExportFolder:
     def finish(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Write the manifest: every image's file and hash, and its objects' parameters and poses.
 
-        The records are put in order, which they are not in where an image was made again.
+        The records are sorted: images that were made again are not in order.
         """
         write_whole(self.root / RECORDS, "".join(line_of(record) for record in records))
         images = [
@@ -74,7 +74,7 @@ class ExportFolder:
         write_json(self.root / MANIFEST, {"identity": dict(self.identity), "images": images})
 
     def check(self) -> None:
-        """Raise what ``opened`` raises, and write nothing."""
+        """Raise what ``opened`` raises, without writing anything."""
         path = self.root / MANIFEST
         if self.root.exists() and not self.root.is_dir():
             raise ValueError(f"export.folder: {self.root} is a file, want a folder")
@@ -121,10 +121,8 @@ def record_of(
 ) -> dict[str, Any]:
     """Return an image's record, from which annotation files of any format are assembled.
 
-    Boxes are (x, y, width, height) in pixels along pixel edges; null where there is none.
-
-    ``camera`` is in OpenCV's convention: (0, 0) is the centre of the upper left pixel. ``digest`` is the SHA-256 of the
-    file's bytes.
+    Boxes are (x, y, width, height) in pixels along pixel edges; null if there is none. ``camera`` is in OpenCV's
+    convention: (0, 0) is the centre of the upper left pixel. ``digest`` is the SHA-256 of the file's bytes.
     """
     shown = image.objects[0].placed.camera if image.objects else camera
     return {
@@ -137,7 +135,7 @@ def record_of(
 
 
 def opencv_entry(camera: PinholeCamera) -> dict[str, float]:
-    """Width, height and OpenCV's camera matrix in pixels."""
+    """Return width, height and OpenCV's camera matrix, in pixels."""
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     size = {"width": camera.width, "height": camera.height}
     return size | {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5}
@@ -176,12 +174,12 @@ def _sized(box: tuple[int, int, int, int] | None) -> list[int] | None:
 
 
 def read_records(folder: Path) -> dict[int, dict[str, Any]]:
-    """Read the records of a folder by number, of images whose files are there.
+    """Read the records of a folder, by number, for images whose files exist.
 
-    A line that a killed process left unfinished is no record; the file is rewritten without such lines.
+    A line that an ended process left unfinished is not a record; the file is rewritten without such lines.
 
     Raises:
-        ValueError: a file that cannot be read.
+        ValueError: a file cannot be read.
     """
     path = folder / RECORDS
     if not path.is_file():
@@ -217,10 +215,10 @@ def _parsed(lines: list[str]) -> Iterator[dict[str, Any]]:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file, with its folder, at once.
+    """Write a file at once, creating its folder.
 
     Raises:
-        ValueError: the system does not let it be written, with the file and the reason.
+        ValueError: the system refuses to write it; the message has the file and the reason.
     """
     try:
         documents.write_whole(path, content)
@@ -234,7 +232,7 @@ def write_json(path: Path, document: Any, indent: int | None = None) -> None:
 
 
 def same_file(source: Path, path: Path) -> None:
-    """``path`` as another name of ``source``; as a copy where the file system has no such names."""
+    """Make ``path`` another name of ``source``, or a copy if the file system has no hard links."""
     if path.exists():
         return
     part = path.with_name(f".{path.name}{PART}")
@@ -254,6 +252,6 @@ def same_file(source: Path, path: Path) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what a killed process left unfinished."""
+    """Remove the files that an ended process left unfinished."""
     for path in folder.rglob(f".*{PART}"):
         path.unlink(missing_ok=True)

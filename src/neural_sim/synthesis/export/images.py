@@ -1,4 +1,4 @@
-"""One image of an exported data set: drawn from its number alone, rendered with depth, composed, and its masks."""
+"""One image of an exported data set: drawn from its number alone, rendered with depth, composed, with its masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neural_sim.synthesis.sensor import seen_by
 from neural_sim.types import PinholeCamera, SceneDraw
 
 MASK_OPACITY = 0.5
-"""Opacity above which a pixel belongs to an object: there a ray loses half of its light, which is where depth is."""
+"""Opacity above which a pixel belongs to an object: at it a ray has lost half of its light, where the depth is."""
 
 Box = tuple[int, int, int, int]
 
@@ -29,10 +29,10 @@ Box = tuple[int, int, int, int]
 class DrawnObject:
     """An object's place in an image.
 
-    ``draw`` are its scene parameters (one draw; distance in object radii), ``shift`` the pixels (right, down) from the
-    principal point to its centre, ``camera`` the image's with the draw's magnification, ``camera_to_world`` the
-    camera's pose in the object's frame (float64, OpenGL axes, object radii). ``order`` in [0, 1) says which of two at
-    equal distances is in front: the smaller.
+    ``draw`` are its scene parameters (one draw; distance in object radii); ``shift`` are the pixels (right, down) from
+    the principal point to its centre; ``camera`` is the image's camera with the draw's magnification;
+    ``camera_to_world`` is the camera's pose in the object's frame (float64, OpenGL axes, object radii). Of two objects
+    at equal distances, the one with the smaller ``order``, in [0, 1), is in front.
     """
 
     label: int
@@ -48,8 +48,8 @@ class ShownObject:
     """An object in an image.
 
     ``full`` are the pixels of its silhouette within the image, ``visible`` those that no other object hides; ``pixels``
-    counts those of its silhouette, also beyond the image, and ``box`` (x0, y0, x1, y1) is round them, None where there
-    are none. ``labelled``: enough of it is visible for a label.
+    counts those of its whole silhouette, also beyond the image, and ``box`` (x0, y0, x1, y1) surrounds them, None if
+    there are none. ``labelled``: enough of it is visible for a label.
     """
 
     placed: DrawnObject
@@ -64,7 +64,7 @@ class ShownObject:
 class ExportImage:
     """An image, sRGB in 8 bits, with its depth and objects, the layout's first one first.
 
-    The depth is along the view axis, of what is visible, in millimetres, and 0 where no object is.
+    The depth is that of the visible surface along the view axis, in millimetres, and 0 where there is no object.
     """
 
     pixels: UInt8[np.ndarray, "height width 3"]
@@ -74,11 +74,11 @@ class ExportImage:
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Images by number. An image depends on ``seed`` and its number only, so that a set can grow.
+    """Images by number. An image depends only on ``seed`` and its number, so that a set can grow.
 
-    ``scene`` says how images are made, ``psi`` [objects, K] is what they are drawn from, ``camera`` has their size.
-    ``millimetres`` is each object's radius. The own class of image i is i modulo the classes. The synthesizer's shift
-    turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera.
+    ``scene`` says how images are made; they are drawn from ``psi`` [objects, K]; ``camera`` has their size.
+    ``millimetres`` is each object's radius. Image i has the class i modulo their number as its own. The synthesizer's
+    shift turns the camera (``cameras.turned``), so that every object has an exact pose under the image's one camera.
     """
 
     scene: Scene
@@ -88,12 +88,12 @@ class ImageSource:
     seed: int
 
     def generator(self, number: int, part: Literal["scene", "pixels"]) -> torch.Generator:
-        """Of the scene parameters of an image, or of its background and noise."""
+        """Return the generator of an image's scene parameters, or of its background and noise."""
         state = hashlib.sha256(f"{self.seed} {number} {part}".encode()).digest()
         return torch.Generator().manual_seed(int.from_bytes(state[:8], "little") >> 1)
 
     def drawn(self, number: int) -> list[DrawnObject]:
-        """Draw the objects of an image, its own first."""
+        """Draw the objects of an image, its own object first."""
         generator, scene, camera = self.generator(number, "scene"), self.scene, self.camera
         synthesizer, classes = scene.synthesizer, len(scene.names)
         layout = draw_layout(torch.tensor([number % classes]), classes, synthesizer.count, generator)
@@ -112,7 +112,7 @@ class ImageSource:
 
     @torch.no_grad()
     def image(self, number: int) -> ExportImage:
-        """Make the image of that number."""
+        """Make the image with this number."""
         height, width, placed = self.camera.height, self.camera.width, self.drawn(number)
         device = self.scene.device
         layers = [self._layer(item) for item in placed]
@@ -120,7 +120,7 @@ class ImageSource:
         covers = synthesizer.distractors.draw(1, height, width, generator, device)
         clear, depth = torch.ones(height, width, device=device), torch.zeros(height, width, device=device)
         colour = torch.zeros(height, width, 3, device=device)
-        if covers is not None:  # what is in front hides pixels like an object without a mask
+        if covers is not None:  # what is in front hides pixels, like an object without a mask
             clear, colour = 1.0 - covers[1].opacity[0], covers[1].rgb[0].clone()
         full = [torch.zeros(height, width, dtype=torch.bool, device=device) for _ in placed]
         visible = [torch.zeros_like(mask) for mask in full]
@@ -149,7 +149,7 @@ class ImageSource:
         return ExportImage(pixels, depth.cpu().numpy(), shown_objects)
 
     def _layer(self, item: DrawnObject) -> Layer:
-        """One object alone, on the part of the plane that it may reach."""
+        """Render one object alone, on the part of the plane that it may reach."""
         subject = self.scene.fields[item.label]
         left, top, right, bottom = reach_on_image(item.camera, item.camera_to_world, subject.field.reach)
         camera = cropped(item.camera, left, top, max(right - left, 1), max(bottom - top, 1))
@@ -171,13 +171,13 @@ class ImageSource:
 
 
 def _developed(image: Float[Tensor, "3 height width"]) -> UInt8[np.ndarray, "height width 3"]:
-    """In 8 bits."""
+    """Convert an image to 8 bits."""
     return image.clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8).movedim(0, -1).cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Premultiplied colour, opacity and depth (object radii) on a rectangle whose corner is at pixel (left, top)."""
+    """Premultiplied colour, opacity and depth (object radii) on a rectangle with its corner at pixel (left, top)."""
 
     left: int
     top: int
@@ -199,10 +199,10 @@ class Layer:
 
 
 def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], radius: float) -> Box:
-    """Return whole pixels (x0, y0, x1, y1) round the image of the ball of ``radius`` about the origin.
+    """Return whole pixels (x0, y0, x1, y1) around the image of the ball of ``radius`` about the origin.
 
-    They lie within three image sizes about the image, the canvas on which the BOP toolkit counts pixels beyond the
-    image; they are empty where the ball has no image.
+    They lie within three image sizes around the image, the canvas on which the BOP toolkit counts pixels beyond the
+    image; they are empty if the ball has no image.
     """
     x, y, z = (camera_to_world[:3, :3].t() @ -camera_to_world[:3, 3]).tolist()
     sides = []
@@ -211,7 +211,7 @@ def reach_on_image(camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"],
     ):
         low, high = float(-size), float(2 * size)
         distance = math.hypot(across, z)
-        if distance > radius:  # else the camera looks out of the ball's shadow on this axis
+        if distance > radius:  # otherwise the camera is within the ball's extent on this axis
             middle, half = math.atan2(across, -z), math.asin(radius / distance)
             if middle - half > -0.5 * math.pi:
                 low = max(low, math.floor(centre + focal * math.tan(min(middle - half, 1.57))))

@@ -1,4 +1,4 @@
-"""Masks as files have them: run lengths, boxes, and polygons along the edges of pixels."""
+"""Masks as file formats store them: run lengths, boxes, and polygons along the edges of pixels."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from jaxtyping import Bool, Int
 
 Box = tuple[int, int, int, int]
 STEPS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
-"""Right, down, left, up: (x, y). A boundary is walked with its pixels on the right hand."""
+"""Right, down, left, up: (x, y). A boundary is walked with its pixels on the right."""
 
 
 def run_lengths(mask: Bool[np.ndarray, "height width"]) -> dict[str, Any]:
-    """COCO's compressed run-length encoding, its counts as text."""
+    """Encode a mask as COCO's compressed run lengths, with the counts as text."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": [int(side) for side in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
 
 
 def mask_of(encoded: dict[str, Any]) -> Bool[np.ndarray, "height width"]:
-    """Inverse of ``run_lengths``."""
+    """Invert ``run_lengths``."""
     return coco_mask.decode(encoded).astype(bool)
 
 
 def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
-    """(x0, y0, x1, y1) along the edges of pixels; None for an empty mask."""
+    """Return (x0, y0, x1, y1) along the edges of pixels; None for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None
@@ -33,14 +33,14 @@ def box_of(mask: Bool[np.ndarray, "height width"]) -> Box | None:
 
 
 def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 2"]]:
-    """Trace the closed outlines of a mask, each by its corners (x, y) along pixel edges, those round most pixels first.
+    """Trace a mask's closed outlines, each as its corners (x, y) along pixel edges, those around most pixels first.
 
-    Outlines of parts go clockwise in the image, those of holes the other way; parts that touch at a corner are two.
+    Outlines of parts go clockwise in the image, those of holes counter-clockwise; parts that touch at a corner are two.
     """
     whole = np.pad(mask, 1).astype(np.int8)
     starts: dict[tuple[int, int], list[int]] = {}
     vertical, horizontal = np.diff(whole, axis=1), np.diff(whole, axis=0)
-    # The edges whose pixel lies on the right hand, by the corner that they begin at.
+    # The edges with their pixel on the right, by the corner at which they begin.
     for direction, (rows, columns) in enumerate(
         (np.nonzero(horizontal == 1), np.nonzero(vertical == -1), np.nonzero(horizontal == -1),
          np.nonzero(vertical == 1))
@@ -57,7 +57,7 @@ def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 
         before = -1
         while True:
             ways = starts[corner]
-            # Where two pixels touch at a corner: turn right, which stays at the pixel.
+            # Where two pixels touch at a corner, turn right to stay at the same pixel.
             direction = ways[0] if len(ways) == 1 else (before + 1) % 4 if before >= 0 else ways[0]
             ways.remove(direction)
             if not ways:
@@ -73,9 +73,9 @@ def outlines(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "_ 
 
 
 def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 2"]:
-    """Join the outlines of a mask to one closed polygon whose inside, by the even-odd rule, is the mask.
+    """Join the outlines of a mask into one closed polygon whose inside, by the even-odd rule, is the mask.
 
-    Each outline is reached from the first one's first corner and left back to it, so that these ways cancel. The
+    The polygon goes from the first outline's first corner to each outline and back, so that these ways cancel. The
     polygon of an empty mask is empty.
     """
     loops = outlines(mask)
@@ -88,9 +88,9 @@ def polygon(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "corners 
 
 
 def _closes(ways: list[int], before: int) -> bool:
-    """Tell whether a walk that arrives at its first corner is done though another edge begins there.
+    """Tell whether a walk that arrives at its first corner is done although another edge begins there.
 
-    It is where the walk would not turn right into that edge.
+    It is done if the walk would not turn right into that edge.
     """
     return (before + 1) % 4 not in ways
 

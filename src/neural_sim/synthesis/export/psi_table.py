@@ -1,4 +1,4 @@
-"""What p_psi draws as a table of sampling weights, for renderers other than this project's."""
+"""p_psi as a table of sampling weights, for other renderers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def psi_rows(
 ) -> list[dict[str, Any]]:
     """Tabulate every bin of every object, counted from 1.
 
-    To draw, choose a bin of each factor with its weight, then a number between ``low`` and ``high``, uniform, or
-    uniform in its logarithm where ``spacing`` is ``log``. Coordinates that no factor draws are one bin of weight 1. The
-    weights of lights are no probabilities: each image is lit by all anchor lights in these proportions.
+    To draw, choose a bin of each factor by its weight, then a number between ``low`` and ``high``, uniformly, or
+    uniformly in its logarithm if ``spacing`` is ``log``. Coordinates that no factor draws are one bin of weight 1. The
+    weights of lights are not probabilities: each image is lit by all anchor lights in these proportions.
     """
     rows, p = [], distribution.probabilities(psi.double())
     free = set(distribution.ranges) - {factor.coordinate for factor in distribution.binned}
@@ -66,7 +66,7 @@ def _placed(
 
 
 def psi_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Write the table with a header, as CSV."""
+    """Write the table as CSV, with a header."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)

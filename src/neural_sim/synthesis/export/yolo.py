@@ -1,7 +1,7 @@
-"""YOLO's text labels: boxes beside the images, and polygons in a folder of their own, since a set has one or the other.
+"""YOLO's text labels: boxes next to the images, and polygons in another folder, because a set has one or the other.
 
-https://docs.ultralytics.com/datasets/detect and /segment: one line an object, its class and numbers in units of the
-image's width and height.
+See https://docs.ultralytics.com/datasets/detect and /segment: each line is an object, with its class and with numbers
+in units of the image's width and height.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SEGMENT = "segment"
 def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: Sequence[str]) -> None:
     """Write ``dataset.yaml`` and ``labels/*.txt`` (boxes) for ``folder/images``.
 
-    ``segment`` has the same images with the visible masks as polygons. Images without objects have empty files, as YOLO
-    has them.
+    ``segment`` has the same images, with the visible masks as polygons. Images without objects have empty files, as
+    YOLO expects.
     """
     for record in records:
         name = Path(record["file"])
@@ -33,14 +33,14 @@ def write_yolo(folder: Path, records: Sequence[Mapping[str, Any]], class_names: 
                 write_whole(path, "".join(f"{text}\n" for text in lines))
         same_file(folder / name, folder / SEGMENT / "images" / name.name)
     names = "".join(f"  {label}: {json.dumps(name)}\n" for label, name in enumerate(class_names))
-    # Readers take paths to be relative to this file where it names no root.
+    # Without a root in the file, readers take paths to be relative to the file.
     text = f"train: images\nval: images # no split is made; name your own\nnc: {len(class_names)}\nnames:\n{names}"
     for place in (folder, folder / SEGMENT):
         write_whole(place / DATA, text)
 
 
 def box_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
-    """Class, and the visible box's centre and size."""
+    """Write an object's class, and the centre and size of its visible box."""
     x, y, width, height = item["box_visible"]
     numbers = (x + 0.5 * width) / size["width"], (y + 0.5 * height) / size["height"]
     sides = width / size["width"], height / size["height"]
@@ -48,6 +48,6 @@ def box_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
 
 
 def polygon_line(item: Mapping[str, Any], size: Mapping[str, float]) -> str:
-    """Class, and the corners of a polygon along the edges of the visible mask's pixels, see ``masks.polygon``."""
+    """Write an object's class, and a polygon along the pixel edges of its visible mask, see ``masks.polygon``."""
     corners = polygon(mask_of(item["mask_visible"])) / (size["width"], size["height"])
     return " ".join([str(item["label"]), *(f"{value:.9f}" for value in corners.flatten().tolist())])
