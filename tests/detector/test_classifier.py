@@ -143,7 +143,10 @@ def test_it_learns_colours(tools):
             lambda: make().assign(torch.zeros(1, 1, 4), torch.tensor([[3]])),
             "want labels below 3, got 3",
         ),
-        (lambda: make().features({}, torch.zeros(1, 3, 16, 16)), r"want images of shape \[n, 3, \(32, 32\)\]"),
+        (
+            lambda: make().features({}, torch.zeros(1, 3, 16, 16)),
+            r"want images of shape \[n, 3, \(32, 32\)\]",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(act, message):
