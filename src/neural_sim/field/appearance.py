@@ -1,9 +1,9 @@
-"""A grid field whose colour, and nothing else, depends on an appearance code (NeRF in the Wild, Martin-Brualla 2021).
+"""A grid field in which only colour depends on an appearance code (NeRF in the Wild, Martin-Brualla 2021).
 
-The code scales the hidden units of the colour head: the gains 1 + W c are the same at every sample, so that a field
-under one code is as fast as one without, and the colour's logits are affine in the code, as shading is linear in light.
-(A shift of the hidden layer's bias, which is what appending the code to its input amounts to, renders a side under a
-light that no view showed it in about 2 dB worse.)
+The code scales the hidden units of the colour head. The gains 1 + W c are the same at every sample, so that a field
+under one code is as fast as one without; and the colour's logits are affine in the code, as shading is linear in light.
+(The alternative, to append the code to the hidden layer's input, amounts to a shift of its bias; it renders a side
+under a light that no view showed it in about 2 dB worse.)
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ INITIAL_CODE = 0.3
 
 @validated
 class AppearanceField(RadianceField):
-    """``GridField`` for density and features, and a colour head of one hidden layer that sees features and a code.
+    """``GridField`` for density and features, and a colour head with one hidden layer over features and a code.
 
-    The first three features also pass straight to the colour's logits, so that the head has only the light to learn.
+    The first three features also go directly to the colour's logits, so that the head only has to learn the light.
     ``learned`` codes of ``code_size`` numbers are fitted, one for each light of the training views or one for each
-    view; the ``anchors`` are those k affine combinations of them that an illumination weighs: rows of ``mixing``
-    (k, learned) add up to 1. ``view_dependent`` shows the head the viewing direction; Lambertian objects need none.
-    Queried without a code, the field is under its anchors' mean.
+    view. The ``anchors``, which an illumination weighs, are k affine combinations of them: rows of ``mixing`` (k,
+    learned) add up to 1. With ``view_dependent`` the head also sees the viewing direction, which Lambertian objects do
+    not need. Queried without a code, the field has the mean of its anchors.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class AppearanceField(RadianceField):
         }
 
     def reset_codes(self, mixing: Float[Tensor, "k learned"], generator: torch.Generator) -> None:
-        """Random codes, and how the anchors combine them."""
+        """Draw random codes, and set how the anchors combine them."""
         shape = (mixing.shape[1], self.code.in_features)
         drawn = INITIAL_CODE * torch.randn(shape, generator=generator, device=generator.device)
         self.codes = nn.Parameter(drawn.to(self.codes))
@@ -106,7 +106,7 @@ class AppearanceField(RadianceField):
         return other
 
     def gain(self, code: Float[Tensor, "*n code"]) -> Float[Tensor, "*n width"]:
-        """Return the factors of the head's hidden units under a code."""
+        """Return the factors on the head's hidden units under a code."""
         return 1.0 + self.code(code)
 
     def decode(
@@ -150,7 +150,7 @@ class AppearanceField(RadianceField):
 
 
 class LitField(RadianceField):
-    """An appearance field under one code; shares its tensors. Its colour has derivatives by the code's rates, too."""
+    """An appearance field under one code; shares its tensors. Its colour also has derivatives by the code's rates."""
 
     def __init__(
         self, field: AppearanceField, gain: Float[Tensor, "width"], gain_rates: Float[Tensor, "q width"]

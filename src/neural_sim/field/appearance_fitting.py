@@ -1,4 +1,4 @@
-"""Fitting a field with appearance codes, and scoring it on views under other lights."""
+"""Fitting of a field with appearance codes, and its scores on views under other lights."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from neural_sim.types import PosedViews
 
 @validated
 class AppearanceFitting(Fitting):
-    """``GridFitting`` for density and features; head and codes learn beside it, at rates of their own.
+    """``GridFitting`` for density and features; the head and codes are learned too, at rates of their own.
 
     Args:
         grid: makes the fitting of the field's grid.
-        shared_lights: the code of a view of known light weights is their combination of the anchors' codes, so that the
-            look of a side under one light is learned from all views of that side. Otherwise, and for photographs, each
-            view learns its own code (NeRF in the Wild).
-        anchors: how many views' codes become the anchors where no light weights are known, evenly spread.
+        shared_lights: if light weights are known, a view's code is the same combination of the anchors' codes, so that
+            the look of a side under one light is learned from all views of that side. Otherwise, and for photographs,
+            each view learns its own code (NeRF in the Wild).
+        anchors: number of views, evenly spread, whose codes become the anchors if no light weights are known.
         transients: learn what single views show in front of the object, and how uncertain each pixel is; for
-            photographs, where somebody walks through the picture. Rendered views have none. They are used once
-            the grid's cells have been refined or pruned: before, they would explain the object itself.
+            photographs, in which somebody may walk through the picture. Rendered views have none. Transients are used
+            only once the grid's cells have been refined or pruned: before, they would explain the object itself.
         transient_penalty: lambda_u of NeRF in the Wild, on the transients' optical depth.
     """
 
@@ -71,7 +71,7 @@ class AppearanceFitting(Fitting):
         self._view_weights, mixing = self._codes_of(views)
         self.field.reset_codes(mixing, generator)
         if self.transients:
-            with torch.random.fork_rng(devices=[]):  # whatever else the process has drawn
+            with torch.random.fork_rng(devices=[]):  # independent of what else the process has drawn
                 torch.manual_seed(generator.initial_seed())
                 self._transient = TransientHead(len(views)).to(self.field.codes)
             self._transient.reset(generator)
@@ -80,7 +80,7 @@ class AppearanceFitting(Fitting):
     def _codes_of(
         self, views: PosedViews
     ) -> tuple[Float[Tensor, "views learned"], Float[Tensor, "k learned"]]:
-        """How each view's code, and each anchor, combines the learned codes."""
+        """Return how each view's code, and each anchor, combines the learned codes."""
         weights = views.light_weights
         if weights is not None and self.shared_lights:
             return weights, torch.eye(weights.shape[1]).to(weights)
@@ -155,10 +155,10 @@ class AppearanceFitting(Fitting):
         return groups
 
     def score(self, views: PosedViews, termination: float, rays_per_chunk: int) -> dict[str, float]:
-        """Whole views under their known lights, which shows the anchors and their mixtures.
+        """Score whole views under their known lights, which tests the anchors and their mixtures.
 
-        Views of unknown light: codes are fitted to each view's left half and its right half is scored, as in NeRF in
-        the Wild.
+        For views of unknown light, a code is fitted to each view's left half and the right half is scored, as in NeRF
+        in the Wild.
         """
         if views.light_weights is not None:
             codes = views.light_weights @ self.field.anchors

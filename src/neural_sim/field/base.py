@@ -14,18 +14,18 @@ from neural_sim.types import PinholeCamera, Rays
 
 
 class RadianceField(nn.Module, ABC):
-    """Density and colour in the object's frame (unit sphere round the origin)."""
+    """Density and colour in the object's frame (the unit sphere around the origin)."""
 
     directed: bool = True
-    """Whether colour may depend on the direction that it is seen from."""
+    """Whether colour may depend on the viewing direction."""
     light_rates: int = 0
-    """How many derivatives of colour alone ``query_with_tangents`` adds to those that were asked for."""
+    """Number of derivatives of colour alone that ``query_with_tangents`` adds to the requested ones."""
 
     @abstractmethod
     def query(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        """Density ``sigma`` (per object radius, at least 0) and colour in [0, 1].
+        """Return density ``sigma`` (per object radius, at least 0) and colour in [0, 1].
 
         ``directions`` are unit and point away from the camera. Differentiable in both arguments, forward and
         reverse mode.
@@ -43,11 +43,11 @@ class RadianceField(nn.Module, ABC):
         Float[Tensor, "m samples"],
         Float[Tensor, "m samples 3"],
     ]:
-        """``query``, and its m >= 1 derivatives where positions move at ``velocities`` and directions at ``turns``.
+        """Return ``query``, with m >= 1 derivatives as positions move at ``velocities`` and directions at ``turns``.
 
-        A field whose light moves has more derivatives of colour than of density, the last ``light_rates`` of them.
+        A field with a moving light has more derivatives of colour than of density, the last ``light_rates`` of them.
 
-        Here by Jacobian-vector products; a field that knows its own derivative overrides this.
+        The base class uses Jacobian-vector products; a field that knows its own derivative overrides this.
         """
         values, rates = [], []
         for velocity, turn in zip(velocities, turns, strict=True):
@@ -62,11 +62,11 @@ class RadianceField(nn.Module, ABC):
         """Return the distances at which to ``query`` the field along rays of shape (rays, 3).
 
         Deterministic and detached: the same rays always give the same distances. Samples behind a transmittance
-        below ``termination`` may be left out; 0 leaves nothing out.
+        below ``termination`` may be skipped; at 0 none is.
         """
 
     def with_step(self, multiple: float) -> RadianceField:
-        """Return this field, tensors shared, sampled at ``multiple`` times its step; itself where it has no step."""
+        """Return this field, tensors shared, sampled at ``multiple`` times its step; itself if it has no step."""
         return self
 
     @torch.no_grad()
@@ -78,11 +78,11 @@ class RadianceField(nn.Module, ABC):
         skip_empty: bool = True,
         surface: Surface | None = None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-        """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the samples of ``sample``.
+        """Compute premultiplied colour and opacity of rays (rays, 3) by quadrature on the samples of ``sample``.
 
-        Without derivatives. ``span`` is that of these rays from ``span``; ``skip_empty``: skip space known to be
-        empty. Neither changes a pixel. A field that knows no empty space ignores both. ``surface``, if given, learns
-        where these rays lose half of their light.
+        Not differentiable. ``span`` are the rays' distances from the method ``span``; with ``skip_empty``, space known
+        to be empty is skipped. Neither changes a pixel, and a field without known empty space ignores both.
+        ``surface``, if given, records where these rays lose half of their light.
         """
         samples = self.sample(rays, termination)
         sigma, rgb = self.query(*sample_points(rays, samples))
@@ -93,11 +93,11 @@ class RadianceField(nn.Module, ABC):
 
     @property
     def reach(self) -> float:
-        """No density lies farther from the origin, in object radii."""
+        """Radius around the origin, in object radii, beyond which there is no density."""
         return 1.0
 
     def span(self, camera: PinholeCamera, camera_to_world: Float[Tensor, "4 4"], rows: range) -> Span | None:
-        """Between which distances the rays of an image's ``rows`` may meet anything; None where nothing is known."""
+        """Return distances between which rays of an image's ``rows`` may meet anything; None if nothing is known."""
         return None
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Fitting a grid field, coarse to fine, with work only where a silhouette or a learned density asks for it."""
+"""Fitting of a grid field, coarse to fine, only where a silhouette or a learned density requires it."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from neural_sim.types import PosedViews
 
 BelowOne = Annotated[float, Ge(0), Lt(1)]
 LARGE = 0.05
-"""Smallest connected part of a field of photographs that is kept, relative to the largest: their poses are not exact,
-and where few look a field has pictures of its own in the air."""
+"""Smallest connected part that is kept of a field of photographs, relative to the largest part: poses are not exact,
+and where few cameras look, a field has pictures of its own in the air."""
 BRIDGED = 2
-"""Cells by which parts are grown before they connect: a surface may have holes about pieces of itself."""
+"""Number of cells by which parts are grown before they are connected: a surface may have holes around its pieces."""
 SPREAD = 0.25
-"""The factor on ``prune_weight`` for photographs. Inexact cameras and blur spread a surface over several cells, each of
-which shows less; with the whole weight, walls had holes."""
+"""Factor on ``prune_weight`` for photographs. Inexact cameras and blur spread a surface over several cells, each of
+which contributes less; with the whole weight, walls had holes."""
 BATCHES_PER_BLOCK = 8
-"""Batches whose samples are chosen at once; choosing has a cost per call."""
+"""Number of batches whose samples are chosen at once; each choice has a fixed cost."""
 
 
 @validated
 class GridFitting(Fitting):
-    """Coarse to fine: the visual hull's cells first; after each of ``refine_steps`` empty cells go, the rest halve.
+    """Fits coarse to fine, first in the visual hull's cells; ``refine_steps`` drop empty cells and halve the others.
 
     ``resolution`` is the final number of cells along the unit sphere's diameter; with n refinements the first is
-    ``resolution`` / 2^n. ``prune_steps`` drop cells without halving. A cell stays when it or a neighbour holds a sample
-    that contributes more than ``prune_weight`` (of photographs, ``SPREAD`` of it) to some of ``prune_rays`` pixels.
+    ``resolution`` / 2^n. ``prune_steps`` drop cells without halving. A cell stays if it or a neighbour holds a sample
+    that contributes more than ``prune_weight`` (for photographs, ``SPREAD`` of it) to one of ``prune_rays`` pixels.
     Samples behind a transmittance of ``termination`` are dropped.
     """
 
@@ -82,14 +82,14 @@ class GridFitting(Fitting):
         occupied, origin, cell = visual_hull(views, self.resolution >> len(self.refine_steps))
         occupied, origin = crop(occupied, origin, cell)
         self.field.reset(occupied, origin, cell)
-        # A hull cell projects at most two of its own diagonals beyond the silhouette (see ``visual_hull``).
+        # A hull cell projects to at most two of its own diagonals beyond the silhouette (see ``visual_hull``).
         border = pixels_across(views, math.sqrt(3.0) * cell)
         self._blocks = RayBlocks(build_pool(views, border, generator))
         self._ready = []
         self._photographs = views.known is not None
 
     def next_batch(self) -> tuple[RayPool, PackedSamples, Int[Tensor, "samples"]]:
-        """Return the next rays with their samples and the cells of these."""
+        """Return the next rays, with their samples and the cells of these samples."""
         if not self._ready:
             block = self._blocks.draw(self.batch_rays * BATCHES_PER_BLOCK)
             self._ready = self._batches(block, self.batch_rays)[::-1]
@@ -128,7 +128,7 @@ class GridFitting(Fitting):
 
     @override
     def state(self) -> dict[str, Any] | None:
-        # The samples of a block's batches were chosen by the densities of its first step.
+        # The samples of a block's batches were chosen with the densities at its first step.
         return None if self._ready else {"field": self.field.state_dict(), "next": self._blocks.next}
 
     @override
@@ -138,7 +138,7 @@ class GridFitting(Fitting):
 
     @torch.no_grad()
     def _seen_cells(self) -> Bool[Tensor, "cells"]:
-        """Occupied cells (in packed order) that show in some pixel."""
+        """Find the occupied cells (in packed order) that are visible in some pixel."""
         largest = self.field.table.new_zeros(self.field.occupancy.count)
         size = self.batch_rays * BATCHES_PER_BLOCK
         for _ in range(math.ceil(self.prune_rays / size)):
@@ -158,7 +158,7 @@ class GridFitting(Fitting):
 
 
 def _large_parts(occupied: Bool[Tensor, "nx ny nz"], seen: Bool[Tensor, "cells"]) -> Bool[Tensor, "cells"]:
-    """Find the cells in connected parts that are not small beside the largest; others are errors in the air."""
+    """Find the cells in connected parts that are large compared with the largest; others are errors in the air."""
     grid = torch.zeros_like(occupied)
     grid[occupied] = seen
     parts = np.zeros(tuple(grid.shape), dtype=np.int64)

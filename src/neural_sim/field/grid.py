@@ -1,4 +1,4 @@
-"""Density and colour features on a packed grid: rows for the vertices of occupied cells only."""
+"""Density and colour features on a packed grid, with rows only for the vertices of occupied cells."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from neural_sim.ranges import NonNegativeInt, Positive, validated
 from neural_sim.types import PinholeCamera, Rays
 
 EMPTY_DENSITY = -1e4
-"""Raw density of the row that stands for all empty space: softplus gives exactly 0."""
+"""Raw density in the row for all empty space: softplus gives exactly 0."""
 
 
 @validated
 class GridField(RadianceField):
-    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, whatever the grid's scale.
+    """Trilinear features over occupied cells; sigma = softplus(gain raw) / cell edge, at any scale of the grid.
 
-    ``features`` numbers per vertex make the colour: with ``head_width`` 0 the first three pass a sigmoid (no view
-    dependence; a Lambertian object under a fixed light needs none), otherwise a head of one hidden layer sees them and
-    the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the
-    softplus' argument in a new field; ``density_gain`` lets density learn that much faster than colour. A new field
-    holds the cube [-1, 1]^3 in one cell; ``reset`` gives it its occupancy.
+    ``features`` numbers at each vertex make the colour. With ``head_width`` 0 the first three pass through a sigmoid
+    (no view dependence; a Lambertian object under a fixed light needs none); otherwise a head with one hidden layer
+    sees them and the viewing direction. ``step_cells`` is the quadrature's step in cells. ``initial_density`` is the
+    argument of softplus in a new field; ``density_gain`` lets density learn that much faster than colour. A new field
+    holds the cube [-1, 1]^3 in one cell; ``reset`` sets its occupancy.
     """
 
     def __init__(
@@ -90,8 +90,8 @@ class GridField(RadianceField):
         return self.step_cells * self.edge
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GridField:
-        """Move and cast as any module does; refuse a type that cannot tell two places in a cell apart."""
-        # Nor would half precision pay for colour alone: decoding is 6 % of a render on a CPU.
+        """Move and cast like any module; refuse a type that cannot distinguish two places in a cell."""
+        # Half precision would not pay for colour alone either: decoding is 6 % of a render on a CPU.
         wanted = fn(self.table.detach()[:0]).dtype
         if wanted not in (torch.float32, torch.float64):
             raise ValueError(f"GridField: want float32 or float64, got {wanted}")
@@ -115,9 +115,9 @@ class GridField(RadianceField):
 
     @torch.no_grad()
     def keep(self, cells: Bool[Tensor, "cells"], refine: bool) -> None:
-        """Drop the occupied cells not in ``cells``, but for neighbours of those that stay.
+        """Drop the occupied cells that are not in ``cells``, except neighbours of those that stay.
 
-        With ``refine`` the cells' edge is halved first, so that the margin of neighbours is thinner, and the table is
+        With ``refine`` the edge of cells is halved first, so that the margin of neighbours is thinner, and the table is
         interpolated.
         """
         wanted, occupied, cell = torch.zeros_like(self.occupied), self.occupied, self.edge
@@ -129,7 +129,8 @@ class GridField(RadianceField):
         before, table, old_cell, old_origin = self.occupancy, self.table, self.edge, self.origin
         corners = self.corners
         coordinates = self._set_cells(occupied, origin, cell)
-        # New vertices lie on old cells' faces; nudged towards the inside of an occupied cell they find a row each.
+        # New vertices lie on faces of old cells; moved slightly towards the inside of an occupied cell, each finds a
+        # row.
         local = (origin - old_origin + coordinates.to(table.dtype) * cell) / old_cell
         rows = _interpolate_from(local, before, corners, table)
         self.table = nn.Parameter(torch.cat([rows, table[-1:]]))
@@ -141,7 +142,8 @@ class GridField(RadianceField):
         # The last row of corners points at the table's last row: empty space.
         self.corners = functional.pad(corners, (0, 0, 0, 1), value=len(coordinates))
         self.occupied, self.origin = occupied, occupancy.origin
-        # A number beside the buffer that is saved: reading that one would make the host wait for the device.
+        # Kept as a number as well as in the saved buffer, because reading the buffer would make the host wait for the
+        # device.
         self.edge, self.cell = float(cell), torch.tensor(cell, dtype=torch.float64)
         self.index, self.distance = occupancy.index, occupancy.distance
         self.coarse, self.coarse_radius = coarse_centres(occupancy)
@@ -150,7 +152,7 @@ class GridField(RadianceField):
     def raw(
         self, positions: Float[Tensor, "samples 3"], cells: Int[Tensor, "samples"] | None = None
     ) -> Float[Tensor, "samples channels"]:
-        """Interpolated table rows. ``cells`` may carry the positions' known cell numbers (-1: empty)."""
+        """Interpolate table rows. ``cells`` may have the known cell numbers of the positions (-1: empty)."""
         local = (positions - self.origin) / self.edge
         base = local.detach().floor()
         corners = self._corners_of(lookup(base, self.occupancy) if cells is None else cells)
@@ -167,7 +169,7 @@ class GridField(RadianceField):
         velocities: Float[Tensor, "m samples 3"],
         turns: Float[Tensor, "m samples 3"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """See the base class; in closed form but for a head, at little more than the cost of ``query``."""
+        """See the base class; in closed form except for a head, at little more than the cost of ``query``."""
         raw, raw_rates = self.raw_with_tangents(positions, velocities)
         sigma_rates = self.density_rates(raw, raw_rates)
         sigma, rgb = self.decode(raw, directions)
@@ -183,7 +185,7 @@ class GridField(RadianceField):
     def raw_with_tangents(
         self, positions: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
     ) -> tuple[Float[Tensor, "samples channels"], Float[Tensor, "m samples channels"]]:
-        """Table rows, and their m derivatives (none is allowed) where positions move at ``velocities``."""
+        """Interpolate table rows, with m >= 0 derivatives for positions that move at ``velocities``."""
         local = (positions - self.origin) / self.edge
         base = local.floor()
         corners = self._corners_of(lookup(base, self.occupancy))
@@ -197,12 +199,12 @@ class GridField(RadianceField):
     def density_rates(
         self, raw: Float[Tensor, "samples channels"], raw_rates: Float[Tensor, "m samples channels"]
     ) -> Float[Tensor, "m samples"]:
-        """Density's derivatives where table rows change at ``raw_rates``."""
+        """Return the derivatives of density for table rows that change at ``raw_rates``."""
         slope = torch.sigmoid(self.density_gain * raw[:, 0]) * (self.density_gain / self.edge)
         return slope * raw_rates[..., 0]
 
     def density(self, raw: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples"]:
-        """Density sigma, per object radius, of table rows."""
+        """Return density sigma, per object radius, of table rows."""
         return functional.softplus(self.density_gain * raw[:, 0]) / self.edge
 
     def decode(
@@ -230,7 +232,7 @@ class GridField(RadianceField):
     def sample_cells(
         self, rays: Rays, termination: float, phase: Float[Tensor, "rays"] | float
     ) -> tuple[PackedSamples, Int[Tensor, "samples"]]:
-        """``sample`` with a lattice phase per ray (see ``march``), and the number of the cell of each sample."""
+        """Return ``sample`` with a lattice phase for each ray (see ``march``), and the cell number of each sample."""
         rays = Rays(rays.origins.detach(), rays.directions.detach())
         collector = SampleCollector(len(rays.origins), rays.origins)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
@@ -258,7 +260,7 @@ class GridField(RadianceField):
         self, decode: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]], directed: bool, rays: Rays,
         termination: float, span: Span | None, skip_empty: bool, surface: Surface | None,
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:  # fmt: skip
-        """``trace`` with density and colour of table rows by ``decode``; ``directed``: it wants samples' directions."""
+        """Do as ``trace``, with table rows decoded by ``decode``; ``directed``: it needs the samples' directions."""
         colour = rays.origins.new_zeros(len(rays.origins), 3)
         extinction = Extinction(len(rays.origins), termination, rays.origins)
 
@@ -291,7 +293,7 @@ class GridField(RadianceField):
         return self.corners.index_select(0, torch.where(cells < 0, len(self.corners) - 1, cells))
 
     def _raw_of(self, wave: Wave) -> Float[Tensor, "k channels"]:
-        """Table rows at a wave's samples, without derivatives."""
+        """Return table rows at a wave's samples, without derivatives."""
         corners = self.corners.index_select(0, wave.cell)
         return gather_weighted(self.table, corners, corner_weights(*wave.fraction))
 
@@ -305,7 +307,7 @@ def _resize_to_state(field: nn.Module, state: dict[str, Tensor], prefix: str, *_
 def _interpolate_from(
     local: Float[Tensor, "vertices 3"], occupancy: Occupancy, corners: Tensor, table: Tensor
 ) -> Float[Tensor, "vertices channels"]:
-    """Values of an old table at grid vertices, each from whichever of its eight neighbouring cells is occupied."""
+    """Return an old table's values at grid vertices, each from any occupied one of its eight neighbouring cells."""
     result = table.new_zeros(len(local), table.shape[1])
     missing = torch.arange(len(local), device=local.device)
     for corner in CORNERS:

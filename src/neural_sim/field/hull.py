@@ -20,22 +20,21 @@ Resolution = Annotated[
     int,
     Matching(lambda cells: cells >= COARSEST and cells & (cells - 1) == 0, f"a power of two from {COARSEST}"),
 ]
-"""Cells along the unit sphere's diameter that can be carved, coarse to fine."""
+"""Number of cells along the unit sphere's diameter that can be carved, coarse to fine."""
 DISSENT = 0.1
-"""Share of the photographs that see a cell and may show no object there: their poses and masks are not exact."""
+"""Fraction of the photographs seeing a cell that may show no object there: their poses and masks are not exact."""
 
 
 def visual_hull(
     views: PosedViews, resolution: int, alpha_threshold: float = 0.004
 ) -> tuple[Bool[Tensor, "nx ny nz"], Float[Tensor, "3"], float]:
-    """Cells of the unit sphere that the object may occupy; the cube [-1, 1]^3 has ``resolution`` along each edge.
+    """Find the cells of the unit sphere that the object may occupy; [-1, 1]^3 has ``resolution`` along each edge.
 
-    A cell goes when some view that sees its centre has no pixel above
-    ``alpha_threshold`` within the circle that the cell can cover, so the hull is never too small. Of photographs
-    (``views.known``) it takes more than ``DISSENT`` of those that show it. Returns cells, origin and edge length in
-    object radii.
+    A cell is removed if some view that sees its centre has no pixel above ``alpha_threshold`` within the circle that
+    the cell can cover, so that the hull is never too small. With photographs (``views.known``), more than the fraction
+    ``DISSENT`` of those that show the cell must agree. Returns cells, origin and edge length in object radii.
 
-    Raises ValueError on another resolution, or when the views leave no cell (their silhouettes contradict each other).
+    Raises ValueError for another resolution, or if the views leave no cell (their silhouettes contradict each other).
     """
     check(resolution, Resolution, "visual_hull.resolution")
     pose = views.camera_to_world
@@ -62,7 +61,7 @@ def visual_hull(
 
 
 def pixels_across(views: PosedViews, length: float) -> int:
-    """How many pixels a length of the unit sphere covers at most in any view, one more for where pixels begin."""
+    """Return how many pixels a length of the unit sphere covers at most in any view, plus one for partial pixels."""
     nearest = max(float(views.camera_to_world[:, :3, 3].norm(dim=-1).min()) - 1.0, 0.25)
     return math.ceil(max(focal_lengths(views.camera)) * length / nearest) + 1
 
@@ -70,7 +69,7 @@ def pixels_across(views: PosedViews, length: float) -> int:
 def _inside_all(
     views: PosedViews, centres: Float[Tensor, "cells 3"], radius: float, alpha_threshold: float
 ) -> Bool[Tensor, "cells"]:
-    """Whether every view that sees a centre finds object within ``radius`` of it; unseen centres stay."""
+    """Whether every view that sees a centre finds the object within ``radius`` of it; unseen centres stay."""
     camera, reach = views.camera, pixels_across(views, radius)
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     mask = views.images[..., 3] > alpha_threshold

@@ -1,7 +1,7 @@
-"""Trilinear interpolation in a packed table: rows of occupied vertices only, found through an array of corners.
+"""Trilinear interpolation in a packed table, with rows only for occupied vertices, found through an array of corners.
 
 On a CPU this is one ``index_select`` and one small batched product; 3-D ``grid_sample`` is about ten times slower
-and lacks forward-over-reverse derivatives.
+and has no forward-over-reverse derivatives.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from torch import Tensor
 from neural_sim.devices import at_once
 
 SCATTERED = 8192
-"""Samples whose derivatives are scattered at a time on a CPU."""
+"""Number of samples whose derivatives are scattered at a time on a CPU."""
 
 CORNERS = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 """Offsets of a cell's eight vertices, in the order of ``trilinear_weights``."""
 
 
 def trilinear_weights(fraction: Float[Tensor, "samples 3"]) -> Float[Tensor, "samples 8"]:
-    """Weights of the eight corners for a position inside a cell, each coordinate in [0, 1]."""
+    """Compute weights of the eight corners for a position inside a cell, each coordinate in [0, 1]."""
     x, y, z = torch.stack([1.0 - fraction, fraction], -1).unbind(1)
     xy = x[:, :, None] * y[:, None, :]
     return (xy[..., None] * z[:, None, None, :]).flatten(1)
@@ -31,7 +31,7 @@ def trilinear_weights(fraction: Float[Tensor, "samples 3"]) -> Float[Tensor, "sa
 def corner_weights(
     x: Float[Tensor, "samples"], y: Float[Tensor, "samples"], z: Float[Tensor, "samples"]
 ) -> Float[Tensor, "samples 8"]:
-    """``trilinear_weights`` of coordinates kept apart, an order of magnitude faster on a CPU; no derivative passes."""
+    """Compute ``trilinear_weights`` from separate coordinates: ten times faster on a CPU, not differentiable."""
     edges = torch.stack(_bilinear(x, y))
     upper = edges * z
     weights = x.new_empty(len(x), 4, 2)
@@ -43,10 +43,10 @@ def corner_weights(
 def trilinear_tangents(
     fraction: Float[Tensor, "samples 3"], velocities: Float[Tensor, "m samples 3"]
 ) -> tuple[Float[Tensor, "samples 8"], Float[Tensor, "m samples 8"]]:
-    """``trilinear_weights``, and their derivatives where the fraction moves at ``velocities``.
+    """Compute ``trilinear_weights``, and their derivatives for a fraction that moves at ``velocities``.
 
-    Coordinate by coordinate over all samples, so that every operation runs over contiguous memory. No derivative
-    passes.
+    The computation goes coordinate by coordinate over all samples, so that every operation runs over contiguous memory.
+    Not differentiable.
     """
     x, y, z = fraction.detach().t().contiguous().unbind(0)
     edges = _bilinear(x, y)
@@ -63,7 +63,7 @@ def trilinear_tangents(
 
 
 def _bilinear(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(1 - x)(1 - y), (1 - x) y, x (1 - y), x y."""
+    """Return (1 - x)(1 - y), (1 - x) y, x (1 - y) and x y."""
     both = x * y
     low = y - both
     return 1.0 - x - low, low, x - both, both
@@ -74,7 +74,7 @@ def gather_weighted(
     corners: Int[Tensor, "samples 8"],
     weights: Float[Tensor, "samples 8"],
 ) -> Float[Tensor, "samples channels"]:
-    """``interpolate`` in one fused operation, several times faster; for values only."""
+    """Do as ``interpolate`` in one fused operation, several times faster; for values only."""
     return torch.nn.functional.embedding_bag(corners, table, per_sample_weights=weights, mode="sum")
 
 
@@ -83,7 +83,7 @@ def interpolate(
     corners: Int[Tensor, "samples 8"],
     weights: Float[Tensor, "samples 8"],
 ) -> Float[Tensor, "samples channels"]:
-    """Weighted sum of eight rows of ``table``. Every derivative mode works through it."""
+    """Return the weighted sum of eight rows of ``table``; differentiable in every mode."""
     rows = table.index_select(0, corners.reshape(-1)).view(*corners.shape, table.shape[1])
     return torch.bmm(weights[:, None], rows)[:, 0]
 
@@ -102,7 +102,7 @@ class _ScatterInterpolate(torch.autograd.Function):
         corners, weights = ctx.saved_tensors
         (cotangent,) = cotangents
         rows, channels = ctx.table_shape
-        # A scatter of single numbers is faster on a CPU than one of rows, and pieces stay in its cache.
+        # On a CPU, scattering single numbers is faster than scattering rows, and pieces stay in its cache.
         gradient = cotangent.new_zeros(rows * channels)
         channel = torch.arange(channels, device=cotangent.device)
         size = at_once(SCATTERED, cotangent.device)
@@ -118,5 +118,5 @@ def interpolate_for_training(
     corners: Int[Tensor, "samples 8"],
     weights: Float[Tensor, "samples 8"],
 ) -> Float[Tensor, "samples channels"]:
-    """``interpolate``, faster in reverse mode and differentiable in ``table`` only (weights are constants)."""
+    """Do as ``interpolate``, faster in reverse mode and differentiable in ``table`` only (weights are constants)."""
     return _ScatterInterpolate.apply(table, corners, weights)  # pyright: ignore[reportReturnType]

@@ -1,8 +1,8 @@
-"""Samples where rays meet occupied cells: uniform steps on a fixed lattice, empty space skipped, rays that end dropped.
+"""Samples where rays meet occupied cells: uniform steps on a fixed lattice that skip empty space and ended rays.
 
-The lattice of a ray is t_k = (k + phase) step from the ray's origin, whatever was skipped; so leaving empty space out
-changes no sample, and the same ray always has the same distances. Coordinates are kept apart, one contiguous array
-each: on a CPU that is several times faster than arrays of points.
+The lattice of a ray is t_k = (k + phase) step from the ray's origin, whatever is skipped: skipping empty space
+changes no sample, and the same ray always has the same distances. Coordinates are separate contiguous arrays, which
+on a CPU is several times faster than arrays of points.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from neural_sim.field.quadrature import PackedSamples, Span
 from neural_sim.types import Rays
 
 SHORTEST, LONGEST = 8, 64
-"""Lattice steps taken at once by each ray that has reached a coarse occupied cell, powers of two."""
+"""Numbers of lattice steps that a ray takes at once after it has reached a coarse occupied cell; powers of two."""
 POINTS = 131_072
-"""Below so many points a wave costs little more than its calls, and few rays take longer waves than many; on a CPU."""
+"""Least points in a wave, so that few rays take longer waves: below it, calls dominate the cost on a CPU."""
 
 Axes = tuple[Tensor, Tensor, Tensor]
 
@@ -31,9 +31,9 @@ Axes = tuple[Tensor, Tensor, Tensor]
 class Wave:
     """The next ``length`` lattice steps of n rays, of which k lie in occupied cells.
 
-    ``ray`` numbers the rays, ``row`` counts within ``ray`` and ``place`` within the n x length steps, both in
-    increasing order; ``count`` is the number of each ray's samples. ``fraction`` is the position inside the cell, x, y
-    and z in [0, 1].
+    ``ray`` numbers the rays; ``row`` is each sample's index in ``ray`` and ``place`` its index among the n x length
+    steps, both in increasing order; ``count`` is the number of each ray's samples. ``fraction`` is the position inside
+    the cell, x, y and z in [0, 1].
     """
 
     length: int
@@ -47,7 +47,7 @@ class Wave:
 
 
 Visitor = Callable[[Wave], Bool[Tensor, "n"]]
-"""Sees a wave, and says which of its rays go on."""
+"""Receives a wave, and returns which of its rays continue."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class _Walk:
         return _Walk((x, y, z), (u, v, w), last, phase)
 
     def at(self, travelled: Float[Tensor, "n *steps"]) -> Axes:
-        """Positions after travelling so many cells."""
+        """Return positions after travelling the given number of cells."""
         shape = (-1,) + (1,) * (travelled.ndim - 1)
         x, y, z = (
             torch.addcmul(start.view(shape), along.view(shape), travelled)
@@ -84,11 +84,11 @@ def march(
     span: Span | None = None,
     skip_empty: bool = True,
 ) -> None:
-    """Walk rays of shape (rays, 3) through the grid and show ``visit`` every wave that may hold occupied cells.
+    """Walk rays of shape (rays, 3) through the grid and pass ``visit`` every wave that may hold occupied cells.
 
-    ``step`` in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. ``span`` may say
-    between which distances the occupied cells of each ray lie. Without ``skip_empty`` a ray takes every step in the
-    grid's box. Raises ValueError where a ray starts so far away that its arithmetic cannot tell one lattice step from
+    ``step`` is in object radii, ``phase`` in [0, 1) steps. A ray's waves come in order of distance. ``span`` may give
+    the distances between which the occupied cells of each ray lie. Without ``skip_empty`` a ray takes every step in the
+    grid's box. Raises ValueError if a ray starts so far away that its arithmetic cannot tell one lattice step from
     the next (float32: 2^22 steps).
     """
     unit = step / occupancy.cell
@@ -101,11 +101,11 @@ def march(
         length = SHORTEST
         while 2 * length * len(ray) <= points and length < LONGEST:
             length *= 2
-        # A long wave soon crosses the gap to an occupied coarse cell that is near.
+        # A long wave soon crosses the gap to a nearby occupied coarse cell.
         there = (away <= length // (4 * COARSENING)).nonzero()[:, 0]
         going = following <= walk.last
         if len(there):
-            # Most rays arrive together, so that few selections copy a part of the rays only.
+            # Most rays arrive together, so that a selection seldom copies a part of the rays.
             whole = len(there) == len(ray)
             arrived = walk if whole else walk.select(there)
             number, first = (
@@ -136,12 +136,12 @@ def _wave(ray: Tensor, first: Tensor, length: int, walk: _Walk, occupancy: Occup
 
 
 def _fraction(local: Float[Tensor, "k"], size: int) -> Float[Tensor, "k"]:
-    """Position inside the cell that ``_flat`` finds."""
+    """Return the position inside the cell that ``_flat`` finds."""
     return local - local.clamp(0, size - 1).floor()
 
 
 def _flat(local: Axes, shape: torch.Size) -> Int[Tensor, "*n"]:
-    """Flat index of the grid's cell at each position; beyond the grid, of the nearest one."""
+    """Return the flat index of the grid's cell at each position; beyond the grid, of the nearest cell."""
     x, y, z = (axis.clamp(0, size - 1).to(torch.int32) for axis, size in zip(local, shape, strict=True))
     return torch.add(z, torch.add(y, x, alpha=shape[1]), alpha=shape[2])
 
@@ -161,9 +161,9 @@ def lookup(local: Float[Tensor, "*samples 3"], occupancy: Occupancy) -> Int[Tens
 def _enter(
     rays: Rays, occupancy: Occupancy, step: float, phase: Float[Tensor, "rays"] | float, span: Span | None
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], _Walk]:
-    """Numbers of the rays that meet the grid's box, their first lattice steps inside, and all rays in cells."""
+    """Return the numbers of the rays that meet the grid's box, their first lattice steps inside, and them in cells."""
     origin = ((rays.origins - occupancy.origin) / occupancy.cell).t().contiguous()
-    # A direction component of exactly zero would divide by zero; the smallest slope has the same span.
+    # A direction component of exactly zero would divide by zero; the smallest slope gives the same span.
     slope = rays.directions.t().contiguous()
     slope = torch.where(slope.abs() < 1e-9, torch.full_like(slope, 1e-9), slope)
     beyond = torch.stack([size - axis for axis, size in zip(origin, occupancy.index.shape, strict=True)])
@@ -193,9 +193,9 @@ def _enter(
 def _leap(
     walk: _Walk, ahead: Float[Tensor, "n"], occupancy: Occupancy, nearest: Int[Tensor, "coarse"], unit: float
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Coarse cells to the nearest occupied one, and the first lattice step behind the empty ones for certain.
+    """Return the coarse cells to the nearest occupied one, and the first lattice step surely behind the empty ones.
 
-    A ray whose coarse cell is d > 0 cells from the nearest occupied one may go on to the exit of the cube of
+    A ray whose coarse cell is d > 0 cells from the nearest occupied one may jump to the exit of the cube of
     d - 1 cells around its own.
     """
     travelled = (ahead + walk.phase) * unit
@@ -217,7 +217,7 @@ class SampleCollector:
     def __init__(self, rays: int, like: Float[Tensor, "*any"]) -> None:
         number = torch.zeros(0, dtype=torch.int64, device=like.device)
         self._count = torch.zeros(rays, dtype=torch.int64, device=like.device)
-        # One empty part, so that rays which all miss need no special case.
+        # One empty part, so that the case in which all rays miss needs no special code.
         self._parts = [(number, number, like.new_zeros(0), number.to(torch.int32))]
 
     def add(self, wave: Wave, kept: Bool[Tensor, "k"] | None = None) -> None:
@@ -226,18 +226,18 @@ class SampleCollector:
         if kept is not None:
             index = kept.nonzero()[:, 0]
             row, distance, cell = (part.index_select(0, index) for part in (row, distance, cell))
-            # Differences of a running count: the size of a histogram depends on its values.
+            # Differences of a running count: a histogram's size would depend on its values.
             ends = torch.nn.functional.pad(kept.cumsum(0), (1, 0)).index_select(0, wave.count.cumsum(0))
             count = torch.diff(ends, prepend=ends.new_zeros(1))
         before = self._count.index_select(0, wave.ray)
-        # Rows come in order: a sample's rank is its number less that of its row's first sample.
+        # Rows come in order: a sample's rank is its number minus that of its row's first sample.
         first = before - (count.cumsum(0) - count)
         order = torch.arange(len(row), device=row.device) + first.index_select(0, row)
         self._parts.append((wave.ray.index_select(0, row), order, distance, cell))
         self._count.index_copy_(0, wave.ray, before + count)
 
     def finish(self, width: float) -> tuple[PackedSamples, Int[Tensor, "samples"]]:
-        """All samples in packed order, each standing for ``width`` of its ray, and their cells."""
+        """Return all samples in packed order, each representing ``width`` of its ray, and their cells."""
         starts = torch.nn.functional.pad(self._count.cumsum(0), (1, 0))
         ray, order, distance, cell = (torch.cat(parts) for parts in zip(*self._parts, strict=True))
         place = starts.index_select(0, ray) + order

@@ -1,4 +1,4 @@
-"""The radiance field of the paper: NeRF's networks (Mildenhall et al. 2020), coarse and fine, and their fitting."""
+"""The radiance field of the paper, NeRF's coarse and fine networks (Mildenhall et al. 2020), and their fitting."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neural_sim.types import PosedViews, Rays
 
 TwoOrMore = Annotated[int, Ge(2)]
 SKIP_LAYER = 4
-"""The layer that sees the encoded position again (NeRF, Fig. 7)."""
+"""The layer at which the encoded position enters again (NeRF, Fig. 7)."""
 
 
 def positional_encoding(
@@ -37,7 +37,7 @@ def positional_encoding(
 
 
 class NerfNetwork(nn.Module):
-    """Position to density, position and direction to colour. All sizes are NeRF's by default."""
+    """Position to density, position and direction to colour. All default sizes are NeRF's."""
 
     def __init__(self, width: int, depth: int, position_frequencies: int, direction_frequencies: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class NerfNetwork(nn.Module):
             if layer == SKIP_LAYER + 1:
                 hidden = torch.cat([encoded, hidden], -1)
             hidden = torch.relu(linear(hidden))
-        # Softplus instead of NeRF's ReLU (as in mip-NeRF): a ReLU that starts below zero everywhere never learns.
+        # Softplus instead of NeRF's ReLU (as in mip-NeRF): a ReLU that is zero everywhere at first never learns.
         sigma = nn.functional.softplus(self.sigma(hidden)[:, 0])
         view = positional_encoding(directions, self.direction_frequencies)
         colour = self.colour(torch.cat([self.bottleneck(hidden), view], -1))
@@ -70,10 +70,10 @@ class NerfNetwork(nn.Module):
 
 @validated
 class MLPField(RadianceField):
-    """Two networks: the coarse one says where along a ray the fine one is asked.
+    """Two networks: the coarse one decides where along a ray the fine one is sampled.
 
-    ``query`` is the fine network's. ``coarse_samples`` uniform samples span the ray's part in the unit sphere;
-    ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at the even quantiles so that
+    ``query`` uses the fine network. ``coarse_samples`` uniform samples span the ray's part in the unit sphere;
+    ``fine_samples`` more are drawn in proportion to the coarse weights (NeRF, Sec. 5.2), at even quantiles so that
     ``sample`` is deterministic. ``density_scale`` multiplies softplus, per object radius.
     """
 
@@ -113,7 +113,7 @@ class MLPField(RadianceField):
         return dict(self._settings)
 
     def with_step(self, multiple: float) -> MLPField:
-        """See the base class; fewer samples in both passes, at least two."""
+        """See the base class; takes fewer samples in both passes, but at least two."""
         if multiple == 1.0:
             return self
         other = copy.copy(self)
@@ -131,19 +131,19 @@ class MLPField(RadianceField):
     def query_coarse(
         self, positions: Float[Tensor, "samples 3"], directions: Float[Tensor, "samples 3"]
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-        """``query`` of the coarse network."""
+        """Query the coarse network."""
         sigma, rgb = self.coarse(positions, directions)
         return sigma * self.density_scale, rgb
 
     @torch.no_grad()
     def sample(self, rays: Rays, termination: float) -> PackedSamples:
-        """See the base class; nothing is left out, whatever ``termination``: samples follow the weights already."""
+        """See the base class; skips nothing, whatever ``termination`` is: samples already follow the weights."""
         coarse = self.sample_coarse(rays, None)
         return self.sample_fine(rays, coarse, None)
 
     @torch.no_grad()
     def sample_coarse(self, rays: Rays, generator: torch.Generator | None) -> PackedSamples:
-        """Stratified distances in the unit sphere, at the strata's middles without a generator."""
+        """Return stratified distances in the unit sphere; without a generator, the middles of the strata."""
         near, far = unit_sphere_span(Rays(rays.origins.detach(), rays.directions.detach()))
         hit = (far > near).nonzero()[:, 0]
         near, far = near[hit, None], far[hit, None]
@@ -156,9 +156,9 @@ class MLPField(RadianceField):
     def sample_fine(
         self, rays: Rays, coarse: PackedSamples, generator: torch.Generator | None
     ) -> PackedSamples:
-        """Coarse distances joined with new ones where the coarse weights are; each sample owns the ray round it.
+        """Join coarse distances with new ones where the coarse weights are; each sample represents the ray around it.
 
-        A ray has coarse_samples + fine_samples samples or, where it misses the unit sphere, none.
+        A ray has coarse_samples + fine_samples samples, or none if it misses the unit sphere.
         """
         sigma, _ = self.query_coarse(*sample_points(rays, coarse))
         weights = render_weights(sigma, coarse).view(-1, self.coarse_samples)
@@ -180,7 +180,7 @@ def inverse_cumulative(
     weights: Float[Tensor, "rays bins"],
     quantiles: Float[Tensor, "rays samples"],
 ) -> Float[Tensor, "rays samples"]:
-    """Where the piecewise uniform density ``weights`` between ``edges`` reaches the given quantiles."""
+    """Return where the piecewise uniform density ``weights`` between ``edges`` reaches the given quantiles."""
     cumulative = nn.functional.pad(weights.cumsum(1), (1, 0))
     cumulative = cumulative / cumulative[:, -1:]
     right = torch.searchsorted(cumulative, quantiles.contiguous(), right=True).clamp(1, weights.shape[1])
@@ -206,7 +206,7 @@ def _pack(distance: Tensor, width: Tensor, hit: Tensor, rays: int) -> PackedSamp
 
 
 def _initialise(module: nn.Module, generator: torch.Generator) -> None:
-    """He-uniform weights and zero biases (torch's own initialiser draws from the global generator)."""
+    """Draw He-uniform weights and zero biases (torch's own initialiser uses the global generator)."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             bound = (6.0 / layer.in_features) ** 0.5
@@ -217,9 +217,9 @@ def _initialise(module: nn.Module, generator: torch.Generator) -> None:
 
 @validated
 class MLPFitting(Fitting):
-    """Both networks at once (NeRF, Eq. 6), stratified noise in the sample distances.
+    """Fits both networks at once (NeRF, Eq. 6), with stratified noise in the sample distances.
 
-    Rays of all pixels take part: empty space far from the object is learned only from rays that miss it.
+    Rays of all pixels are used: only rays that miss the object teach that space far from it is empty.
     """
 
     field: MLPField

@@ -1,4 +1,4 @@
-"""How each kind of field is fitted: which rays make a batch, what is rendered, when the field's structure changes."""
+"""How each kind of field is fitted: which rays form a batch, what is rendered, when the field's structure changes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from neural_sim.types import PosedViews
 
 
 class Fitting(ABC):
-    """One field with its training rays. Calls: ``start`` once, then ``loss`` and ``advance`` in each step."""
+    """One field with its training rays. ``start`` is called once, then ``loss`` and ``advance`` in each step."""
 
     checkpoint: Checkpoint | None = None
-    """The checkpoint that the fit is taken up from and writes to; None: neither."""
+    """The checkpoint from which the fit resumes and to which it writes; None: neither."""
 
     def __init__(self, field: RadianceField, batch_rays: int) -> None:
         self.field = field
@@ -33,15 +33,15 @@ class Fitting(ABC):
 
     @abstractmethod
     def render(self) -> tuple[list[Rendering], Float[Tensor, "rays 4"]]:
-        """All renderings of the next batch that the loss compares with its pixels, and these (premultiplied RGBA)."""
+        """Render the next batch, in every way that the loss needs; also return its pixels (premultiplied RGBA)."""
 
     def loss(self) -> Float[Tensor, ""]:
-        """Return what the next step descends: the expected error of every rendering of the next batch."""
+        """Return what the next step minimises: the expected error of every rendering of the next batch."""
         renderings, pixels = self.render()
         return torch.stack([expected_error(rendering, pixels) for rendering in renderings]).sum()
 
     def score(self, views: PosedViews, termination: float, rays_per_chunk: int) -> dict[str, float]:
-        """How well the field shows views that it is not fitted to, see ``score_views``."""
+        """Score the field on views to which it is not fitted, see ``score_views``."""
         return score_views(self.field, views, termination, rays_per_chunk)
 
     @abstractmethod
@@ -49,25 +49,27 @@ class Fitting(ABC):
         """Act after ``step`` steps; return whether the field's parameters were replaced."""
 
     def state(self) -> dict[str, Any] | None:
-        """Return all but the optimiser's state that a step leaves to the next; None where a step cannot be the first.
+        """Return what a step passes on, except the optimiser's state; None if a fit cannot resume at this step.
 
-        A fitting that never returns any is not taken up where a killed run left it.
+        A fitting that never returns a state does not resume interrupted runs.
         """
         return None
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a ``state``, just after ``start`` on the same views."""
-        raise NotImplementedError(f"{type(self).__name__} returns a state, and wants restore to take it up")
+        """Continue from a ``state``, directly after ``start`` on the same views."""
+        raise NotImplementedError(
+            f"{type(self).__name__} returns a state, and needs restore to resume from it"
+        )
 
     @abstractmethod
     def learning_rates(self) -> list[tuple[list[torch.nn.Parameter], float]]:
-        """Parameter groups with their initial learning rates."""
+        """Return parameter groups with their initial learning rates."""
 
 
 class RayBlocks:
-    """Consecutive blocks of a shuffled pool of rays, again from its beginning when fewer than a block are left.
+    """Consecutive blocks of a shuffled pool of rays, starting over if less than a block is left.
 
-    ``next`` is the place of the next one.
+    ``next`` is the start of the next block.
     """
 
     def __init__(self, pool: RayPool) -> None:

@@ -1,4 +1,4 @@
-"""Which cells of a grid can hold anything: a packed numbering of them, and how far away the nearest one is."""
+"""Which cells of a grid can hold anything: a packed numbering of them, and the distance to the nearest one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 COARSENING = 4
-"""Fine cells along one edge of a coarse cell, in which rays skip empty space."""
+"""Number of fine cells along one edge of a coarse cell, in which rays skip empty space."""
 NOTHING = "occupancy: no cell is occupied, want at least one (silhouettes empty or all pruned?)"
 FARTHEST = 16
 """Largest skip, in coarse cells."""
@@ -42,7 +42,7 @@ class Occupancy:
 
 
 def build_occupancy(occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float) -> Occupancy:
-    """Give numbers to the occupied cells, and measure distances to them.
+    """Assign numbers to the occupied cells, and compute distances to them.
 
     Raises:
         ValueError: no cell is occupied.
@@ -66,7 +66,7 @@ def _coarse_distance(occupied: Bool[Tensor, "nx ny nz"]) -> Int[Tensor, "cx cy c
 
 
 def dilate(field: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
-    """Maximum over the 26 neighbours and the cell itself, one axis at a time."""
+    """Take the maximum over the 26 neighbours and the cell itself, one axis at a time."""
     values = field[None, None]
     for kernel, padding in (((3, 1, 1), (1, 0, 0)), ((1, 3, 1), (0, 1, 0)), ((1, 1, 3), (0, 0, 1))):
         values = functional.max_pool3d(values, kernel, 1, padding)
@@ -74,14 +74,14 @@ def dilate(field: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
 
 
 def subdivide(occupied: Bool[Tensor, "nx ny nz"]) -> Bool[Tensor, "mx my mz"]:
-    """Each cell becomes eight of half the edge."""
+    """Divide each cell into eight of half the edge."""
     return occupied.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
 
 
 def crop(
     occupied: Bool[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], cell: float
 ) -> tuple[Bool[Tensor, "mx my mz"], Float[Tensor, "3"]]:
-    """Cut away empty margins; returns the smaller grid and its origin. Raises ValueError when no cell is occupied."""
+    """Cut away empty margins; return the smaller grid and its origin. Raises ValueError if no cell is occupied."""
     where = occupied.nonzero()
     if not len(where):
         raise ValueError(NOTHING)
@@ -94,7 +94,7 @@ def crop(
 def vertices(
     occupancy: Occupancy, corners: Int[Tensor, "8 3"]
 ) -> tuple[Int[Tensor, "cells 8"], Int[Tensor, "vertices 3"]]:
-    """Packed vertex numbers of every occupied cell's corners, and every vertex's grid coordinates."""
+    """Return packed vertex numbers of every occupied cell's corners, and every vertex's grid coordinates."""
     where = occupancy.occupied.nonzero()
     shape = torch.tensor(occupancy.index.shape, device=where.device) + 1
     coordinates = where[:, None, :] + corners.to(where.device)

@@ -15,13 +15,13 @@ from neural_sim.field.quadrature import Span
 from neural_sim.types import PinholeCamera
 
 SMALLEST_STRIP, LARGEST_STRIP = 2048, 16384
-"""Pixels of an image looked at together, in whole rows: a large image needs no more memory than a small one.
-The largest is a CPU's."""
+"""Number of pixels of an image processed together, in whole rows, so that a large image needs no more memory than a
+small one. The largest number is a CPU's."""
 
 
 @dataclass(frozen=True)
 class SeenPixels:
-    """Flat indices into [views, height, width], and what is known of their rays."""
+    """Flat indices into [views, height, width], and what is known of the pixels' rays."""
 
     pixel: Int[Tensor, "rays"]
     span: Span | None
@@ -34,7 +34,7 @@ def seen_pixels(
     rays_per_chunk: int,
     cull: bool = True,
 ) -> Iterator[SeenPixels]:
-    """Chunks of at most ``rays_per_chunk`` pixels, in order; with ``cull`` only those that may see the field."""
+    """Yield at most ``rays_per_chunk`` pixels at a time, in order; with ``cull`` only those that may see the field."""
     strip = max(SMALLEST_STRIP, min(rays_per_chunk, at_once(LARGEST_STRIP, camera_to_world.device)))
     rows_per_strip = max(1, strip // camera.width)
     waiting: list[SeenPixels] = []

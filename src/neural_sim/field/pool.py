@@ -18,7 +18,7 @@ from neural_sim.types import PosedViews, Rays
 class RayPool:
     """Rays (rays, 3), their premultiplied RGBA pixels, views, and a phase in [0, 1) that shifts each sample lattice.
 
-    With phases of their own, neighbouring rays see different depths, so that no depth stays unseen.
+    With different phases, neighbouring rays sample different depths, so that no depth is missed.
     """
 
     rays: Rays

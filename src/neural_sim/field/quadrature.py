@@ -1,9 +1,9 @@
-"""Samples along rays without padding, and the volume rendering quadrature on them, pure functions.
+"""Samples along rays without padding, and volume rendering by quadrature over them, as pure functions.
 
 The quadrature is Max's (1995; NeRF, Mildenhall et al. 2020, Eq. 3). Sums over a ray are differences of one running sum
-over all samples; unlike scatters it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
-counts for more than ``OPAQUE_DEPTH``, so that a ray late in the pack loses no digits to those before it: N samples are
-known to N eps of float64 times the sum of their counted depths.
+over all samples; unlike scatters, it is fast on a CPU and has both derivative modes. It runs in float64, and no sample
+counts more than ``OPAQUE_DEPTH``, so that a ray late in the pack loses no digits to those before it: N samples have an
+error of N eps of float64 times the sum of their counted depths.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from torch import Tensor
 from neural_sim.types import Rays
 
 OPAQUE_DEPTH = 50.0
-"""Optical depth of one sample behind which nothing is seen: exp(-50) = 2e-22 is lost beside 1 even in float64."""
+"""Optical depth of one sample behind which nothing is visible: exp(-50) = 2e-22 vanishes against 1 even in float64."""
 
 
 @dataclass(frozen=True)
 class PackedSamples:
     """Samples of many rays without padding, sorted by ray and then by distance (the layout of nerfacc).
 
-    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii and
-    ``width`` the length of ray the sample stands for. Ray r owns the samples ``starts[r]:starts[r + 1]``.
+    ``ray`` numbers the ray of each sample; ``distance`` is along the ray's unit direction in object radii;
+    ``width`` is the length of ray that the sample represents. Ray r owns the samples ``starts[r]:starts[r + 1]``.
     """
 
     ray: Int[Tensor, "samples"]
@@ -37,10 +37,10 @@ class PackedSamples:
         return self.ray.shape[0]
 
     def of_rays(self, first: int, last: int, begin: int, end: int) -> PackedSamples:
-        """Return the samples of rays ``first`` to ``last`` - 1, numbered from 0: those from ``begin`` to ``end`` - 1.
+        """Return the samples ``begin`` to ``end`` - 1, which belong to rays ``first`` to ``last`` - 1, numbered from 0.
 
-        Both are ``starts`` of the rays. They are asked for, because reading them here would make the host wait for
-        the device once a batch.
+        ``begin`` and ``end`` are in ``starts``. They are arguments because reading them here would make the host wait
+        for the device once a batch.
         """
         return PackedSamples(
             self.ray[begin:end] - first,
@@ -65,7 +65,7 @@ class Span:
 def sample_points(
     rays: Rays, samples: PackedSamples
 ) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples 3"]]:
-    """Positions and directions of the samples, differentiable in the rays; the distances are constants."""
+    """Return positions and directions of the samples, differentiable in the rays; the distances are constants."""
     directions = rays.directions.index_select(0, samples.ray)
     origins = rays.origins.index_select(0, samples.ray)
     return origins + directions * samples.distance[:, None], directions
@@ -74,7 +74,7 @@ def sample_points(
 def alpha_from_sigma(
     sigma: Float[Tensor, "*samples"], width: Float[Tensor, "*samples"]
 ) -> Float[Tensor, "*samples"]:
-    """Absorbed fraction of one sample, 1 - exp(-sigma delta), exact where sigma delta is tiny."""
+    """Compute the fraction that one sample absorbs, 1 - exp(-sigma delta), exact even for tiny sigma delta."""
     return -torch.expm1(-sigma * width)
 
 
@@ -88,9 +88,9 @@ def sum_rays(
 
 
 def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "samples channels"]:
-    """Sum up the samples one after the other, channel by channel where it is not the CPU that adds.
+    """Sum up the samples one after the other, channel by channel unless on a CPU.
 
-    CUDA walks the rows of a matrix one by one, a single row in parallel.
+    CUDA adds the rows of a matrix sequentially, but a single row in parallel.
     """
     if values.device.type == "cpu":
         return values.cumsum(0)
@@ -98,20 +98,20 @@ def _running(values: Float[Tensor, "samples channels"]) -> Float[Tensor, "sample
 
 
 def transmittance(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
-    """Fraction of light that reaches each sample: exp of minus the exclusive sum of sigma delta along its ray."""
+    """Compute the fraction of light that reaches each sample: exp of minus the sum of sigma delta before it."""
     depth = (sigma * samples.width).clamp_max(OPAQUE_DEPTH)
     return torch.exp(-_exclusive(depth.double(), samples)).to(sigma.dtype)
 
 
 def render_weights(sigma: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
-    """Contribution of each sample to its pixel, T alpha. They sum to the ray's opacity."""
+    """Compute each sample's contribution to its pixel, T alpha. They sum to the ray's opacity."""
     return transmittance(sigma, samples) * alpha_from_sigma(sigma, samples.width)
 
 
 def composite(
     sigma: Float[Tensor, "samples"], rgb: Float[Tensor, "samples 3"], samples: PackedSamples
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """Premultiplied colour and opacity of each ray. There is no last infinite interval: what passes, passes."""
+    """Compute premultiplied colour and opacity of each ray. No last interval is infinite: light may pass through."""
     weights = render_weights(sigma, samples)[:, None]
     pixels = sum_rays(torch.cat([weights * rgb, weights], -1), samples)
     return pixels[:, :3], pixels[:, 3]
@@ -124,11 +124,11 @@ def composite_with_tangents(
     rgb_rates: Float[Tensor, "n samples 3"],
     samples: PackedSamples,
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
-    """``composite`` as RGBA, and its derivatives where densities and colours change at the given rates.
+    """Compute ``composite`` as RGBA, and its derivatives for densities and colours that change at the given rates.
 
-    Beyond the m rates of densities only colours change, and opacity's derivative is exactly 0. With tau = sigma delta
-    and D its exclusive sum along the ray, the weight T alpha changes at T (exp(-tau) tau' - alpha D'). Distances and
-    widths are constants.
+    Rates beyond the m rates of density change only colour, and their derivative of opacity is exactly 0. With
+    tau = sigma delta and D its exclusive sum along the ray, the weight T alpha changes at
+    T (exp(-tau) tau' - alpha D'). Distances and widths are constants.
     """
     depth, weights, passed = _passage(sigma, samples)
     parts = [weights[:, None] * rgb, weights[:, None]]
@@ -153,12 +153,12 @@ def composite_with_gradient(
 ) -> tuple[
     Float[Tensor, "rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "3 rays 4"], Float[Tensor, "q rays 3"]
 ]:
-    """Composite as ``composite`` does, to RGBA, with derivatives.
+    """Compute ``composite`` as RGBA, and its derivatives.
 
-    These are by motions of all samples of a ray along x, y or z, by motions in proportion to their distances, and the
-    colour's by the q = n - 3 rates that move colours only. The first three rates are those in space, the others'
-    densities are not looked at. A sample's density adds its own colour, as far as light passes through it, and takes
-    away all behind it: with tau = sigma delta the pixel C changes by T exp(-tau) c - sum_{j behind} w_j c_j.
+    These are the derivatives by motion of all of a ray's samples along x, y or z; by motion in proportion to their
+    distances; and, for colour, by the q = n - 3 rates that change only colour. The first three rates are spatial; the
+    densities of the others are ignored. A sample's density adds its own colour, as far as light passes through it, and
+    removes everything behind it: with tau = sigma delta the pixel C changes by T exp(-tau) c - sum_{j behind} w_j c_j.
     """
     depth, weights, passed = _passage(sigma, samples)
     weights = weights[:, None]
@@ -185,7 +185,7 @@ def composite_with_gradient(
 def _passage(
     sigma: Float[Tensor, "samples"], samples: PackedSamples
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:
-    """Every sample's optical depth, its weight, and the light that passes it."""
+    """Return every sample's optical depth, its weight, and the light that passes it."""
     depth, reached = sigma * samples.width, transmittance(sigma, samples)
     return depth, reached * alpha_from_sigma(sigma, samples.width), reached * torch.exp(-depth)
 
@@ -195,7 +195,7 @@ def _segment_sum(
     samples: PackedSamples,
     factors: Float[Tensor, "samples"] | None = None,
 ) -> Float[Tensor, "rays channels"]:
-    """Each ray's sum, in the values' own type; no derivative passes."""
+    """Return each ray's sum, in the values' own dtype; not differentiable."""
     every = torch.arange(len(values), device=values.device)
     return torch.nn.functional.embedding_bag(
         every, values, samples.starts[:-1], per_sample_weights=factors, mode="sum"
@@ -203,7 +203,7 @@ def _segment_sum(
 
 
 def _exclusive(values: Float[Tensor, "samples"], samples: PackedSamples) -> Float[Tensor, "samples"]:
-    """Sum of the values before each sample along its ray."""
+    """Return the sum of the values before each sample along its ray."""
     wide = values.double()
     exclusive = wide.cumsum(0) - wide
     # A sentinel keeps the start of a last ray without samples inside the array; its value is never used.

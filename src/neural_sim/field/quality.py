@@ -1,4 +1,4 @@
-"""What says whether a field shows its object: scores on held-out views, and pictures that let one judge."""
+"""How well a field shows its object: scores on held-out views, and pictures for the user to judge."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from neural_sim.field.scores import fit_codes, render_lit, where_known
 from neural_sim.types import PosedViews
 
 POOR = 18.0
-"""PSNR in dB on the object below which a field does not show it: debris of real captures had 11 to 14 dB, what one
-recognises 20 and more."""
+"""PSNR in dB on the object below which a field does not show it: debris of real captures had 11 to 14 dB, recognisable
+objects 20 and more."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Where an object is in its capture, in the capture's frame and unit.
+    """The place of an object in its capture, in the capture's frame and unit.
 
     ``distances`` are those of the nearest and the farthest camera, in object radii.
     """
@@ -35,16 +35,16 @@ class Placed:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a field shows an object, with the pictures that let one judge.
+    """How well a field shows an object, with pictures for the user to judge.
 
     Args:
-        psnr: in dB on the object's pixels of the held-out views; None without any.
-        ssim: on these pixels of the views that are shown.
-        cells: of a grid; None for other fields.
+        psnr: PSNR in dB on the object's pixels of the held-out views; None without any.
+        ssim: SSIM on these pixels of the views that are shown.
+        cells: number of a grid's cells; None for other fields.
         views: held-out views over white, their masks and the field's renders of them, as bytes.
-        photographs: whole photographs of these views with what is not the object dimmed; none of a mesh.
+        photographs: whole photographs of these views, with everything but the object dimmed; empty for a mesh.
         bins: the object from the middle of every bin, by factor.
-        placed: of an object of photographs.
+        placed: the object's place, if it comes from photographs.
     """
 
     psnr: float | None
@@ -57,7 +57,7 @@ class Quality:
 
 
 def as_views(field: RadianceField, views: PosedViews) -> Float[Tensor, "n h w 4"]:
-    """Premultiplied renders from the views' cameras; under a light fitted to each where the field has lights."""
+    """Render premultiplied images from the views' cameras; a field with lights gets a light fitted to each view."""
     if not len(views):
         return views.images
     if isinstance(field, AppearanceField):
@@ -70,7 +70,7 @@ def as_views(field: RadianceField, views: PosedViews) -> Float[Tensor, "n h w 4"
 def similarity(
     rendered: Float[Tensor, "n h w 3"], truth: Float[Tensor, "n h w 3"], inside: Bool[Tensor, "n h w"]
 ) -> float | None:
-    """Mean of the similarity map over the object's pixels; None where nothing shows it."""
+    """Return the mean of the similarity map over the object's pixels; None if no pixel shows it."""
     if not bool(inside.any()):
         return None
     every = structural_similarity_index_measure(

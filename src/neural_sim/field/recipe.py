@@ -1,4 +1,4 @@
-"""How a field is fitted to posed views: the configured recipe, its training loop, and what is stored of a field."""
+"""How a field is fitted to posed views: the configured recipe, its training loop, and a field's stored form."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class FieldRecipe:
     Args:
         field: makes a new field.
         fitting: makes the fitting of a field.
-        steps: optimiser steps, the budget.
-        final_rate: of the learning rates' start, to which they fall exponentially.
-        score_every: steps after which the held-out views are rendered and scored; 0: only at the end.
-        seed: of new weights and the order of rays; not the run's seed, so that runs share fields.
+        steps: budget of optimiser steps.
+        final_rate: final learning rates as a fraction of the initial ones, from which they fall exponentially.
+        score_every: number of steps between scores on the held-out views; 0: only at the end.
+        seed: seed of new weights and the order of rays; separate from the run's seed, so that runs share fields.
     """
 
     field: Callable[[], RadianceField]
@@ -58,7 +58,7 @@ class FieldRecipe:
 
     @property
     def kind(self) -> type[RadianceField] | None:
-        """The class of the fields; None where another callable makes them."""
+        """The class of the fields; None if another callable makes them."""
         made = getattr(self.field, "func", self.field)
         return made if isinstance(made, type) and issubclass(made, RadianceField) else None
 
@@ -67,7 +67,7 @@ class FieldRecipe:
     ) -> tuple[RadianceField, list[dict[str, Any]]]:
         """Return the fitted field, and its scores on the last ``held_out`` views against steps and seconds.
 
-        It is taken up where ``checkpoint`` says that an earlier run left it.
+        The fit resumes where an earlier run left it, according to ``checkpoint``.
         """
         placed = views.to(device)
         with torch.random.fork_rng(devices=[]):
@@ -93,7 +93,7 @@ def fit_field(
 ) -> tuple[RadianceField, list[dict[str, float]]]:
     """Fit ``fitting.field`` to all but the last ``held_out`` views, which score it (see ``RadianceFieldModule``).
 
-    Returns the field, in evaluation mode and without gradients, and its history. Raises ValueError when no view is
+    Returns the field, in evaluation mode and without gradients, and its history. Raises ValueError if no view is
     left to fit.
     """
     if not 0 <= held_out < len(views):
@@ -116,7 +116,7 @@ def fit_field(
 
 
 def field_state(field: RadianceField) -> dict[str, Any]:
-    """Kind, constructor arguments and tensors of a field, on the CPU. Raises ``ValueError`` for an unknown kind."""
+    """Return the kind, constructor arguments and tensors (on the CPU) of a field; ValueError for an unknown kind."""
     kind = type(field).__name__
     if kind not in KINDS:
         raise ValueError(f"field: unknown kind {kind!r}, want one of {sorted(KINDS)}")
@@ -125,7 +125,7 @@ def field_state(field: RadianceField) -> dict[str, Any]:
 
 
 def field_from_state(saved: Mapping[str, Any]) -> RadianceField:
-    """Inverse of ``field_state``, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
+    """Invert ``field_state``, in evaluation mode. Raises ``ValueError`` for an unknown kind."""
     if saved.get("kind") not in KINDS:
         raise ValueError(f"field: unknown kind {saved.get('kind')!r}, want one of {sorted(KINDS)}")
     field = KINDS[saved["kind"]](**saved["settings"])
@@ -138,9 +138,9 @@ class RadianceFieldModule(lightning.LightningModule):
     """Fits a field to ``views`` by Adam and scores it on ``held_out``.
 
     One step is one batch of rays; the learning rate falls exponentially to ``final_rate`` of its start over ``steps``.
-    ``score_every`` steps (0: only at the end) the held-out views are rendered; each score is a row of
-    ``history`` {seconds, step, psnr, psnr_foreground, ssim} and is logged as ``field/...``. Seconds are those of
-    fitting, from the start of preparation, without the scoring itself.
+    The held-out views are rendered every ``score_every`` steps (0: only at the end); each score is a row of
+    ``history`` {seconds, step, psnr, psnr_foreground, ssim} and is logged as ``field/...``. Seconds count the
+    fitting from the start of preparation, without the scoring itself.
     """
 
     def __init__(
@@ -177,10 +177,10 @@ class RadianceFieldModule(lightning.LightningModule):
         self.generator.set_state(state["generator"])
         self.history, self._steps_done, self._optimised = state["history"], state["step"], state["optimiser"]
         self._begun = time.perf_counter() - state["seconds"]
-        _log.info("field: goes on after step %d/%d of a run that was ended", self._steps_done, self.steps)
+        _log.info("field: resumes after step %d/%d of an interrupted run", self._steps_done, self.steps)
 
     def _state(self) -> dict[str, Any] | None:
-        """Return all that a step leaves to the next, on the CPU; None where it does so in a way of its own."""
+        """Return everything that a step passes on, on the CPU; None if a fit cannot resume at this step."""
         fitting = self.fitting.state()
         optimiser = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
         return fitting and {
@@ -193,7 +193,7 @@ class RadianceFieldModule(lightning.LightningModule):
         }
 
     def train_dataloader(self) -> DataLoader[int]:
-        """Count the steps that are left, which need no data."""
+        """Count the steps that are left; they need no data."""
         left = range(self._steps_done, self.steps)
         return DataLoader(left, batch_size=None)  # pyright: ignore[reportArgumentType]
 
@@ -246,7 +246,7 @@ class RadianceFieldModule(lightning.LightningModule):
 
 
 def _on_cpu(tree: Any) -> Any:
-    """Copy the tensors of a state, which the next steps change in place."""
+    """Copy the tensors of a state, because the next steps change them in place."""
     if isinstance(tree, torch.Tensor):
         return tree.detach().cpu().clone()
     if isinstance(tree, Mapping):
@@ -255,7 +255,7 @@ def _on_cpu(tree: Any) -> Any:
 
 
 def _replace_parameters(optimizer: torch.optim.Optimizer, groups: list[list[torch.nn.Parameter]]) -> None:
-    """Point the optimiser at new tensors; moments of those that stay are kept."""
+    """Point the optimiser at new tensors; moments of the unchanged ones are kept."""
     for group, parameters in zip(optimizer.param_groups, groups, strict=True):
         group["params"] = parameters
     current = {parameter for parameters in groups for parameter in parameters}

@@ -1,6 +1,6 @@
 """A coloured mesh of an object from its posed views: marching cubes of the masks, colours from the views.
 
-`+experiment=sfm_vs_nerf` compares fields with it. Its geometry comes from silhouettes (Laurentini 1994) instead of a
+`+experiment=sfm_vs_nerf` compares fields with it. Its geometry comes from silhouettes (Laurentini 1994) and not from a
 structure-from-motion pipeline, which needs features that smooth objects lack.
 """
 
@@ -22,9 +22,9 @@ from neural_sim.types import PosedViews
 LEVEL = 0.5
 """Alpha of the silhouette's edge."""
 GRAZING = 0.2
-"""Smallest cosine between a surface's normal and a view's direction for the view to colour it."""
+"""Smallest cosine between a surface's normal and a view's direction at which the view colours the surface."""
 SHARPNESS = 4.0
-"""Power of that cosine by which views are weighted: those from the front see most detail."""
+"""Power of that cosine in the views' weights: frontal views see most detail."""
 LIFT = 0.02
 """Height in object radii above the surface at which the ray to a camera begins."""
 
@@ -32,12 +32,12 @@ LIFT = 0.02
 def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     """Return the surface where the least alpha over all views is ``LEVEL``, with a colour at each vertex.
 
-    In the views' frame, without lighting: the colours are those of the views, with the light that was on them.
-    ``resolution`` is that of ``visual_hull``; the grid of alphas has its cells' centres as points. Cells that a
-    photograph does not show are not carved by it.
+    It is in the views' frame and unlit: the colours are those of the views, with the light that was on them.
+    ``resolution`` is that of ``visual_hull``; the alphas are sampled at the centres of its cells. A photograph does not
+    carve cells that it does not show.
 
     Raises:
-        ValueError: as ``visual_hull``, or where no point's alpha exceeds ``LEVEL``.
+        ValueError: as for ``visual_hull``, or if no point's alpha exceeds ``LEVEL``.
     """
     occupied, origin, cell = visual_hull(views, resolution)
     where = occupied.nonzero()
@@ -51,8 +51,8 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
     from skimage.measure import marching_cubes
 
     vertices, faces, _, _ = marching_cubes(padded, LEVEL, spacing=(cell,) * 3)
-    vertices += origin.cpu().double().numpy() - 0.5 * cell  # of the padding's first centre
-    # Alpha falls from the inside out, so that the surface has to be turned for its normals to point outwards.
+    vertices += origin.cpu().double().numpy() - 0.5 * cell  # centre of the padding's first cell
+    # Alpha falls from the inside out, so that the surface must be reversed for its normals to point outwards.
     mesh = trimesh.Trimesh(vertices, faces, process=True)
     if mesh.volume < 0.0:
         mesh.invert()
@@ -61,7 +61,7 @@ def reconstruct(views: PosedViews, resolution: int = 128) -> trimesh.Trimesh:
 
 
 def least_alpha(views: PosedViews, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-    """Return the least alpha, bilinear, over the views that show each point; 1 where none does."""
+    """Return the least alpha, bilinear, over the views that show each point; 1 if none does."""
     least = torch.ones(len(points), dtype=points.dtype, device=points.device)
     for index in range(len(views)):
         (values, seen) = _sampled(views, index, points)
@@ -72,7 +72,7 @@ def least_alpha(views: PosedViews, points: Float[Tensor, "p 3"]) -> Float[Tensor
 def vertex_colours(mesh: trimesh.Trimesh, views: PosedViews) -> Float[np.ndarray, "v 3"]:
     """Return the mean colour in [0, 1] over the views that see each vertex, weighted towards those that face it.
 
-    Vertices that no view sees have the mean colour of the others.
+    Vertices that no view sees get the mean colour of the others.
     """
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     points = torch.from_numpy(vertices.copy()).to(views.camera_to_world)
@@ -100,7 +100,7 @@ def vertex_colours(mesh: trimesh.Trimesh, views: PosedViews) -> Float[np.ndarray
 def _sampled(
     views: PosedViews, index: int, points: Float[Tensor, "p 3"]
 ) -> tuple[Float[Tensor, "p 4"], Tensor]:
-    """Premultiplied RGBA of a view where it shows the points, bilinear, and which points it shows."""
+    """Return a view's premultiplied RGBA at the points, bilinear, and which points it shows."""
     camera, pose = views.camera, views.camera_to_world[index]
     (fx, fy), (cx, cy) = focal_lengths(camera), principal_point(camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]

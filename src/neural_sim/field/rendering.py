@@ -1,4 +1,4 @@
-"""From rays to pixels through any field: sample, query, composite. One place, so that training and rendering agree."""
+"""From rays to pixels through any field: sample, query, composite. Training and rendering share this code."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from neural_sim.field.quadrature import (
 from neural_sim.types import PinholeCamera, Rays
 
 FEW = 2
-"""Up to this many rates are propagated through the samples; for more, derivatives by a ray's six numbers are."""
+"""Up to this many rates are propagated through the samples; for more, the derivatives by a ray's six numbers are."""
 SAMPLES_AT_ONCE = 16_384
-"""Samples differentiated together on a CPU, to fit its cache."""
+"""Number of samples differentiated together on a CPU, to fit its cache."""
 
 
 def render_samples(
     field: RadianceField, rays: Rays, samples: PackedSamples
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """Premultiplied colour and opacity of rays (rays, 3) by the quadrature on the given samples."""
+    """Compute premultiplied colour and opacity of rays (rays, 3) by quadrature on the given samples."""
     positions, directions = sample_points(rays, samples)
     sigma, rgb = field.query(positions, directions)
     return composite(sigma, rgb, samples)
@@ -39,7 +39,7 @@ def render_samples(
 def render_packed(
     field: RadianceField, rays: Rays, termination: float
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """``render_samples`` on the samples that the field itself chooses."""
+    """Do as ``render_samples`` on the samples that the field itself chooses."""
     return render_samples(field, rays, field.sample(rays, termination))
 
 
@@ -47,16 +47,16 @@ def render_packed(
 def render_with_tangents(
     field: RadianceField, rays: Rays, rates: Rays, termination: float, samples_at_once: int = SAMPLES_AT_ONCE
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
-    """Premultiplied RGBA of rays (rays, 3), and its derivatives where they move at ``rates`` (m, rays, 3).
+    """Compute premultiplied RGBA of rays (rays, 3), and derivatives for rays moving at ``rates`` (m, rays, 3).
 
     Derivatives by a moving light (see ``RadianceField.light_rates``) follow these m.
 
     One pass over the samples gives both, about ``samples_at_once`` at a time: a sample at distance t moves at
-    o' + t d'. Many rates cost what a few do (``_by_ray_numbers``).
+    o' + t d'. Many rates cost as much as a few (``_by_ray_numbers``).
     """
     samples = field.sample(rays, termination)
     differentiate = _with_tangents if len(rates.origins) <= FEW else _by_ray_numbers
-    # Pieces of about as many samples need the same memory wherever in an image their rays lie.
+    # Pieces with about equal numbers of samples need the same memory, wherever in an image their rays lie.
     cuts = torch.arange(0, len(samples), samples_at_once, device=samples.starts.device)[1:]
     first = torch.searchsorted(samples.starts, cuts)
     inner = torch.stack([first, samples.starts.index_select(0, first)], -1).tolist()
@@ -86,9 +86,9 @@ def _with_tangents(
 def _by_ray_numbers(
     field: RadianceField, rays: Rays, rates: Rays, samples: PackedSamples
 ) -> tuple[Float[Tensor, "rays 4"], Float[Tensor, "n rays 4"]]:
-    """Render as ``_with_tangents`` does, by the derivatives in space at each sample.
+    """Render like ``_with_tangents``, through the spatial derivatives at each sample.
 
-    Their sums along a ray are the pixel's derivatives by the ray's origin, and weighted by distance those by its
+    Summed along a ray, they are the pixel's derivatives by the ray's origin; weighted by distance, those by its
     direction.
     """
     positions, directions = sample_points(rays, samples)
@@ -116,7 +116,7 @@ def render_views(
     skip_empty: bool = True,
     surfaces: bool = False,
 ) -> Float[Tensor, "views height width channels"]:
-    """Premultiplied RGBA of whole views; chunks bound the memory and may span views.
+    """Render premultiplied RGBA of whole views; chunks bound the memory and may span views.
 
     ``cull`` casts rays only for pixels that may see something; for ``skip_empty`` see ``RadianceField.trace``. With
     ``surfaces`` a fifth channel has the distance along the ray at which half of the light is lost (0: nowhere).

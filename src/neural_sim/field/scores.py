@@ -1,4 +1,4 @@
-"""How well a field shows views: the error that fitting descends, and scores on views that it was not fitted to.
+"""How well a field shows views: the error that fitting minimises, and scores on views to which it was not fitted.
 
 A field with appearance codes is scored on each view under a code fitted to the view's left half.
 """
@@ -22,7 +22,7 @@ Rendering = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]
 
 
 def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, ""]:
-    """Mean square colour error over a background drawn uniformly in [0, 1], in closed form.
+    """Compute the mean square colour error over a background drawn uniformly in [0, 1], in closed form.
 
     With d the error of premultiplied colour, a that of opacity and b the background, the pixel's error is d - a b;
     E b = 1/2 and E b^2 = 1/3. ``pixels`` are premultiplied RGBA.
@@ -31,7 +31,7 @@ def expected_error(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Flo
 
 
 def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Float[Tensor, "rays 3"]:
-    """Return the square error of each ray and channel, of which ``expected_error`` is the mean."""
+    """Return the square error of each ray and channel; ``expected_error`` is their mean."""
     colour = rendering[0] - pixels[:, :3]
     opacity = (rendering[1] - pixels[:, 3])[:, None]
     return colour.square() - colour * opacity + opacity.square() / 3.0
@@ -40,7 +40,7 @@ def expected_errors(rendering: Rendering, pixels: Float[Tensor, "rays 4"]) -> Fl
 def score_views(
     field: RadianceField, views: PosedViews, termination: float, rays_per_chunk: int
 ) -> dict[str, float]:
-    """``compare`` of the field's images with these views."""
+    """Render these views from the field, and ``compare`` the images with them."""
     rendered = render_views(field, views.camera, views.camera_to_world, termination, rays_per_chunk)
     return compare(where_known(rendered, views), views.images)
 
@@ -59,7 +59,7 @@ def compare(
 
     The scores are ``psnr``, ``ssim``, and ``psnr_foreground`` where alpha is above 0.
 
-    PSNR in dB, mean over views of each view's value; SSIM as torchmetrics' default (Gaussian window, range 1).
+    PSNR is in dB, the mean over views of each view's value; SSIM is torchmetrics' default (Gaussian window, range 1).
     """
     shown, target = (
         over_white(image).movedim(-1, 1).clamp(0.0, 1.0) for image in (rendered, premultiplied(images))
@@ -86,7 +86,7 @@ def render_lit(
     termination: float,
     rays_per_chunk: int,
 ) -> Float[Tensor, "views height width 4"]:
-    """Premultiplied RGBA from the views' cameras, each under its own code."""
+    """Render premultiplied RGBA from the views' cameras, each under its own code."""
     poses = views.camera_to_world
     rendered = [
         render_views(field.lit(code), views.camera, poses[i : i + 1], termination, rays_per_chunk)
@@ -107,10 +107,10 @@ def fit_codes(
     steps: int = 100,
     learning_rate: float = 0.1,
 ) -> Float[Tensor, "views code"]:
-    """Codes that show the left halves of these views best; the field stays as it is.
+    """Fit codes to the left halves of these views; the field does not change.
 
     Geometry and features do not depend on codes: they are looked up once, and each of ``steps`` steps of Adam
-    evaluates the colour head alone.
+    evaluates only the colour head.
     """
     half = views.camera.width // 2
     bundle = cameras.rays(views.camera, views.camera_to_world)

@@ -1,4 +1,4 @@
-"""Which pixels can see occupied space, and between which distances: coarse cells projected before any ray is cast."""
+"""Which pixels can see occupied space, and at which distances: coarse cells are projected before any ray is cast."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from neural_sim.field.occupancy import COARSENING, Occupancy
 from neural_sim.types import PinholeCamera
 
 BLOCKS = 4
-"""A ball covers at least so many blocks of pixels to each side: larger ones would let rays pass far from it."""
+"""Largest number of pixel blocks that a ball may cover to each side; larger blocks would let rays pass far from it."""
 
 
 def coarse_centres(occupancy: Occupancy) -> tuple[Float[Tensor, "3 cells"], float]:
-    """Centres of the occupied coarse cells and the radius of a ball round each, in object radii."""
+    """Return the centres of the occupied coarse cells and the radius of a ball around each, in object radii."""
     edge = COARSENING * occupancy.cell
     where = (occupancy.distance == 0).nonzero().t().to(occupancy.origin)
     return occupancy.origin[:, None] + (where + 0.5) * edge, 0.5 * math.sqrt(3.0) * edge
@@ -32,17 +32,17 @@ def screen_span(
     camera_to_world: Float[Tensor, "4 4"],
     rows: range,
 ) -> Span:
-    """Distances between which the rays of the image's ``rows`` can meet balls of ``radius`` round ``centres``.
+    """Return distances between which rays of the image's ``rows`` can meet balls of ``radius`` around ``centres``.
 
-    Never too short; near > far where a pixel sees none. Each ball is drawn as one block of pixels, its nearest and
-    farthest distance; all are widened together by as many blocks as the largest one covers. Blocks grow with the
-    balls, so that a large image needs no more memory than a small one. Where a ball touches the plane of the camera
+    They are never too narrow; near > far if a pixel sees no ball. Each ball is drawn as one block of pixels, with its
+    nearest and farthest distance; all are then widened by as many blocks as the largest ball covers. Blocks grow with
+    the balls, so that a large image needs no more memory than a small one. If a ball touches the plane of the camera,
     nothing is known, and every pixel gets all distances.
     """
     rotation, position = camera_to_world[:3, :3], camera_to_world[:3, 3]
     x, y, z = (rotation.t() @ (centres - position[:, None])).unbind(0)
     size = (len(rows), camera.width)
-    # A margin for the rounding of this arithmetic, far below a step.
+    # A margin for the rounding errors here, far below a step.
     radius = radius * (1.0 + 1e-4)
     # A point of the ball lies at (x + u) / (-z + w), |u|, |w| <= radius: off the centre by at most this slope.
     across, down = x / -z, -y / -z
@@ -73,7 +73,7 @@ def screen_span(
 
 
 def _sliding_max(values: Float[Tensor, "2 h w"], axis: int, width: int) -> Float[Tensor, "2 h2 w2"]:
-    """Largest of every ``width`` neighbours along an axis, by windows that double; far fewer steps than pooling."""
+    """Return the largest of every ``width`` neighbours along an axis, in windows that double (faster than pooling)."""
     window = 1
     while 2 * window <= width:
         values = _larger(values, axis, window)

@@ -15,9 +15,9 @@ SMALLEST_BETA = 0.03  # as in NeRF in the Wild
 
 
 class TransientHead(nn.Module):
-    """Density, colour and uncertainty of what only one view shows, from a position and that view's transient code.
+    """Density, colour and uncertainty of what only one view shows, from a position and the view's transient code.
 
-    Used while fitting and dropped afterwards; ``codes`` are 16 numbers a view, as in NeRF in the Wild.
+    It is used while fitting and dropped afterwards; ``codes`` are 16 numbers a view, as in NeRF in the Wild.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class TransientHead(nn.Module):
         self.initial_density = initial_density
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw new codes. Equal ones would stay equal where views have equal gradients."""
+        """Draw new codes. Equal codes would stay equal if their views had equal gradients."""
         drawn = torch.randn(self.codes.shape, generator=generator, device=generator.device)
         with torch.no_grad():
             self.codes.copy_(drawn)
@@ -40,7 +40,7 @@ class TransientHead(nn.Module):
     def forward(
         self, positions: Float[Tensor, "samples 3"], view: Int[Tensor, "samples"], step: float
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"], Float[Tensor, "samples"]]:
-        """Density (per object radius; of order 1 / ``step`` where opaque), colour and uncertainty beta."""
+        """Return density (per object radius; of order 1 / ``step`` where opaque), colour and uncertainty beta."""
         scales = torch.pi * 2.0 ** torch.arange(FREQUENCIES, device=positions.device)
         angles = (positions[:, :, None] * scales).flatten(1)
         encoded = torch.cat([positions, angles.sin(), angles.cos()], -1)
@@ -57,8 +57,8 @@ def composite_both(
 ) -> tuple[Rendering, Float[Tensor, "rays"]]:
     """Composite object and transients together; return the image and each ray's beta, seen through both.
 
-    Densities add and colours mix by density, which is emission and absorption of two media in one place. (NeRF in
-    the Wild adds the alphas of the two, which exceed 1 together where both are opaque.)
+    Densities add and colours mix by density, as for two media in one place that emit and absorb. (NeRF in the Wild adds
+    the alphas of the two, which together exceed 1 where both are opaque.)
     """
     sigma = static[0] + transient[0]
     fraction = (transient[0] / sigma.clamp_min(torch.finfo(sigma.dtype).tiny))[:, None]
@@ -75,10 +75,10 @@ def uncertain_error(
     depths: Float[Tensor, "samples"],
     penalty: float,
 ) -> Float[Tensor, ""]:
-    """Return |C - C^|^2 / (2 beta^2) + log(beta^2) / 2, mean over rays, with a penalty of transients.
+    """Return |C - C^|^2 / (2 beta^2) + log(beta^2) / 2, averaged over rays, plus a penalty on transients.
 
     ``penalty`` multiplies the mean optical depth of the transients' samples (NeRF in the Wild, Sec. 4.2). The square
-    error is expected over backgrounds.
+    error is its expectation over backgrounds.
     """
     errors = expected_errors(rendering, pixels).sum(-1)
     return (0.5 * errors / beta.square() + beta.log()).mean() + penalty * depths.mean()

@@ -1,1 +1,1 @@
-"""A field of a whole captured scene, and the masks of the object in it."""
+"""A field of a whole captured scene, and masks of the object in it."""

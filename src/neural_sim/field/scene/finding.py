@@ -19,20 +19,20 @@ from neural_sim.objects.capture import Capture
 from neural_sim.objects.pictures import Corners
 
 RAYS = 98_304
-"""Pixels whose rays find the scene's surface."""
+"""Number of pixels whose rays find the scene's surface."""
 DETAILED = 3
-"""One in so many of them, those with most detail, give the points among which the plane is looked for."""
+"""One in this many of these pixels, those with most detail, gives a point among which the plane is searched."""
 FAINT = 0.05
-"""Largest contribution to any pixel of what is in a box with nothing in it."""
+"""Largest contribution to any pixel of the contents of a box that counts as empty."""
 THICK = 0.75
-"""Distance from the plane in cells up to which points lie on it: a fitted surface is about that thick."""
+"""Largest distance in cells from the plane of points on it: a fitted surface is about that thick."""
 
 
 @dataclass(frozen=True)
 class Found:
     """The object's region in the normalised frame, with what is needed to draw it.
 
-    The centre, radius and box are in the capture's frame. ``occupied`` are the field's cells that hold no fog.
+    The centre, radius and box are in the capture's frame. ``occupied`` are the cells of the field without fog.
     """
 
     frame: Frame
@@ -55,11 +55,11 @@ def find(
 ) -> Found:
     """Find the object in the field of a capture's scene.
 
-    ``up`` and ``box`` are in the capture's frame. ``before`` is what a coarser field, whose frame may be another, took
-    for the object.
+    ``up`` and ``box`` are in the capture's frame. ``before`` is the object as found in a coarser field, which may have
+    another frame.
 
     Raises:
-        ValueError: nothing solid in the box, or without one nothing near the origin.
+        ValueError: there is nothing solid in the box or, without a box, near the origin.
     """
     index = torch.randperm(len(pixels), generator=generator)[:RAYS]
     index = index[pixels.detail[index].argsort(descending=True, stable=True)]
@@ -103,7 +103,7 @@ def find(
 def _boxed(
     grid: SceneGrid, largest: Float[Tensor, "cells"], plane: Plane | None, frame: Frame, box: Corners
 ) -> Region | None:
-    """All of the box above the plane, if that passes through its lower half; None where nothing there is solid."""
+    """Find everything in the box that is above the plane, if that crosses its lower half; None if nothing is solid."""
     low, high = (frame.into(torch.tensor(corner)) for corner in box)
     if plane is not None and float(plane.height(0.5 * (low + high))) < 0.0:
         plane = None  # the box is below it: it is no plane that the object stands on

@@ -1,4 +1,4 @@
-"""Fitting a scene's grid to photographs: which samples count, the loss, and the optimiser's steps."""
+"""Fitting of a scene's grid to photographs: which samples count, the loss, and the optimiser's steps."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from neural_sim.types import Rays
 
 LEARNING_RATE = 0.2
 WARM_RATE = 0.1
-"""From a field that is known roughly: what it has settled, such as a table without texture, must not come loose."""
+"""Learning rate of a warm start, low enough to keep what is settled, such as a table without texture."""
 FINAL_RATE = 0.1
 GAIN_RATE = 0.01
 """Learning rate of the photographs' log gains."""
 SMOOTHNESS = 0.01
 """Weight of the absorbed fractions' total variation in the loss."""
 SMOOTHED = 16_384
-"""Vertices a step at which it is taken."""
+"""Number of vertices at which each step evaluates it."""
 REACHED = 1e-3
-"""Samples that less light than this reaches are dropped."""
+"""Transmittance below which samples are dropped."""
 MARK_EVERY = 16
-"""Steps between two searches for empty cells."""
+"""Number of steps between two searches for empty cells."""
 
 
 @dataclass(frozen=True)
 class ScenePixels:
     """Pixels of all photographs with their rays in the capture's frame.
 
-    ``photo`` numbers each pixel's photograph. ``detail`` is how much the photograph changes from a pixel to the next:
-    where it hardly does, the depth is not known well.
+    ``photo`` numbers each pixel's photograph. ``detail`` is how much the photograph changes from one pixel to the next:
+    without such change, the depth is uncertain.
     """
 
     origins: Float[Tensor, "pixels 3"]
@@ -48,7 +48,7 @@ class ScenePixels:
         return len(self.photo)
 
     def rays(self, index: Int[Tensor, "some"] | slice, frame: Frame) -> Rays:
-        """In the normalised frame."""
+        """Return the rays of pixels, in the normalised frame."""
         return Rays(frame.into(self.origins[index]).float(), self.directions[index].float())
 
 
@@ -56,7 +56,7 @@ class ScenePixels:
 class Visible:
     """The samples of rays that may count.
 
-    ``samples.distance`` in [0, 1] is the place along its ray, in parts of the ray's lattice, ``samples.width`` a
+    ``samples.distance``, in [0, 1], is the place along a ray as a fraction of its lattice; ``samples.width`` is a
     contracted length.
     """
 
@@ -68,7 +68,7 @@ class Visible:
 
 @torch.no_grad()
 def visible(grid: SceneGrid, rays: Rays, phase: Float[Tensor, "rays"], count: int) -> Visible:
-    """Of ``count`` samples a ray those in occupied cells that light reaches."""
+    """Select, from ``count`` samples a ray, those in occupied cells that light reaches."""
     positions, width = along_rays(rays.origins, rays.directions, phase, count)
     kept = grid.in_occupied(positions)
     ray, number = kept.nonzero().unbind(1)
@@ -91,10 +91,10 @@ def loss_of(
     behind: Float[Tensor, "rays 3"],
     vertices: Int[Tensor, "some"],
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the rays' colours, and ``SMOOTHNESS`` times the total variation at some vertices.
+    """Compute the mean squared error of colours, plus ``SMOOTHNESS`` times the total variation at some vertices.
 
     Each photograph has its own exposure, a factor exp(log_gain). Where light passes the whole scene, ``behind`` is
-    seen: drawn at random in every step it teaches the field to be opaque.
+    seen: drawn at random in every step, it teaches the field to be opaque.
     """
     raw = grid.raw(seen.corners, seen.weights)
     weights = render_weights(grid.density(raw[:, 0]), seen.samples)
@@ -132,7 +132,7 @@ def fit(
     generator: torch.Generator,
     start: SceneGrid | None = None,
 ) -> Fitted:
-    """Fit the field of all photographs, from nothing or from a grid of half the budget's resolution."""
+    """Fit the field of all photographs, from scratch or from a grid of half the budget's resolution."""
     photos = int(pixels.photo.max()) + 1
     rate = LEARNING_RATE if start is None else WARM_RATE
     grid = SceneGrid(budget.resolution // 2) if start is None else start
@@ -156,7 +156,9 @@ def fit(
         )
         seen = visible(grid, pixels.rays(index, frame), phase, grid.samples)
         vertices = torch.randint(len(grid.table), (SMOOTHED,), generator=generator)
-        centred = log_gain - log_gain.mean(0)  # a factor of all photographs is the field's own brightness
+        centred = log_gain - log_gain.mean(
+            0
+        )  # a common factor on all photographs is the field's own brightness
         loss = loss_of(grid, seen, pixels.colours[index], centred[pixels.photo[index]], behind, vertices)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

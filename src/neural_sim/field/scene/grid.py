@@ -11,20 +11,20 @@ from neural_sim.field.interpolation import CORNERS, corner_weights, gather_weigh
 from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 
 INITIAL = -5.0
-"""The softplus' argument in a new grid: rays pass it, but for a third or so of their light."""
+"""Argument of softplus in a new grid: rays pass through and lose about a third of their light."""
 GAIN = 2.0
-"""Density learns so much faster than colour."""
+"""Factor by which density learns faster than colour."""
 AT_ONCE = 1 << 17
-"""Vertices that are moved together."""
+"""Number of vertices that are moved together."""
 EMPTY = 1e-3
-"""Largest absorbed fraction of a cell's edge that counts as nothing."""
+"""Largest fraction absorbed over a cell's edge that counts as empty."""
 
 
 class SceneGrid:
     """A trilinear field over ``resolution``^3 cells of [-2, 2]^3.
 
     sigma = softplus(GAIN raw) per cell edge of contracted length; the colour is the sigmoid of three more channels.
-    ``table`` has a row for each vertex, x slowest.
+    ``table`` has a row for each vertex; x varies slowest.
     """
 
     def __init__(self, resolution: int, table: Float[Tensor, "vertices 4"] | None = None) -> None:
@@ -39,18 +39,18 @@ class SceneGrid:
 
     @property
     def samples(self) -> int:
-        """Of a ray: in the unit ball they lie about a cell apart."""
+        """Number of samples on a ray: in the unit ball they are about a cell apart."""
         return round(0.75 * self.resolution)
 
     @property
     def edge(self) -> float:
-        """Of a cell, in contracted length."""
+        """Edge of a cell, in contracted length."""
         return 4.0 / self.resolution
 
     def corners(
         self, contracted: Float[Tensor, "samples 3"]
     ) -> tuple[Int[Tensor, "samples 8"], Float[Tensor, "samples 8"]]:
-        """Rows of the table about points, and their weights."""
+        """Return the table rows around points, and their weights."""
         local = (contracted + 2.0) / self.edge
         base = local.floor().clamp_(0, self.resolution - 1)
         weights = corner_weights(*(local - base).t().contiguous())
@@ -61,24 +61,24 @@ class SceneGrid:
     def raw(
         self, corners: Int[Tensor, "samples 8"], weights: Float[Tensor, "samples 8"]
     ) -> Float[Tensor, "samples 4"]:
-        """Interpolated rows; differentiable in the table."""
+        """Interpolate rows; differentiable in the table."""
         if self.table.requires_grad and torch.is_grad_enabled():
             return interpolate_for_training(self.table, corners, weights)
         return gather_weighted(self.table, corners, weights)
 
     def density(self, raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-        """Of the first channel, per contracted length."""
+        """Return density, per contracted length, from the first channel."""
         return functional.softplus(GAIN * raw) / self.edge
 
     def in_occupied(self, contracted: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie in cells that ``mark`` has left."""
+        """Whether points lie in cells that ``mark`` has kept."""
         return self.occupied[cells_of(contracted, self.resolution)]
 
     def variation(self, vertices: Int[Tensor, "some"]) -> Float[Tensor, ""]:
         """Compute the total variation of the absorbed fraction of a cell's edge.
 
-        It is the mean length of the differences to the next vertex along each axis. Among surfaces that explain the
-        photographs equally well, the smoothest has the least.
+        It is the mean length of the differences to the next vertex along each axis. Of all surfaces that explain the
+        photographs equally well, the smoothest has the lowest.
         """
         side = self.resolution + 1
         last = len(self.table) - 1
@@ -91,7 +91,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def mark(self) -> None:
-        """Find anew which cells may hold anything: some vertex of theirs absorbs more than ``EMPTY``."""
+        """Find again which cells may hold anything: those with a vertex that absorbs more than ``EMPTY``."""
         absorbed = -torch.expm1(-functional.softplus(GAIN * self.table[:, 0]))
         side = self.resolution + 1
         largest = functional.max_pool3d(absorbed.view(1, 1, side, side, side), 2, 1)
@@ -99,7 +99,7 @@ class SceneGrid:
 
     @torch.no_grad()
     def moved(self, old: Frame, new: Frame) -> SceneGrid:
-        """Resample the field from the frame ``old`` onto a grid of as many cells in the frame ``new``."""
+        """Resample the field from the frame ``old`` onto a grid with as many cells in the frame ``new``."""
         side = self.resolution + 1
         axis = torch.linspace(-2.0, 2.0, side)
         vertices = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)

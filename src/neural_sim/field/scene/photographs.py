@@ -1,4 +1,4 @@
-"""Photographs as pixels with rays: reduced, their lenses' distortion undone by the rays."""
+"""Photographs as pixels with rays; they are reduced, and their rays undo the lens distortion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neural_sim.objects.pictures import reduced
 
 @dataclass(frozen=True)
 class PhotoRays:
-    """The rays of a photograph's pixels at reduced size, in the capture's frame; ``seen`` where the lens has one."""
+    """Rays of a reduced photograph's pixels, in the capture's frame; ``seen`` is where the lens has a ray."""
 
     origin: Float[Tensor, "3"]
     directions: Float[Tensor, "h w 3"]
@@ -24,13 +24,13 @@ class PhotoRays:
 
 
 def reduced_size(frame: Frame, longest: int) -> tuple[int, int]:
-    """Width and height of a photograph whose longer side has at most ``longest`` pixels."""
+    """Return width and height of a photograph reduced to at most ``longest`` pixels along its longer side."""
     part = min(1.0, longest / max(frame.lens.width, frame.lens.height))
     return max(1, round(part * frame.lens.width)), max(1, round(part * frame.lens.height))
 
 
 def photo_rays(frame: Frame, longest: int) -> PhotoRays:
-    """Through the centres of the reduced photograph's pixels."""
+    """Return rays through the centres of the reduced photograph's pixels."""
     local, seen = _local_rays(frame.lens, *reduced_size(frame, longest))
     pose = torch.from_numpy(frame.camera_to_world)
     return PhotoRays(pose[:3, 3], local @ pose[:3, :3].t(), seen)
@@ -44,7 +44,7 @@ def _local_rays(lens: Lens, width: int, height: int) -> tuple[Float[Tensor, "h w
 
 
 def scene_pixels(capture: Capture, longest: int) -> ScenePixels:
-    """All pixels of a capture's photographs, reduced."""
+    """Collect all pixels of a capture's photographs, reduced."""
     parts = []
     for number, frame in enumerate(capture.frames):
         rays, colours = photo_rays(frame, longest), reduced(frame, reduced_size(frame, longest))

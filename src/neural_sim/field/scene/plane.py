@@ -1,4 +1,4 @@
-"""The plane that an object stands on, found among points of the scene's surface."""
+"""The plane on which an object stands, found among points of the scene's surface."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from torch import Tensor
 from neural_sim.field.scene.space import Frame
 
 NEARBY = 1.0
-"""Radius of the ball whose points are looked at, in the normalised frame."""
+"""Radius of the ball whose points are used, in the normalised frame."""
 AROUND = 2.0
-"""The same where the object fills the unit ball."""
+"""The same radius if the object fills the unit ball."""
 HYPOTHESES = 1024
 TILT = math.radians(40.0)
 """Largest angle between a plane's normal and up: cameras on one side of an object see it from above."""
 LIKELY = math.radians(15.0)
-"""Standard deviation of that angle: of planes with as many points the more upright one is taken."""
+"""Standard deviation of that angle: of planes with equally many points, the more upright one wins."""
 PART = 0.08
-"""Smallest fraction of the points nearby that lie on a supporting plane."""
+"""Smallest fraction of the nearby points that must lie on a supporting plane."""
 STANDING = 0.02
-"""Smallest fraction of the points nearby that stand on a supporting plane."""
+"""Smallest fraction of the nearby points that must stand on a supporting plane."""
 CAMERAS = 0.9
-"""Smallest fraction of the cameras above a supporting plane."""
+"""Smallest fraction of the cameras that must be above a supporting plane."""
 SHOWING = 0.5
-"""Most points just below a supporting plane, relative to those on it: of an object that it cuts as many are there."""
+"""Most points just below a supporting plane, relative to those on it; a plane that cuts an object has as many."""
 ATTEMPTS = 4
 JUST = 4.0
-"""Points below a plane by 1 to so many tolerances speak against it: nothing shows through what an object stands on."""
+"""End, in tolerances, of the band below a plane (from 1) whose points are evidence against it: support is opaque."""
 BELOW = 4.0
-"""Weight of points below the plane: surfaces without texture bulge towards the cameras, and none away from them."""
+"""Weight of points below the plane: surfaces without texture bulge towards the cameras, never away from them."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Plane:
     offset: float
 
     def from_axis(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Distance from the plane's normal through the origin."""
+        """Return the distances from the line along the plane's normal through the origin."""
         normal = points.new_tensor(self.normal)
         return (points - (points @ normal)[..., None] * normal).norm(dim=-1)
 
@@ -53,7 +53,7 @@ class Plane:
         return Plane(self.normal, float(normal @ new.of(old, self.offset * normal)))
 
     def height(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Above the plane."""
+        """Return the heights of points above the plane."""
         return points @ points.new_tensor(self.normal) - self.offset
 
 
@@ -64,11 +64,12 @@ def supporting_plane(
     tolerance: float,
     generator: torch.Generator,
 ) -> Plane | None:
-    """Find the plane under what stands about the origin, None without one (all in the normalised frame).
+    """Find the plane below the object at the origin; None without one (all in the normalised frame).
 
-    By random samples of three points (RANSAC, Fischler and Bolles 1981): the plane with most points within
-    ``tolerance`` and few just below it, fitted by least squares. It has cameras above it, something standing on it near
-    the origin, and reaches farther than that does; the top of a box or the foot of a lamp does not count.
+    It is found by random samples of three points (RANSAC, Fischler and Bolles 1981), as the plane with most points
+    within ``tolerance`` and few just below it, and then fitted by least squares. It must have cameras above it and
+    something standing on it near the origin, and extend farther than that; the top of a box or the foot of a lamp does
+    not.
     """
     near = points[points.norm(dim=-1) < NEARBY].double()
     left = torch.ones(len(near), dtype=torch.bool)
@@ -153,7 +154,7 @@ def _supports(
 
 
 def _spread(points: Float[Tensor, "n 3"], plane: Plane) -> float:
-    """Root mean square distance along the plane from the points' middle."""
+    """Return the root mean square distance, along the plane, from the points' centre."""
     moved = points - points.mean(0)
     return float(plane.from_axis(moved).square().mean().sqrt())
 

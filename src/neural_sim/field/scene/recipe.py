@@ -26,13 +26,13 @@ from neural_sim.ranges import NonNegativeInt, PositiveInt, validated
 _log = logging.getLogger(__name__)
 
 CAMERAS_AT = 2.0
-"""Median distance of the cameras in the first field's frame: they lie outside of the ball that is not contracted."""
+"""Median camera distance in the first field's frame: cameras lie outside the ball that is not contracted."""
 ROOM = 1.0
-"""Radius of the ball that the second field does not contract, in radii of what the first found."""
+"""Radius of the ball that the second field does not contract, in radii of the object that the first found."""
 COARSE = 0.5
 """Steps, cells a side and pixels a side of the first field, relative to the second's."""
 LEAST_PIXELS = 80
-"""But photographs keep so many pixels along the longer side."""
+"""Smallest number of pixels along the longer side of its photographs."""
 
 
 @validated
@@ -45,10 +45,10 @@ class SceneMasks:
 
     Args:
         image_size: longer side in pixels of the photographs that train the field, and of the masks.
-        resolution: cells of the field along each side of contracted space.
-        steps: optimiser steps, the budget.
-        batch_rays: rays of a step.
-        seed: of the order of rays; not the run's seed, so that runs share masks.
+        resolution: number of the field's cells along each side of contracted space.
+        steps: budget of optimiser steps.
+        batch_rays: rays in a step.
+        seed: seed of the order of rays; separate from the run's seed, so that runs share masks.
     """
 
     image_size: Annotated[int, Ge(16)] = 160
@@ -62,11 +62,12 @@ class SceneMasks:
     ) -> tuple[Float[Tensor, "_ _"], ...]:
         """Compute the object's opacity in [0, 1] in each photograph, ``image_size`` pixels along its longer side.
 
-        ``up`` is in the capture's frame, None: its file's, else the mean of the cameras' up vectors. ``box``: what is
-        in it and above the plane is the object; None: what is connected and nearest to the point that cameras look at.
+        ``up`` is in the capture's frame; None: its file's, or else the mean of the cameras' up vectors. With ``box``,
+        the object is what is in it and above the plane; None: what is connected and nearest to the point at which the
+        cameras look.
 
         Raises:
-            ValueError: cameras that look at no one place, no object found, or nothing in the box.
+            ValueError: the cameras do not look at one place, no object is found, or the box is empty.
         """
         poses = np.stack([frame.camera_to_world for frame in capture.frames])
         upward = torch.tensor(up or capture.up or mean_up(capture), dtype=torch.float64)
@@ -98,14 +99,14 @@ class SceneMasks:
         generator: torch.Generator,
         start: SceneGrid | None = None,
     ) -> tuple[ScenePixels, SceneGrid]:
-        """Fit a field to the photographs, reduced to a part of their pixels a side, with these cells and steps."""
+        """Fit a field with these cells and steps to the photographs, reduced to a fraction of their pixels a side."""
         pixels = scene_pixels(capture, min(self.image_size, max(LEAST_PIXELS, round(part * self.image_size))))
         budget = Budget(max(1, round(part * self.steps)), self.batch_rays, round(part * self.resolution))
         return pixels, fit(pixels, frame, budget, generator, start).grid
 
 
 def _tell(capture: Capture, found: Found, masks: tuple[Tensor, ...]) -> None:
-    """Log what was taken for the object."""
+    """Log what was found as the object."""
     covered = [float((mask > 0.5).float().mean()) for mask in masks]
     low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in found.box)
     plane = found.region.plane

@@ -1,4 +1,4 @@
-"""The part of a scene that is the object: cells of a grid above the supporting plane, connected, near the origin."""
+"""The part of a scene that is the object: connected cells of a grid near the origin, above the supporting plane."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 from neural_sim.field.scene.surface import SeenSurface
 
 SHOWS = 0.4
-"""Smallest contribution of a cell to some pixel with which it counts as solid."""
+"""Smallest contribution of a solid cell to some pixel."""
 HITS = 2
-"""Least rays that end in a cell which counts as solid: cell by cell, a blurred surface contributes less."""
+"""Smallest number of rays that end in a solid cell: each cell of a blurred surface contributes less."""
 REACH = 1.5
 """The object lies inside the ball of this radius in the normalised frame."""
 LARGE = 0.1
-"""Connected parts with less than this fraction of the largest one's cells are errors of the field."""
+"""Connected parts with less than this fraction of the largest part's cells are errors of the field."""
 FARTHEST = 0.9
-"""Largest distance from the origin at which an object is looked for to end."""
+"""Largest distance from the origin at which the end of an object is looked for."""
 LEAST = 8
-"""Solid cells of an object, at least."""
+"""Smallest number of solid cells in an object."""
 EMPTIER = 0.5
-"""Largest density of solid cells about an object, relative to its own."""
+"""Largest density of solid cells around an object, relative to that of the object."""
 SPECK = 64
-"""Cells of a connected part of the scene's surface, at least: a smaller one in the air is an error of the field."""
+"""Smallest number of cells in a connected part of the scene's surface: less is an error of the field, in the air."""
 APART = 1.0
-"""Height in cells above the plane from which on cells connect: below it the plane's own roughness does."""
+"""Height in cells above the plane at which cells start to connect: lower, the plane's roughness would connect them."""
 GROUND = 1.0
-"""Height in cells above the plane from which on samples are the object's."""
+"""Height in cells above the plane at which samples start to be the object's."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """``cells`` of a grid, and of these what is above the plane by ``ground``, in the normalised frame."""
+    """``cells`` of a grid, of which the part more than ``ground`` above the plane counts, in the normalised frame."""
 
     cells: Bool[Tensor, "cells"]
     resolution: int
@@ -57,19 +57,19 @@ class Region:
         return inside
 
     def cells_in(self, own: Frame, frame: Frame, resolution: int) -> Bool[Tensor, "cells"]:
-        """Which cells of another grid and frame lie in this region's, whatever their height."""
+        """Find the cells of another grid and frame that lie in this region's cells, at any height."""
         points = contract(own.of(frame, expand(cell_centres(resolution))))
         return self.cells[cells_of(points, self.resolution)]
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and highest corner of a box about the cells, in the normalised frame."""
+        """Return the lowest and highest corner of a box around the cells, in the normalised frame."""
         centres = expand(cell_centres(self.resolution)[self.cells])
         half = 2.0 / self.resolution
         return (centres.amin(0) - half).double().numpy(), (centres.amax(0) + half).double().numpy()
 
 
 def cell_centres(resolution: int) -> Float[Tensor, "cells 3"]:
-    """Contracted, in the order of ``cells_of``."""
+    """Return the contracted centres of all cells, in the order of ``cells_of``."""
     axis = (torch.arange(resolution) + 0.5) * (4.0 / resolution) - 2.0
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
 
@@ -80,9 +80,9 @@ def connected_region(
     plane: Plane | None,
     within: Bool[Tensor, "cells"] | None = None,
 ) -> Region | None:
-    """Find what is connected and nearest to the origin, None where nothing is.
+    """Find the connected part nearest to the origin; None if there is nothing.
 
-    ``within``, where it is given, holds the object and little else: all that is solid there is taken.
+    ``within``, if given, holds the object and little else: everything solid in it is taken.
     """
     shows, allowed = surface.largest > SHOWS, _allowed(grid, plane, APART)
     if within is not None:
@@ -90,7 +90,7 @@ def connected_region(
         return enclosed(grid, _large_parts(solid, grid.resolution), plane) if bool(solid.any()) else None
     centres = expand(cell_centres(grid.resolution))
     distance = centres.norm(dim=-1) if plane is None else plane.from_axis(centres)
-    # Large cells, and fields of few steps, have ends of rays in the air, too: more rays must then end in what is solid.
+    # Large cells, and fields with few steps, also have ends of rays in the air: a solid cell must then end more rays.
     for least in (HITS, 2 * HITS, 4 * HITS, 8 * HITS, math.inf):
         solid = (shows | (surface.hits >= least)) & allowed
         reach = _apart(distance[solid], 3 if plane is None else 2, grid.edge)
@@ -101,10 +101,10 @@ def connected_region(
 
 
 def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> float | None:
-    """Find the distance from the origin at which the object ends, None where nothing stands apart.
+    """Find the distance from the origin at which the object ends; None if nothing is set apart.
 
-    Rings of two cells' width are compared with what they enclose, in solid cells for each volume: about an object is a
-    ring that is emptier by far, even where an error of the field bridges it.
+    Rings two cells wide are compared with what they enclose, in solid cells per volume: around an object there is a
+    ring that is much emptier, even if an error of the field bridges it.
     """
     inner = torch.arange(3, int(FARTHEST / edge)) * edge
     within = (distance[None] < inner[:, None]).sum(1)
@@ -121,7 +121,7 @@ def _apart(distance: Float[Tensor, "solid"], dimensions: int, edge: float) -> fl
 def _nearest_part(
     solid: Bool[Tensor, "cells"], centres: Float[Tensor, "cells 3"], side: int
 ) -> Bool[Tensor, "cells"]:
-    """Of the connected parts that are not small beside the largest the one nearest to the origin."""
+    """Return the large connected part nearest to the origin."""
     large = _large_parts(solid, side)
     label, count = _labelled(large, side)
     distance = centres.norm(dim=-1)
@@ -130,14 +130,14 @@ def _nearest_part(
 
 
 def _labelled(solid: Bool[Tensor, "cells"], side: int) -> tuple[Int[Tensor, "cells"], int]:
-    """Label each cell with the number of its connected part, 0 where it is not solid, and count the parts."""
+    """Label each cell with the number of its connected part, 0 if it is not solid, and count the parts."""
     parts = np.zeros((side, side, side), dtype=np.int64)
     scipy.ndimage.label(solid.view(side, side, side).numpy(), np.ones((3, 3, 3)), output=parts)
     return torch.from_numpy(parts).view(-1), int(parts.max())
 
 
 def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells"]:
-    """Of solid cells those in connected parts that are not small beside the largest."""
+    """Find the solid cells in connected parts that are large compared with the largest."""
     label, count = _labelled(solid, side)
     sizes = torch.bincount(label, minlength=count + 1)
     sizes[0] = 0
@@ -147,8 +147,8 @@ def _large_parts(solid: Bool[Tensor, "cells"], side: int) -> Bool[Tensor, "cells
 def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[Tensor, "cells"]:
     """Select the cells in which light ends, with their neighbours and the region's own; all others hold fog.
 
-    Before few cameras, and where they see little, a field explains their photographs by something thin in the air. No
-    ray ends in it, or few do in a place of its own; in a mask it would hide the object.
+    In front of few cameras, and where they see little, a field explains their photographs by something thin in the air.
+    No ray ends in it, or only few in one place; in a mask it would hide the object.
     """
     side = grid.resolution
     label, count = _labelled(surface.hits >= HITS, side)
@@ -161,8 +161,8 @@ def without_fog(grid: SceneGrid, surface: SeenSurface, region: Region) -> Bool[T
 def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None) -> Region:
     """Return the region of all cells inside the convex hull of these and their neighbours.
 
-    A hollow, such as a mug's, shows surfaces that few photographs see and that stay faint; in the hull they are the
-    object's. What is empty in the hull absorbs nothing and stays out of the masks.
+    A hollow, such as a mug's, shows surfaces that few photographs see and that stay faint; within the hull they belong
+    to the object. Empty parts of the hull absorb nothing and stay out of the masks.
     """
     side = grid.resolution
     fringe: np.ndarray = np.asarray(
@@ -179,7 +179,7 @@ def enclosed(grid: SceneGrid, cells: Bool[Tensor, "cells"], plane: Plane | None)
 
 
 def _allowed(grid: SceneGrid, plane: Plane | None, cells: float) -> Bool[Tensor, "cells"]:
-    """Cells within reach, so many cells above the plane."""
+    """Find the cells within reach that are at least ``cells`` cells above the plane."""
     centres = expand(cell_centres(grid.resolution))
     inside = centres.norm(dim=-1) < REACH
     if plane is not None:

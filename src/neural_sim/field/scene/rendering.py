@@ -1,4 +1,4 @@
-"""A mask of the object in a photograph: the opacity of its region, behind whatever stands before it."""
+"""A mask of the object in a photograph: the opacity of its region, as far as nothing in front hides it."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from neural_sim.field.scene.surface import AT_ONCE
 from neural_sim.types import Rays
 
 PHASES = (0.25, 0.75)
-"""Shifts of the samples' lattice that a pixel averages: with one alone a surface shows the lattice's steps."""
+"""Number of shifts of the sample lattice that a pixel averages: with only one, a surface shows the lattice's steps."""
 
 PINHOLE = 0.01
 """Area of a hole, relative to that of the mask, below which it is filled."""
 FOG = 4.0
-"""What lets one part in so many of the light pass hides nothing; what is solid lets less pass than a hundredth."""
+"""Transmittance, as one over this number, above which nothing is hidden; solid things let less than 1 % pass."""
 
 
 @torch.no_grad()
 def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) -> Float[Tensor, "h w"]:
-    """Opacity in [0, 1] of the object at each pixel, behind what is solid before it.
+    """Compute the object's opacity in [0, 1] at each pixel, as far as no solid thing in front hides it.
 
-    Fog is not: a field of few photographs from some side explains what it cannot by something thin in the air, and
-    would hide the object behind it.
+    Fog does not hide it: with few photographs from a side, a field explains the rest by something thin in the air,
+    which would hide the object behind it.
     """
     height, width = rays.seen.shape
     directions = rays.directions.reshape(-1, 3).float()
@@ -53,7 +53,7 @@ def object_mask(grid: SceneGrid, region: Region, rays: PhotoRays, frame: Frame) 
 
 
 def without_pinholes(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Fill holes that are small for the object: walls that few photographs show have some; a handle's is larger."""
+    """Fill holes that are small for the object, as in walls that few photographs show; a handle's hole is larger."""
     solid = (mask > 0.5).numpy()
     holes, count = scipy.ndimage.label(~solid)  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(holes.ravel(), minlength=count + 1)
@@ -69,7 +69,7 @@ def _meets(
     low: Float[Tensor, "3"],
     high: Float[Tensor, "3"],
 ) -> Bool[Tensor, "n"]:
-    """Whether rays pass through a box, by its slabs."""
+    """Whether rays pass through a box (slab test)."""
     slope = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     one, other = (low - origin) / slope, (high - origin) / slope
     return torch.minimum(one, other).amax(1).clamp_min(0.0) <= torch.maximum(one, other).amin(1)

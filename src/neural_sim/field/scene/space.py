@@ -1,4 +1,4 @@
-"""The space of a captured scene: normalised about its object, contracted so that it ends, and rays sampled in it."""
+"""The space of a captured scene: centred on its object, contracted to a finite ball, and sampled along rays."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from torch import Tensor
 from neural_sim.objects.placing import nearest_to_axes
 
 NEAR = 0.4
-"""Where rays begin, in distances of their camera from the origin: nearer, a field has room for a picture of its own
-before each camera, and photographs of an object show nothing."""
+"""Start of rays, as a fraction of their camera's distance from the origin: nearer, a field has room for a picture of
+its own in front of each camera, and photographs of an object show nothing there."""
 FAR = 100.0
-"""Where rays end: the contraction moves what is farther away by less than 1 / FAR."""
+"""End of rays: the contraction moves anything farther by less than 1 / FAR."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The normalised frame: the capture's, moved by -``centre`` and divided by ``unit``, both in the capture's."""
+    """The normalised frame: the capture's moved by -``centre`` and divided by ``unit``, both in the capture's frame."""
 
     centre: tuple[float, float, float]
     unit: float
 
     def into(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points of the capture's frame in the normalised one."""
+        """Transform points of the capture's frame into the normalised frame."""
         return (points - points.new_tensor(self.centre)) / self.unit
 
     def of(self, other: Frame, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points of another normalised frame in this one."""
+        """Transform points of another normalised frame into this one."""
         moved = (points.new_tensor(other.centre) - points.new_tensor(self.centre)) / self.unit
         return points * (other.unit / self.unit) + moved
 
     def out(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Inverse of ``into``."""
+        """Invert ``into``."""
         return points * self.unit + np.array(self.centre)
 
 
 def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """All of space into the ball of radius 2; the unit ball stays (mip-NeRF 360, Barron et al. 2022, Eq. 10)."""
+    """Contract space to the ball of radius 2, the unit ball unchanged (mip-NeRF 360, Barron et al. 2022, Eq. 10)."""
     length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
     return points * ((2.0 - 1.0 / length) / length)
 
 
 def expand(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Inverse of ``contract``; what is outside of the ball of radius 2 goes far away."""
+    """Invert ``contract``; points outside the ball of radius 2 go far away."""
     length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
     return points / (length * (2.0 - length).clamp_min(1e-6))
 
@@ -57,11 +57,12 @@ def along_rays(
     phase: Float[Tensor, "rays"],
     count: int,
 ) -> tuple[Float[Tensor, "rays count 3"], Float[Tensor, "rays count"]]:
-    """Contracted positions of ``count`` samples of each ray, and the contracted length that each stands for.
+    """Return contracted positions of ``count`` samples of each ray, and the contracted length that each represents.
 
     Distances are equiangular about the origin (Kulla and Fajardo 2012): t = m + h tan(theta) with equal steps of theta,
-    where m is the distance to the point nearest to the origin and h^2 is 1 plus its square there, so that the unit ball
-    has most of the samples and steps grow as the contraction shrinks them. ``phase`` in [0, 1) shifts each ray's.
+    where m is the distance to the ray's point nearest to the origin and h^2 is 1 plus the square of that point's
+    distance from the origin. The unit ball therefore has most samples, and steps grow as the contraction shrinks them.
+    ``phase``, in [0, 1), shifts each ray's samples.
     """
     middle = -(origins * directions).sum(-1)
     square = origins.square().sum(-1)
@@ -76,7 +77,7 @@ def along_rays(
 
 
 def cells_of(contracted: Float[Tensor, "*n 3"], resolution: int) -> Int[Tensor, "*n"]:
-    """Flat indices of the cells that points lie in; ``resolution`` cells along each side of [-2, 2]^3."""
+    """Return flat indices of the cells that contain points; ``resolution`` cells along each side of [-2, 2]^3."""
     place = ((contracted + 2.0) * (resolution / 4.0)).long().clamp_(0, resolution - 1)
     return (place[..., 0] * resolution + place[..., 1]) * resolution + place[..., 2]
 
@@ -85,7 +86,7 @@ def looked_at(camera_to_world: Float[np.ndarray, "n 4 4"], name: str) -> tuple[n
     """Find the point nearest to the cameras' optical axes (least squares), and the cameras' median distance from it.
 
     Raises:
-        ValueError: axes that are all parallel, or a point behind most cameras.
+        ValueError: all axes are parallel, or the point is behind most cameras.
     """
     axes, centres = -camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

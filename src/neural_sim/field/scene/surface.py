@@ -1,4 +1,4 @@
-"""What of a scene photographs see: points of its surface, and the cells that show."""
+"""What photographs see of a scene: points of its surface, and the cells that are visible."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from neural_sim.field.scene.grid import SceneGrid
 from neural_sim.field.scene.space import Frame, cells_of, contract, expand
 
 AT_ONCE = 4096
-"""Rays whose samples are in memory together."""
+"""Number of rays whose samples are in memory together."""
 
 
 @dataclass(frozen=True)
 class SeenSurface:
     """The surfaces that rays meet.
 
-    ``points`` are where half of a ray's light has ended, in the normalised frame, with their number in each of the
+    ``points`` are where a ray has lost half of its light, in the normalised frame, with their number in each of the
     grid's cells; ``largest`` is the largest contribution of each cell to any pixel.
 
-    A field of few steps spreads a surface over several cells, none of which contributes much; where half of the light
-    has ended it has a place all the same.
+    A field with few steps spreads a surface over several cells, each of which contributes little; the point where half
+    of the light is lost is well defined all the same.
     """
 
     points: Float[Tensor, "hits 3"]
@@ -37,7 +37,7 @@ class SeenSurface:
 def seen_surface(
     grid: SceneGrid, pixels: ScenePixels, index: Int[Tensor, "some"], frame: Frame
 ) -> SeenSurface:
-    """Collect the surfaces that the rays of these pixels meet."""
+    """Find the surfaces that the rays of these pixels meet."""
     points, largest = [], torch.zeros(grid.resolution**3)
     for part in index.split(AT_ONCE):
         seen = visible(grid, pixels.rays(part, frame), torch.full((len(part),), 0.5), grid.samples)
@@ -45,7 +45,7 @@ def seen_surface(
         reached = transmittance(sigma, seen.samples)
         weights = reached * alpha_from_sigma(sigma, seen.samples.width)
         largest.scatter_reduce_(0, cells_of(seen.positions, grid.resolution), weights, "amax")
-        # Light falls along a ray: the last sample that half of it reaches is where the other half ends.
+        # Light falls along a ray: half of it is lost in the last sample that half of it reaches.
         lit = torch.nn.functional.pad((reached >= 0.5).long().cumsum(0), (1, 0))
         starts = seen.samples.starts
         last = starts[:-1] + lit[starts[1:]] - lit[starts[:-1]] - 1
