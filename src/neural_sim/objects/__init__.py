@@ -1,1 +1,1 @@
-"""Objects: procedural meshes, YCB layout, BOP models, any folder of meshes, photographs with cameras."""
+"""Objects: procedural meshes, YCB layout, BOP models, any folder of meshes, photographs with or without cameras."""

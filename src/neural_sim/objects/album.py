@@ -1,4 +1,4 @@
-"""Photographs whose cameras are not known yet: which files they are, and what their EXIF says of the camera."""
+"""Photographs with unknown cameras: which files they are, and what their EXIF says about the camera."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from neural_sim.pictures import (
 
 FOLDER = "images"
 FILM_DIAGONAL = 43.27
-"""Millimetres of the 36 x 24 mm film that EXIF's equivalent focal length is of."""
+"""Width in millimetres of the 36 x 24 mm film to which EXIF's equivalent focal length refers."""
 UP = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-"""Where the upright picture's up lies in the stored one (x to the right, y up), by EXIF orientation."""
+"""The upright picture's up direction in the stored picture (x to the right, y up), by EXIF orientation."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph: its header, and what took it.
+    """A photograph: its header, and the camera that took it.
 
-    ``focal`` is the focal length in pixels that EXIF says, None if it does not. Photographs of one ``camera`` share
+    ``focal`` is the focal length in pixels according to EXIF, None if it has none. Photographs of one ``camera`` share
     their intrinsics.
     """
 
@@ -49,25 +49,25 @@ class Shot:
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
-        """The direction that EXIF says is up, in the camera's OpenGL frame."""
+        """The up direction according to EXIF, in the camera's OpenGL frame."""
         return np.array([*UP[self.header.orientation], 0.0])
 
 
 @dataclass(frozen=True)
 class Album:
-    """The photographs of an object, by name. ``folder`` is what their names are relative to."""
+    """The photographs of an object, by name. Names are relative to ``folder``."""
 
     name: str
     folder: Path
     shots: tuple[Shot, ...]
 
     def called(self, shot: Shot) -> str:
-        """Return a photograph's name in messages and results."""
+        """Return a photograph's name as used in messages and results."""
         return shot.image.relative_to(self.folder).as_posix()
 
 
 def pictures_of(folder: Path) -> list[Path]:
-    """Return the photographs of a capture's folder: all in ``images``, else those in the folder itself."""
+    """Return the photographs in a capture's folder: all in ``images``, else those in the folder itself."""
     if (folder / FOLDER).is_dir():
         return picture_files(folder / FOLDER)
     own = sorted(
@@ -77,10 +77,10 @@ def pictures_of(folder: Path) -> list[Path]:
 
 
 def read_album(folder: Path, name: str) -> Album:
-    """Return the photographs of a capture's folder by their headers.
+    """Read the headers of the photographs in a capture's folder.
 
     Raises:
-        ValueError: a photograph that cannot be read, or a folder without any.
+        ValueError: a photograph cannot be read, or the folder has none.
     """
     strange = say_strange(folder, _files(folder), OTHER_FORMATS)
     pictures = pictures_of(folder)

@@ -30,7 +30,7 @@ class BOP(MeshFiles):
         names: objects as 'obj_000001', '000001', '1' or 1; None: all.
 
     Raises:
-        ValueError: no ``obj_*.ply`` in the folder, or an unknown name.
+        ValueError: the folder has no ``obj_*.ply``, or a name is unknown.
     """
 
     def __init__(self, root: str | Path, names: Annotated[list[str | int], MinLen(1)] | None = None) -> None:
@@ -46,10 +46,10 @@ class BOP(MeshFiles):
         self._info = folder / "models_info.json"
 
     def load(self) -> list[ObjectMesh]:
-        """Load the objects, normalised, in the order of ``names``; transforms lead to metres.
+        """Load the objects, normalised, in the order of ``names``; their transforms give metres.
 
         Raises:
-            ValueError: a mesh whose extent agrees with its diameter in models_info.json in no unit.
+            ValueError: a mesh's extent does not agree with its diameter in models_info.json in any unit.
         """
         diameters, digests = self._diameters(), self.digests()
         items = []
@@ -60,7 +60,7 @@ class BOP(MeshFiles):
         return items
 
     def _diameters(self) -> dict[str, float]:
-        """Diameters in millimetres by object number, from models_info.json; empty, with a warning, without the file."""
+        """Read diameters in millimetres by object number from models_info.json; empty, with a warning, without it."""
         if not self._info.is_file():
             log.warning("%s is missing: the models are taken to be in millimetres, unchecked", self._info)
             return {}
@@ -89,7 +89,7 @@ class BOP(MeshFiles):
 
 
 def _diameter(item: ObjectMesh) -> float:
-    """Largest distance between two vertices, in metres; the convex hull's vertices attain it."""
+    """Return the largest distance between two vertices, in metres; vertices of the convex hull attain it."""
     try:
         points = np.asarray(item.mesh.convex_hull.vertices)
     except (ValueError, RuntimeError):  # flat meshes have no hull; scipy's QhullError is a RuntimeError

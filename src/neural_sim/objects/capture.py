@@ -1,4 +1,4 @@
-"""Data of a capture: photographs of one object with their cameras."""
+"""The data of a capture: photographs of one object with their cameras."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _log = logging.getLogger(__name__)
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity: files round to six digits, and pose optimisers drift."""
 WIDEST = 3.0
-"""Tangent of the largest angle off the axis at which a perspective lens's distortion is examined."""
+"""Tangent of the largest angle off the axis at which a perspective lens's distortion is checked."""
 FARTHEST = 1e3
-"""Tangent of the largest angle off the axis that a pixel of a perspective lens is taken to have."""
+"""Tangent of the largest angle off the axis that a pixel of a perspective lens may have."""
 FOCAL_LENGTHS = (0.05, 1000.0)
-"""Least and largest focal length in the longer side of the image: 170 degrees, and a telescope."""
+"""Smallest and largest focal length, in units of the image's longer side: 170 degrees, and a telescope."""
 BISECTIONS = 64
 REPETITIONS = 12
 
@@ -31,14 +31,13 @@ REPETITIONS = 12
 class Lens:
     """A camera with OpenCV's distortion.
 
-    Lengths are in pixels, the principal point from the image's upper left corner (the first pixel's centre is
-    (0.5, 0.5), as in COLMAP and nerfstudio). A point (x, y) of the plane at distance 1, of radius r, is scaled by
+    Lengths are in pixels; the principal point is measured from the image's upper left corner (the first pixel's centre
+    is (0.5, 0.5), as in COLMAP and nerfstudio). A point (x, y) of the plane at distance 1, with radius r, is scaled by
     (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + divisor[0] r^2 + ...), then shifted by the ``tangential`` p1 and
-    p2. ``fisheye``: r is the angle off the axis, and there is no tangential term.
+    p2. With ``fisheye``, r is the angle off the axis, and there is no tangential term.
 
     Raises:
-        ValueError: a size or a focal length that is not positive, a number that is not finite, or one that is in
-            another unit than pixels.
+        ValueError: a size or focal length is not positive, a number is not finite, or a length is not in pixels.
     """
 
     width: int
@@ -76,10 +75,10 @@ class Lens:
         )  # fmt: skip
 
     def project(self, local: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Pixels (x, y) of points in the camera's OpenGL frame, and which of them are visible.
+        """Return the pixels (x, y) of points in the camera's OpenGL frame, and which of them are visible.
 
-        Points behind the camera are not visible, nor points so far off the axis that the distortion's polynomial no
-        longer increases there.
+        Points behind the camera are not visible, nor are points so far off the axis that the distortion's polynomial
+        stops increasing.
         """
         depth = -local[..., 2]
         ahead = depth > 1e-9
@@ -96,9 +95,10 @@ class Lens:
         return plane * focal + plane.new_tensor([self.cx, self.cy]), seen
 
     def directions(self, pixel: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-        """Inverse of ``project``: unit directions in the camera's OpenGL frame, and which pixels have one.
+        """Invert ``project``: return unit directions in the camera's OpenGL frame, and which pixels have one.
 
-        The radius is found by bisection, which no distortion leads astray; the small tangential term by repetition.
+        The radius is found by bisection, which no distortion can mislead; the small tangential term by fixed-point
+        iteration.
         """
         target = (pixel - pixel.new_tensor([self.cx, self.cy])) / pixel.new_tensor([self.fx, self.fy])
         reach = min(self._reach(), 0.5 * np.pi if self.fisheye else FARTHEST)
@@ -151,8 +151,8 @@ def _polynomial(coefficients: tuple[float, ...], square: Tensor) -> Tensor:
 class Frame:
     """One photograph.
 
-    ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z) in the capture's frame and unit. ``mask`` is a
-    separate image file; ``test`` frames are the capture's own test set.
+    ``camera_to_world`` has OpenGL axes (x right, y up, looking along -z), in the capture's frame and unit. ``mask`` is
+    a separate image file; ``test`` marks frames of the capture's own test set.
     """
 
     image: Path
@@ -166,11 +166,11 @@ class Frame:
 class Capture:
     """The photographs of an object.
 
-    ``source`` is the file or folder with their cameras, ``files`` are all files that were read, ``up`` is the world's
+    ``source`` is the file or folder with their cameras; ``files`` are all files that were read; ``up`` is the world's
     up direction in the capture's frame, None if the source does not give it.
 
     Raises:
-        ValueError: a photograph that comes twice, or cameras that all stand at one place.
+        ValueError: a photograph is listed twice, or all cameras are at one place.
     """
 
     name: str
@@ -195,10 +195,10 @@ class Capture:
 
 
 def say_missing(source: Path, missing: Sequence[str], listed: int) -> None:
-    """Warn of listed photographs without a file, which are left out.
+    """Warn about listed photographs without a file, which are left out.
 
     Raises:
-        ValueError: none of the ``listed`` has one.
+        ValueError: none of the ``listed`` photographs has a file.
     """
     if missing and len(missing) == listed:
         raise ValueError(
@@ -215,7 +215,7 @@ def checked_pose(matrix: object, where: str) -> Float[np.ndarray, "4 4"]:
     """Check a camera-to-world matrix of 3 or 4 rows, and return it with 4.
 
     Raises:
-        ValueError: another shape, entries that are no finite numbers, or a matrix that is no rotation.
+        ValueError: the matrix has another shape, entries that are not finite numbers, or is not a rotation.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)

@@ -1,7 +1,8 @@
 """Captures of CO3D (Reizenstein et al. 2021), version 2: photographs with cameras and masks, by category.
 
-``<root>/<category>/frame_annotations.jgz`` and ``sequence_annotations.jgz`` are gzipped JSON lists; paths in them start
-at ``<root>``. Cameras are PyTorch3D's: rows of points, x_camera = x_world R + T, with x to the left, y up and z ahead.
+``<root>/<category>/frame_annotations.jgz`` and ``sequence_annotations.jgz`` are gzipped JSON lists; paths in them are
+relative to ``<root>``. Cameras are PyTorch3D's: row vectors, x_camera = x_world R + T, with x to the left, y up and z
+ahead.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from neural_sim.ranges import NonNegativeInt, Positive, validated
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 FORMATS = ("ndc_norm_image_bounds", "ndc_isotropic")
 OPENGL = np.diag([-1.0, 1.0, -1.0])
-"""PyTorch3D's camera axes to OpenGL's, and back."""
+"""Converts PyTorch3D's camera axes to OpenGL's, and back."""
 
 
 @validated
@@ -34,15 +35,15 @@ class Co3d(Photos):
     """One sequence of each category, as an object with the category's name.
 
     Args:
-        root: the folder of the categories' folders.
+        root: the folder that holds the categories' folders.
         names: categories; null: all.
-        sequences: category -> name of its sequence; null, or for a category that it does not list: the sequence with
-            the highest ``viewpoint_quality_score``, of those without one the longest.
+        sequences: category -> name of its sequence. null, or a category that it does not list: the sequence with the
+            highest ``viewpoint_quality_score``, or the longest if none has a score.
         masks, up, size, box, scene, refinement, poor, mask_command, mask_value: see ``Photos``.
 
     Raises:
-        ValueError: a missing folder, one without categories, an unknown name or sequence, annotations that cannot be
-            read or lack a key, with the file and the key; and what ``Photos`` refuses.
+        ValueError: a folder is missing or has no categories, a name or sequence is unknown, or annotations cannot be
+            read or lack a key (the message has the file and the key); and whatever ``Photos`` refuses.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Co3d(Photos):
         )
         strange = sorted(set(self.sequences) - set(self.names()))
         if strange:
-            raise ValueError(f"objects.sequences: {strange} are no objects, these are {self.names()}")
+            raise ValueError(f"objects.sequences: {strange} are not objects, these are {self.names()}")
 
     def _found(self) -> dict[str, Path]:
         found = {p.name: p for p in sorted(self.root.iterdir()) if (p / FRAMES).is_file()}
@@ -85,7 +86,7 @@ class Co3d(Photos):
         return Capture(name, frames, source, (source, *listed))
 
     def _sequence(self, name: str, counts: Counter[str]) -> str:
-        """Choose the sequence of a category; ``counts`` are the frames of each of its sequences."""
+        """Choose the sequence of a category; ``counts`` has the number of frames of each of its sequences."""
         wanted = self.sequences.get(name)
         if wanted is not None:
             if wanted not in counts:
@@ -98,7 +99,7 @@ class Co3d(Photos):
 
     @cached_property
     def _scores(self) -> dict[str, dict[str, float]]:
-        """Each category's sequences with a quality score."""
+        """Read the quality scores of each category's sequences that have one."""
         found: dict[str, dict[str, float]] = {}
         for name, folder in self._folders.items():
             path = folder / SEQUENCES
@@ -109,7 +110,7 @@ class Co3d(Photos):
 
 
 def _entries(path: Path, key: str) -> list[dict[str, Any]]:
-    """Read the file's entries, each of which has the key."""
+    """Read a file's entries, all of which must have the key."""
     try:
         entries = parsed_json(gzip.decompress(path.read_bytes()))
     except (OSError, EOFError, ValueError) as error:
@@ -147,7 +148,7 @@ def _frame(root: Path, entry: Mapping[str, Any], where: str) -> Frame:
 
 def _pose(view: Mapping[str, Any], where: str) -> np.ndarray:
     rotation, shift = _numbers(view, "R", (3, 3), where), _numbers(view, "T", (3,), where)
-    # x_camera = R^T x + T of columns: the axes are the columns of R, the centre is where x_camera vanishes.
+    # x_camera = R^T x + T for columns: the axes are the columns of R, the centre is where x_camera vanishes.
     pose = np.column_stack([rotation @ OPENGL, -rotation @ shift])
     return checked_pose(pose.tolist(), f"{where}.R and T")
 

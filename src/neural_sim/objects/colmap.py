@@ -26,10 +26,10 @@ from neural_sim.pictures import by, read_header
 _log = logging.getLogger(__name__)
 
 MODELS = ("sparse/*", "sparse", "colmap/sparse/*", "colmap/sparse", ".")
-"""Where models lie, the likelier first. COLMAP numbers several (``sparse/0``, ``sparse/1``), of which the one with the
-most photographs is taken."""
+"""Places of models, the likeliest first. COLMAP numbers several models (``sparse/0``, ``sparse/1``); the one with the
+most photographs is used."""
 PLACES = ("images", "input")
-"""Folders of photographs; tools of 3D Gaussian splatting call it ``input``. Without one, the capture's own folder."""
+"""Folders of photographs; 3D Gaussian splatting tools use ``input``. Without either, the capture's own folder."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Names of each camera model's parameters, in COLMAP's order.
 PARAMETERS: dict[str, str] = {
@@ -46,7 +46,7 @@ PARAMETERS: dict[str, str] = {
 
 
 def model_folders(folder: Path) -> list[Path]:
-    """Folders of a capture's sparse models: those of the first place that has any."""
+    """Return the folders of a capture's sparse models, from the first place that has any."""
     for place in MODELS:
         found = [folder] if place == "." else sorted(folder.glob(place))
         models = [one for one in found if any((one / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))]
@@ -59,8 +59,8 @@ def read_colmap(folder: Path, name: str) -> Capture:
     """Read a capture from a folder with ``sparse/0`` (or ``sparse``, or the model itself) and ``images`` or ``input``.
 
     Raises:
-        ValueError: a model that pycolmap cannot read (such as one of another version) or without posed images, an
-            unknown camera model, images that are all missing, one whose size is not its camera's.
+        ValueError: pycolmap cannot read the model (such as one of another version), it has no posed images, its camera
+            model is unknown, its images are all missing, or an image's size is not that of its camera.
     """
     models = model_folders(folder)
     if not models:
@@ -110,7 +110,7 @@ def _model(folder: Path) -> tuple[Any, dict[int, Any]]:
 
 
 def _reconstruction(folder: Path) -> Any:
-    """Read a model; a file of points, which nothing here needs, may be missing."""
+    """Read a model; its file of points may be missing, because nothing here needs it."""
     import pycolmap
 
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
@@ -133,15 +133,15 @@ def _reconstruction(folder: Path) -> Any:
 
 
 def _check_counts(path: Path, kind: str) -> None:
-    """Refuse a binary file whose counts lead beyond its end: pycolmap would go on reading for hours.
+    """Refuse a binary file whose counts point beyond its end, where pycolmap would read on for hours.
 
     Raises:
-        ValueError: such a file.
+        ValueError: the file is such a file.
     """
     data, at = path.read_bytes(), 0
 
     def take(size: int) -> int:
-        """Pass over some bytes, and return the number that they are."""
+        """Skip some bytes, and return the number that they encode."""
         nonlocal at
         at += size
         if at > len(data):
@@ -170,10 +170,10 @@ def _check_counts(path: Path, kind: str) -> None:
 
 
 def _names(path: Path) -> dict[int, str]:
-    """Return the names of a text model's images, whole: pycolmap ends them at their first space.
+    """Return the full names of a text model's images, which pycolmap would cut at their first space.
 
     Raises:
-        ValueError: images without a line of points after their own, of which pycolmap would read every second one.
+        ValueError: images have no line of points after their own, so that pycolmap would read only every second one.
     """
     names, lines = {}, iter(path.read_text(encoding="utf-8-sig").split("\n"))
     for line in lines:
@@ -202,10 +202,10 @@ def _frame(image: Any, read: Any, folder: Path, model: Path) -> Frame:
 
 
 def posed(image: Any, read: Any, where: str) -> tuple[Float[np.ndarray, "4 4"], Lens]:
-    """Camera-to-world matrix (OpenGL axes) and lens of an image of a model.
+    """Return the camera-to-world matrix (OpenGL axes) and the lens of a model's image.
 
     Raises:
-        ValueError: a pose that is no rotation, or an unknown camera model.
+        ValueError: the pose is not a rotation, or the camera model is unknown.
     """
     moved = image.cam_from_world()
     length = float(np.linalg.norm(moved.rotation.quat))

@@ -21,14 +21,14 @@ from neural_sim.objects.repair import repair
 from neural_sim.objects.wavefront import obj_references, read_obj
 
 Names = Annotated[list[str | int | float | bool | None], MinLen(1)] | None
-"""Which objects of a folder, None: all. Numbers are names that the command line took for some."""
+"""Which objects of a folder to load; None: all. Numbers are names that the command line parsed as numbers."""
 Y_UP_TO_Z_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 
 
 def file_digest(*paths: Path) -> str:
-    """SHA-256 of the files' bytes, in the order given; missing files are skipped."""
+    """Return the SHA-256 of the files' bytes, in the order given; missing files are skipped."""
     state = hashlib.sha256()
     for path in paths:
         if path.is_file():
@@ -37,19 +37,19 @@ def file_digest(*paths: Path) -> str:
 
 
 def content_digest(files: Mapping[str, Path]) -> str:
-    """SHA-256 of names and contents, whatever the files' folders; a missing file counts as an empty one."""
+    """Return the SHA-256 of names and contents, whatever the files' folders; a missing file counts as empty."""
     lines = (f"{name} {file_digest(path)}\n" for name, path in files.items())
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) -> ObjectMesh:
-    """Read, repair and normalise a mesh file; several parts in it are joined, each with its own material.
+    """Read, repair and normalise a mesh file; several parts are joined, each with its own material.
 
     glTF files have +y up by their standard and are turned to +z up; others are not turned. The object's ``transform``
-    leads back to the file's frame in metres.
+    gives the file's frame in metres.
 
     Raises:
-        ValueError: a file that cannot be read or has no triangles, with the reason.
+        ValueError: the file cannot be read or has no triangles; the message has the reason.
     """
     with _named(path, f"object {name!r} cannot be read as a mesh"):
         mesh = _READERS[path.suffix.lower()](path)
@@ -64,10 +64,10 @@ def load_file(path: Path, name: str, digest: str, metres_per_unit: float = 1.0) 
 
 
 def references(path: Path) -> list[Path]:
-    """Return the files that a mesh file names and that its reader reads: materials, textures, buffers.
+    """Return the files that a mesh file refers to and that its reader reads: materials, textures, buffers.
 
     Raises:
-        ValueError: a file that is not there, with the names of both.
+        ValueError: a file is missing; the message names both files.
     """
     with _named(path, "cannot be read as a mesh"):
         return _REFERENCES.get(path.suffix.lower(), lambda _: [])(path)
@@ -75,10 +75,10 @@ def references(path: Path) -> list[Path]:
 
 @contextmanager
 def _named(path: Path, what: str) -> Iterator[None]:
-    """Turn all that a reader raises on a damaged or unknown file into one line with its name."""
+    """Turn anything that a reader raises on a damaged or unknown file into one line with the file's name."""
     try:
         yield
-    except Exception as error:  # of damaged files, whose numbers and names lead anywhere
+    except Exception as error:  # damaged files may raise anything
         reason = " ".join(str(error).split()) or "its content is damaged"
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise ValueError(f"{path}: {what}: {kind}{reason}") from error
@@ -108,13 +108,13 @@ _REFERENCES: dict[str, Callable[[Path], list[Path]]] = {
 def choose(
     available: dict[str, Path], names: Sequence[Any] | None, aliases: dict[str, str], where: str
 ) -> list[str]:
-    """Choose the available names among ``names``, which may be aliases, in their order; for None all of them, sorted.
+    """Choose ``names``, which may be aliases, among the available ones, in their order; for None all of them, sorted.
 
-    What the command line took for a number or a word of YAML (1, 1e3, 2024_05_01, true, null) is the one name that is
-    written so.
+    A value that the command line parsed as a number or a word of YAML (1, 1e3, 2024_05_01, true, null) stands for the
+    single name that is written so.
 
     Raises:
-        ValueError: an unknown name, or one object twice.
+        ValueError: a name is unknown, or an object is named twice.
     """
     if names is None:
         return sorted(available)
@@ -134,7 +134,7 @@ def choose(
 
 
 def _written(value: Any, names: Sequence[str]) -> str:
-    """Return the only one of ``names`` that the command line takes for a value, else the value as text."""
+    """Return the only one of ``names`` that the command line would parse as this value, else the value as text."""
     words = {None: ("null",), True: ("true",), False: ("false",)}
     if value is None or isinstance(value, bool):
         alike = [name for name in names if name.lower() in words[value]]
@@ -151,7 +151,7 @@ def _is_number(name: str, value: float) -> bool:
 
 
 class MeshFiles:
-    """Objects of a folder, one mesh file each.
+    """The objects in a folder, each in one mesh file.
 
     Args:
         root: the folder.
@@ -161,7 +161,7 @@ class MeshFiles:
         wanted: what the folder should hold, for messages.
 
     Raises:
-        ValueError: no files, or what ``choose`` raises.
+        ValueError: there are no files, or whatever ``choose`` raises.
     """
 
     metric: ClassVar[bool] = True
@@ -184,15 +184,15 @@ class MeshFiles:
         return list(self._files)
 
     def digests(self) -> dict[str, str]:
-        """Return the SHA-256 of each mesh and of all files that it names, without parsing the mesh.
+        """Return the SHA-256 of each mesh and of all files that it refers to, without parsing the mesh.
 
         Raises:
-            ValueError: a mesh that names a file which is not there.
+            ValueError: a mesh refers to a missing file.
         """
         return {name: file_digest(path, *references(path)) for name, path in self._files.items()}
 
     def load(self) -> list[ObjectMesh]:
-        """Load the objects, normalised, in the order of ``names``. Source units are taken to be metres."""
+        """Load the objects, normalised, in the order of ``names``. Source units are assumed to be metres."""
         digests = self.digests()
         return [load_file(path, name, digests[name]) for name, path in self._files.items()]
 

@@ -1,4 +1,4 @@
-"""Any folder of meshes: files side by side, or one sub-folder per object."""
+"""Any folder of meshes: files in one folder, or one sub-folder for each object."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from neural_sim.ranges import validated
 
 log = logging.getLogger(__name__)
 
-# In order of preference, for a sub-folder with one object in several formats.
+# In order of preference, if a sub-folder holds one object in several formats.
 FORMATS = (".glb", ".obj", ".ply", ".stl", ".gltf")
 OTHER_FORMATS = (".fbx", ".dae", ".off", ".3ds", ".3mf", ".blend", ".usd", ".usdz", ".usdc", ".stp", ".drc")
-"""Meshes that are not read."""
+"""Meshes that cannot be read."""
 
 
 @validated
 class MeshFolder(MeshFiles):
     """Meshes of a folder (.glb, .obj, .ply, .stl, .gltf), +z up, in metres (rendering does not depend on the unit).
 
-    A file's object has the name of its stem. A sub-folder is one object of that name: its only mesh, or the first by
-    ``FORMATS``; nested folders are searched.
+    A file's object is named after its stem. A sub-folder is one object with the folder's name: its only mesh, or the
+    first by ``FORMATS``; nested folders are searched.
 
     Raises:
-        ValueError: an empty folder, an unknown name, or two objects of one name.
+        ValueError: the folder is empty, a name is unknown, or two objects have one name.
     """
 
     def __init__(self, root: str | Path, names: Names = None) -> None:

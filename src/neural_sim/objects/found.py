@@ -1,4 +1,4 @@
-"""Cameras that were found: how good they are, and why some or all were not found."""
+"""Cameras that were found from photographs: how good they are, and why some or all are missing."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from neural_sim.objects.placing import mean_up, nearest_to_axes, upright
 _log = logging.getLogger(__name__)
 
 LEAST = 8
-"""Fewest photographs of which an object can be made at all."""
+"""Fewest photographs from which an object can be made."""
 ONE_PLACE = 0.08
 """Largest extent of the cameras, relative to the distance of what they show, that counts as one place."""
 TURNED_ALONE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
-"""COLMAP's names of pairs that a turn of the camera explains, without a step."""
+"""COLMAP's names for pairs that a rotation of the camera explains, without translation."""
 MOST_TURNS = 0.5
-"""Share of these pairs above which photographs are taken to come from one place."""
+"""Fraction of such pairs above which photographs are assumed to come from one place."""
 POOR_ERROR = 1.5
-"""Pixels of the reduced photographs above which cameras are doubted; a good capture has 0.3 to 0.8."""
+"""Error in pixels of the reduced photographs above which cameras are doubted; a good capture has 0.3 to 0.8."""
 FEW = 0.7
-"""Share of the photographs below which the missing ones are a warning with what to do."""
+"""Fraction of the photographs with cameras below which a warning says what to do about the missing ones."""
 NAMED = 12
 """Most photographs that a message lists by name."""
 ONE_SIDED = 0.2
-"""Length of the mean of the cameras' horizontal directions above which they are on one side; all round, it is 0."""
+"""Length of the cameras' mean horizontal direction above which they are on one side; all around, it is 0."""
 LEVEL = 0.1
-"""Root mean square of the horizontal axes' second direction, above which they say what is up."""
+"""Root mean square of the second principal horizontal axis above which the axes determine what is up."""
 SIDEWAYS = 0.5
-"""By how much another of a camera's axes must fit the others' up better than its own, for a photograph on its side."""
+"""Margin by which another camera axis must fit the others' up better than its own for a photograph on its side."""
 
 _OVERLAP = "let each photograph show two thirds of what the one before shows, and much texture, such as a printed sheet"
 
@@ -46,11 +46,11 @@ class FoundCapture:
     """A capture with found cameras.
 
     Args:
-        capture: the photographs that have one.
+        capture: the photographs that have a camera.
         error: mean distance between features and their points' projections, in pixels of the reduced photographs.
-        points: how many points the cameras were found from.
+        points: number of points from which the cameras were found.
         missing: names of the photographs without a camera.
-        apart: how many of these belong together in another group.
+        apart: number of the missing photographs that fit together in another group.
         turning: whether the room stands still in the photographs while the object turns.
     """
 
@@ -90,7 +90,7 @@ class FoundCapture:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in words, of many the first."""
+    """Write names in words; of many, only the first."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
@@ -101,16 +101,16 @@ def judged(
     verified: Mapping[tuple[int, int], tuple[str, int]],
     turning: bool,
 ) -> FoundCapture:
-    """Return the largest of COLMAP's models, if an object can be made of it.
+    """Return the largest of COLMAP's models, if an object can be made from it.
 
     Args:
         album: the photographs.
-        models: COLMAP's, the largest first, each with its capture.
-        verified: pairs of photographs that a motion explains: the kind of motion, and how many matches.
+        models: COLMAP's models, the largest first, each with its capture.
+        verified: pairs of photographs that a motion explains, with the kind of motion and the number of matches.
         turning: see ``FoundCapture``.
 
     Raises:
-        ValueError: too few photographs that belong together, or photographs from one place, with what to do.
+        ValueError: too few photographs fit together, or all come from one place; the message says what to do.
     """
     total = len(album.shots)
     if not models or len(models[0][1].frames) < LEAST:
@@ -132,7 +132,7 @@ def judged(
 
 
 def _why_not(verified: Mapping[tuple[int, int], tuple[str, int]], count: int, total: int) -> str:
-    """Return why no cameras were found, and what to do."""
+    """Say why no cameras were found, and what to do."""
     if not verified:
         return f"no two of {total} photographs show enough of one place to find cameras; {_OVERLAP}"
     kinds = Counter(kind for kind, _ in verified.values())
@@ -142,7 +142,7 @@ def _why_not(verified: Mapping[tuple[int, int], tuple[str, int]], count: int, to
 
 
 def _extent(model: Any, capture: Capture) -> float:
-    """Return the largest distance of a camera from their middle, in median distances of what they show."""
+    """Return the largest distance of a camera from their centre, in units of the median distance of what they show."""
     centres = np.stack([frame.camera_to_world[:3, 3] for frame in capture.frames])
     points = np.array([point.xyz for point in model.points3D.values()])
     away = np.median(np.linalg.norm(points - centres.mean(0), axis=1))
@@ -152,9 +152,9 @@ def _extent(model: Any, capture: Capture) -> float:
 def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple[float, float, float]:
     """Return the direction that is up in most photographs, in the capture's frame.
 
-    It is across of all pictures' horizontal axes, for people hold cameras level and look down; where these are nearly
-    one axis, the mean of the pictures' own ups. A photograph that lies on its side, and whose EXIF does not say so,
-    counts by the axis that fits the others.
+    It is perpendicular to all pictures' horizontal axes, because people hold cameras level and tilt them down; if these
+    axes nearly coincide, it is the mean of the pictures' own up directions. A photograph that lies on its side, without
+    EXIF to say so, counts by whichever axis fits the others.
     """
     own = np.stack([pose[:3, :3] @ shot.up for pose, shot in zip(poses, shots, strict=True)])
     axes = np.concatenate([poses[:, :3, :2], -poses[:, :3, :2]], -1)  # right, up, left, down of each camera
@@ -175,10 +175,10 @@ def common_up(poses: Float[np.ndarray, "n 4 4"], shots: Sequence[Shot]) -> tuple
 
 
 def in_own_frame(capture: Capture) -> Capture:
-    """Return a capture in a frame that means something, where COLMAP's is arbitrary.
+    """Return a capture in a meaningful frame, because COLMAP's is arbitrary.
 
-    +z is up, the origin is where the cameras look, their median distance is 1, and they are on the side of +x, by their
-    mean or, all round, by the first.
+    +z is up, the origin is where the cameras look, and the cameras' median distance is 1. They are on the side of +x:
+    by their mean or, if they are all around, by the first.
     """
     poses = np.stack([frame.camera_to_world for frame in capture.frames])
     up = np.array(capture.up if capture.up is not None else mean_up(capture))

@@ -27,15 +27,15 @@ _READ = (
     "KHR_texture_transform", "KHR_mesh_quantization", "KHR_lights_punctual", "KHR_animation_pointer",
     "EXT_texture_webp", "EXT_texture_avif",
 )  # fmt: skip
-"""Extensions that are read or change nothing here, beside all KHR_materials_, which keep the base colour."""
+"""Extensions that are read or have no effect here, in addition to all KHR_materials_, which keep the base colour."""
 _DRACO, _GLOSSINESS = "KHR_draco_mesh_compression", "KHR_materials_pbrSpecularGlossiness"
 
 
 def gltf_references(path: Path) -> list[Path]:
-    """Return the files beside a glTF file that it names: buffers and pictures.
+    """Return the files that a glTF file refers to: buffers and pictures.
 
     Raises:
-        ValueError: a file that is no glTF, or that names a file which is not there.
+        ValueError: the file is not glTF, or refers to a missing file.
     """
     document = _read(path)[0]
     entries = [*document.get("buffers", []), *document.get("images", [])]
@@ -44,10 +44,10 @@ def gltf_references(path: Path) -> list[Path]:
 
 
 def read_gltf(path: Path) -> list[Part]:
-    """Read the parts of a glTF file's scene, one for each primitive of each node, with +y up as glTF has it.
+    """Read the parts of a glTF file's scene, one for each primitive of each node, with +y up as in glTF.
 
     Raises:
-        ValueError: a file that is no glTF 2.0, or that requires an extension which is not read.
+        ValueError: the file is not glTF 2.0, or requires an extension that is not read.
     """
     document, chunk = _read(path)
     version = str(document.get("asset", {}).get("version", ""))
@@ -100,10 +100,10 @@ def _file_of(uri: str, path: Path) -> Path:
 
 
 class _File:
-    """A glTF document and what it names.
+    """A glTF document and the files that it refers to.
 
     Args:
-        path: the file, for messages and for what lies beside it.
+        path: the file, for messages and to find other files.
         document: its JSON.
         chunk: the binary part of a .glb.
     """
@@ -116,12 +116,12 @@ class _File:
 
     @cached_property
     def accessors(self) -> Accessors:
-        """The numbers of the buffers."""
+        """The numbers in the buffers."""
         buffers = [self._bytes(buffer) for buffer in self.document.get("buffers", [])]
         return Accessors(self.document, buffers)
 
     def parts(self) -> Iterator[Part]:
-        """Walk the scene's nodes and yield each triangle primitive where its node puts it."""
+        """Walk the scene's nodes and yield each triangle primitive, transformed by its node."""
         for matrix, node in self._nodes():
             if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
                 raise ValueError("uses EXT_mesh_gpu_instancing, which is not read; export it without")
@@ -136,7 +136,7 @@ class _File:
                     yield part
 
     def _say(self, what: str) -> None:
-        """Warn once of each thing that is not drawn."""
+        """Warn once about each thing that is not drawn."""
         if what not in self._said:
             self._said.add(what)
             _log.warning("%s: %s", self.path, what)
@@ -201,7 +201,7 @@ class _File:
     def _look(
         self, primitive: Mapping[str, Any], count: int
     ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 2"] | None, Texture | None]:
-        """Return the colours of a primitive's vertices in sRGB, its texture coordinates and its texture."""
+        """Return a primitive's vertex colours in sRGB, its texture coordinates and its texture."""
         attributes = primitive["attributes"]
         material = self.document["materials"][primitive["material"]] if "material" in primitive else {}
         base, factor = _base_colour(material)
@@ -217,14 +217,14 @@ class _File:
         if name not in attributes:
             self._say(f"a primitive has a texture and no {name}: it takes the plain colour")
             return encoded(paint), None, None
-        # Integers are fractions, except where KHR_mesh_quantization lets the file say otherwise.
+        # Integers are fractions, unless the file uses KHR_mesh_quantization.
         quantised = "KHR_mesh_quantization" in self.document.get("extensionsUsed", [])
         read = self.accessors
         uv = _moved(
             read.floats(attributes[name], 2) if quantised else read.unit(attributes[name])[:, :2], move
         )
         uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1)  # glTF counts v from the top
-        if (paint == paint[:1]).all():  # one colour is exact in the texture itself
+        if (paint == paint[:1]).all():  # a single colour is exact in the texture itself
             return np.ones((count, 3)), uv, self._texture(base["index"], paint[0])
         return encoded(paint), uv, self._texture(base["index"], np.ones(3))
 
@@ -274,15 +274,15 @@ class _File:
 
 
 def _turned(normals: Float[np.ndarray, "v 3"], linear: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "v 3"]:
-    """Turn normals as a linear map turns planes, by its inverse's transpose."""
+    """Transform normals under a linear map as planes transform, by the transposed inverse."""
     if abs(np.linalg.det(linear)) < 1e-30:
-        return np.full_like(normals, np.nan)  # recomputed with a warning
+        return np.full_like(normals, np.nan)  # they are recomputed with a warning
     turned = normals @ np.linalg.inv(linear)
     return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
 
 
 def _matrix(node: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """Return a node's matrix: the one it states, or translation times rotation times scale."""
+    """Return a node's matrix: the given one, or translation times rotation times scale."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", [0.0, 0.0, 0.0, 1.0]), dtype=np.float64)
@@ -312,7 +312,7 @@ def _faces(indices: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "f 3"]:
         first = np.broadcast_to(indices[:1], (max(len(indices) - 2, 0),))
         return np.stack([indices[1:-1], indices[2:], first], -1)
     faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], -1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other triangle of a strip is wound the other way
+    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other triangle of a strip has the opposite winding
     return faces
 
 

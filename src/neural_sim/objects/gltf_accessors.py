@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Shaped
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MOST = 100_000_000
-"""More numbers than any mesh has that can be drawn; a damaged count would ask for all memory."""
+"""More numbers than any mesh has that can be drawn; a damaged count would otherwise ask for all memory."""
 
 
 class Accessors:
@@ -38,7 +38,7 @@ class Accessors:
         return data[start:end]
 
     def stored(self, index: int) -> bool:
-        """Return whether the file has an accessor's numbers rather than zeros for a decoder to fill."""
+        """Return whether the file itself has an accessor's numbers; otherwise there are zeros for a decoder to fill."""
         return "bufferView" in self._accessors[index] or "sparse" in self._accessors[index]
 
     def floats(self, index: int, width: int) -> Float[np.ndarray, "n width"]:
@@ -51,7 +51,7 @@ class Accessors:
         return values.astype(np.float64)
 
     def unit(self, index: int) -> Float[np.ndarray, "n width"]:
-        """Return colours or texture coordinates, whose integers stand for fractions of their largest."""
+        """Return colours or texture coordinates; integers are fractions of their largest value."""
         values = self._values(index)
         if values.shape[1] < 2:
             raise ValueError(f"accessors[{index}]: want vectors of 2 to 4, got {values.shape[1]}")
@@ -94,7 +94,7 @@ class Accessors:
         return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).copy()
 
     def _sparse(self, values: np.ndarray, sparse: Mapping[str, Any], index: int) -> np.ndarray:
-        """Replace the numbers that a sparse accessor names."""
+        """Replace the numbers that a sparse accessor lists."""
         count, places, new = sparse["count"], sparse["indices"], sparse["values"]
         kind = np.dtype(_TYPES[places["componentType"]]).newbyteorder("<")
         at = self._rows(places["bufferView"], places.get("byteOffset", 0), count, 1, kind)[:, 0]
@@ -107,7 +107,7 @@ class Accessors:
 
 
 def _normalised(values: Shaped[np.ndarray, "n width"]) -> Float[np.ndarray, "n width"]:
-    """Scale integers to fractions of their largest."""
+    """Scale integers to fractions of their largest value."""
     if values.dtype.kind == "f":
         return values.astype(np.float64)
     return np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0)

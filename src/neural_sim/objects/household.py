@@ -1,9 +1,9 @@
-"""The six procedural household objects: their looks, and which of their sides look alike.
+"""The six procedural household objects: how they look, and which of their sides look alike.
 
-The pitcher's +x side is the can's label except for the place of its bar; its -x side has the handle and another print.
-The drill's -x side is the tall box's front except for the colours of two marks; its +x side has grip and chuck, which
-lie within 45 degrees behind the housing and so are never visible from -x. Lengths are in units of the body's radius or
-half height; the loader normalises afterwards.
+The pitcher's +x side is the can's label, except for the position of its bar; its -x side has the handle and another
+print. The drill's -x side is the tall box's front, except for the colours of two marks; its +x side has grip and chuck,
+which lie within 45 degrees behind the housing and are therefore never visible from -x. Lengths are in units of the
+body's radius or half height; the loader normalises them.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ YELLOW: Colour = (244, 200, 36)
 VIOLET: Colour = (60, 30, 110)
 AMBER: Colour = (242, 172, 36)
 
-# The look-alike sides differ by the place of the label's bar and by the colours of the drill's marks, chosen on seeds
-# 100 and 101 so that a few images are too few to learn the difference and some dozens are enough.
+# Look-alike sides differ by the position of the label's bar and by the colours of the drill's marks. They were chosen
+# on seeds 100 and 101, so that a few images are too few to learn the difference and a few dozen are enough.
 CAN_EMBLEM = PITCHER_EMBLEM = RED
 CAN_BAND = PITCHER_BAND = WHITE
 BOX_EMBLEM, DRILL_EMBLEM = NAVY, VIOLET
 BOX_BAND, DRILL_BAND = YELLOW, AMBER
 
-CAN_HEADER, PITCHER_HEADER = 0.68, 0.3  # where the label's navy bar begins: over the emblem, or under it
+CAN_HEADER, PITCHER_HEADER = 0.68, 0.3  # where the label's navy bar begins: above the emblem, or below it
 
-CAN_HALF_HEIGHT = 1.5  # of its radius
+CAN_HALF_HEIGHT = 1.5  # in units of its radius
 PITCHER_TAPER = 0.97  # top radius over bottom radius
 PITCHER_SPOUT = 0.08
-HANDLE_REACH = 0.40  # beyond the body: hidden from the other side within 45 degrees while below sqrt(2) - 1
+HANDLE_REACH = 0.40  # beyond the body; below sqrt(2) - 1 it is hidden from the other side within 45 degrees
 BOX_HALF = (0.30, 0.74, 1.0)  # tall box and drill housing: half depth, half width, half height
 FLAT_HALF = (0.74, 0.95, 0.32)
 
@@ -59,7 +59,7 @@ def can(generator: torch.Generator) -> trimesh.Trimesh:
 def pitcher(generator: torch.Generator) -> trimesh.Trimesh:
     """Make a pitcher: the can's look on +x with a small spout; a white handle over a yellow print on -x."""
     side = _blue_side(PITCHER_EMBLEM, PITCHER_BAND, PITCHER_HEADER, generator)
-    for x0, x1 in ((0.0, 0.12), (0.88, 1.0)):  # no wider: the print must not show from +x either
+    for x0, x1 in ((0.0, 0.12), (0.88, 1.0)):  # no wider: the print must not be visible from +x either
         side.rectangle(x0, 0.12, x1, 0.88, YELLOW)
     side.text_lines((0.04, 0.2, 0.11, 0.8), 4, DARK_RED, generator)
     side.text_lines((0.89, 0.2, 0.96, 0.8), 4, DARK_RED, generator)
@@ -123,7 +123,7 @@ _FACES: tuple[str, ...] = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def _blue_side(emblem: Colour, band: Colour, header: float, generator: torch.Generator) -> Print:
-    """Print a cylinder's side: blue, a white label with header, emblem and small print on +x, a band round the foot."""
+    """Print a cylinder's side: blue, with a white label on +x (header, emblem, small print), and a band at the foot."""
     side = Print(512, 256, BLUE)
     side.rectangle(0.0, 0.04, 1.0, 0.17, band)
     side.rectangle(0.3, 0.24, 0.7, 0.84, WHITE)
@@ -152,7 +152,7 @@ def _with_lids(profile: list[tuple[float, float]], side: Print, mark: Colour, ba
 
 
 def _spouted(part: Part, half_height: float) -> Part:
-    """Pull the rim outward round world +x."""
+    """Pull the rim outwards around world +x."""
     x, y, z = part.vertices.T
     height = np.clip((z / half_height - 0.4) / 0.6, 0.0, 1.0) ** 2
     pull = (

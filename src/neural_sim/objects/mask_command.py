@@ -1,4 +1,4 @@
-"""Masks by another program: it is given a folder of photographs, and writes one mask for each into another."""
+"""Masks from another program, which reads a folder of photographs and writes one mask for each into another folder."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ KEY = "objects.mask_command"
 class MaskCommand:
     """A command line that writes masks, such as ``rembg p -om {images} {masks}``.
 
-    ``{images}`` becomes a folder of photographs, as PNG without EXIF, and ``{masks}`` an empty one. A mask has its
-    photograph's name, or begins with it. The line is not read by a shell.
+    ``{images}`` stands for a folder of photographs, as PNG without EXIF, and ``{masks}`` for an empty folder. A mask
+    has its photograph's name, or a name that begins with it. No shell reads the line.
 
     Raises:
-        ValueError: a line without the two folders, or a program that is not installed.
+        ValueError: the line lacks one of the two folders, or the program is not installed.
     """
 
     command: str
@@ -46,10 +46,10 @@ class MaskCommand:
             raise ValueError(f"{KEY}: no such program: {program}")
 
     def masks(self, images: Sequence[Path], value: int | None = None) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return the program's masks of photographs; in an image of labels, ``value`` is the object's.
+        """Return the program's masks of photographs; in an image of labels, the object has ``value``.
 
         Raises:
-            ValueError: a program that fails, a photograph without a mask, or a mask that cannot be read.
+            ValueError: the program fails, a photograph has no mask, or a mask cannot be read.
         """
         with tempfile.TemporaryDirectory(prefix="neural-sim-") as place:
             given, made = Path(place) / "images", Path(place) / "masks"

@@ -19,7 +19,7 @@ class ObjectMesh:
     """A mesh whose bounding box is centred on the origin and whose farthest vertex has norm 1; +z up.
 
     ``transform`` maps normalised coordinates to the source's frame, in metres. ``digest`` is the SHA-256 of the
-    object's source, a part of the keys of stored results.
+    object's source, which is part of the keys of stored results.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Source(Protocol):
 
 
 class MeshSource(Source, Protocol):
-    """A source of meshes; ``metric``: they are in metres, otherwise they have no unit of length."""
+    """A source of meshes. ``metric``: they are in metres; otherwise they have no unit of length."""
 
     metric: ClassVar[bool]
 
@@ -58,10 +58,10 @@ class MeshSource(Source, Protocol):
 def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None = None) -> ObjectMesh:
     """Copy ``mesh`` (in metres) with its bounding box centred and scaled to the unit sphere.
 
-    ``source`` (a file or another origin) is for messages. Without ``digest`` the mesh is hashed.
+    ``source`` (a file or another origin) is used in messages. Without ``digest`` the mesh is hashed.
 
     Raises:
-        ValueError: an extent that is zero or not finite.
+        ValueError: the extent is zero or not finite.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(vertices) == 0 or not np.isfinite(vertices).all():
@@ -73,7 +73,7 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
     if radius < DEGENERATE_EXTENT:
         raise ValueError(f"{source}: want a mesh with extent, got one of radius {radius:g}")
     scaled = mesh.copy()
-    normals = np.array(mesh.vertex_normals)  # similarities keep normals; trimesh would drop those of the file
+    normals = np.array(mesh.vertex_normals)  # similarities keep normals; trimesh would drop the file's
     scaled.vertices = (vertices - centre) / radius
     scaled.vertex_normals = normals
     transform = np.eye(4)
@@ -83,7 +83,7 @@ def normalise(mesh: trimesh.Trimesh, name: str, source: str, digest: str | None 
 
 
 def content_digest(mesh: trimesh.Trimesh) -> str:
-    """SHA-256 of vertices, faces and colours or texture, equal on every machine."""
+    """Return the SHA-256 of vertices, faces and colours or texture, which is equal on every machine."""
     state = hashlib.sha256()
     state.update(np.ascontiguousarray(np.round(mesh.vertices, 9), dtype="<f8").tobytes())
     state.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())

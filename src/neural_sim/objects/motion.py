@@ -1,4 +1,4 @@
-"""Cameras of photographs from the photographs alone: structure from motion by COLMAP."""
+"""Cameras of photographs, found from the photographs alone: structure from motion by COLMAP."""
 
 from __future__ import annotations
 
@@ -31,32 +31,33 @@ from neural_sim.ranges import PositiveInt, validated
 _log = logging.getLogger(__name__)
 
 ALL_PAIRS = 40
-"""Photographs of which every pair is compared. Of more, those near in time, and of the whole a coarse selection."""
+"""Most photographs of which every pair is compared. Of more, nearby ones and a coarse selection of all are compared."""
 SKELETON = 5
-"""Every so many photographs, one is compared with all others of the kind: where a walk round ends, it has begun."""
+"""Stride of the photographs that are compared with all others at this stride: a walk may end where it began."""
 LARGE = 800
-"""Longer side in pixels from which photographs are searched for features at their own size alone."""
+"""Longer side in pixels from which photographs are searched for features only at their own size."""
 BATCH = 8
 SEED = 0
-"""Of COLMAP's random samples; not the run's, so that runs share poses."""
+"""Seed of COLMAP's random samples; not the run's, so that runs share poses."""
 
 MaskOf = Callable[[Shot], Bool[np.ndarray, "_ _"] | None]
-"""Where a photograph shows the object, if anything says so."""
+"""Gives the region of a photograph that shows the object, or None if it is unknown."""
 
 
 @validated
 @dataclass(frozen=True)
 class Colmap:
-    """Finds the cameras of photographs by their own features (SIFT), and says of which it cannot.
+    """Finds the cameras of photographs by their own features (SIFT), and reports those that it cannot find.
 
     Args:
-        picture_size: longer side in pixels to which larger photographs are reduced for this.
-        features: most features of a photograph.
-        matching: which photographs are compared: ``exhaustive`` all, ``sequential`` those near in the order of their
-            names; ``auto``: all of up to 40, else near ones and a coarse selection of all.
-        overlap: of ``sequential``, how many photographs each is compared with.
-        region: ``all`` of a photograph counts; ``object``: what the masks show alone; ``auto``: all, unless the room
-            stands still while the object turns: then the masks, and without masks what does not stand still.
+        picture_size: longer side in pixels to which larger photographs are reduced for this purpose.
+        features: largest number of features in a photograph.
+        matching: which photographs are compared: ``exhaustive``: all; ``sequential``: those nearby in the order of
+            their names; ``auto``: all of up to 40, else nearby ones and a coarse selection of all.
+        overlap: for ``sequential``, the number of photographs with which each is compared.
+        region: which part of a photograph counts. ``all``: all of it; ``object``: only what the masks show; ``auto``:
+            all, unless the room stands still while the object turns: then the masks or, without masks, what does not
+            stand still.
     """
 
     picture_size: Annotated[int, Ge(200)] = 1000
@@ -70,11 +71,11 @@ class Colmap:
 
         Args:
             album: the photographs.
-            mask: says where a photograph shows the object, None where nothing does.
+            mask: gives the region of a photograph that shows the object; None if it is unknown.
             progress: whether to show a bar.
 
         Raises:
-            ValueError: photographs whose cameras cannot be found, with the reason and what to do.
+            ValueError: the cameras cannot be found; the message has the reason and what to do.
         """
         if len(album.shots) < LEAST:
             raise ValueError(
@@ -86,7 +87,7 @@ class Colmap:
             return _Search(self, album, Path(place), progress).run(mask)
 
     def pairs(self, count: int) -> list[tuple[int, int]]:
-        """Return which of ``count`` photographs are compared."""
+        """Return which pairs of ``count`` photographs are compared."""
         if self.matching == "exhaustive" or (self.matching == "auto" and count <= ALL_PAIRS):
             return list(combinations(range(count), 2))
         steps = {*range(1, self.overlap + 1), *(2**power for power in range(count.bit_length()))}
@@ -106,7 +107,7 @@ class _Search:
     progress: bool
 
     def run(self, mask: MaskOf) -> FoundCapture:
-        """Return what was found."""
+        """Search, and return what was found."""
         shots, album = self.album.shots, self.album
         with signals_kept():
             import pycolmap
@@ -131,7 +132,7 @@ class _Search:
         return self.place / "database.db"
 
     def _write(self, mask: MaskOf, standing: Mapping[Path, Bool[np.ndarray, "_ _"]] | None) -> bool:
-        """Write reduced photographs, and where features count if not everywhere; return whether that is so."""
+        """Write reduced photographs, and the regions that count if not all do; return whether there are any."""
         region = self.settings.region
         (self.place / "images").mkdir()
         (self.place / "masks").mkdir()
@@ -163,12 +164,13 @@ class _Search:
         return width, height
 
     def _extract(self, pycolmap: Any, masked: bool, bar: Any) -> None:
-        """Find features; photographs of one camera share its intrinsics."""
+        """Find features; photographs from one camera share its intrinsics."""
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, _threads()
         options.max_image_size = self.settings.picture_size
         options.sift.max_num_features = self.settings.features
-        # Of small photographs, twice the size is searched too: four times the work, and there is little else to find.
+        # Small photographs are also searched at twice their size: four times the work, but they have little else to
+        # find.
         largest = max(max(self._reduced(shot)) for shot in self.album.shots)
         options.sift.first_octave = -1 if largest < LARGE else 0
         groups: dict[object, list[int]] = {}
@@ -182,7 +184,7 @@ class _Search:
                 width, height = self._reduced(shot)
                 focal = shot.focal * width / shot.size[0]
                 reader.camera_params = f"{focal},{0.5 * width},{0.5 * height},0"
-            # Here photographs get their numbers, in their order; the threads of the extraction have none.
+            # Photographs get their numbers here, in their order, because the threads of the extraction keep no order.
             pycolmap.import_images(
                 self.database, self.place / "images", pycolmap.CameraMode.SINGLE,
                 [_file(number) for number in numbers], reader,
@@ -211,7 +213,7 @@ class _Search:
         matching.use_gpu, matching.num_threads = False, _threads()
         verification.ransac.random_seed = SEED
         verification.compute_relative_pose = True
-        # What stands still in the pictures as the object turns tells of a camera that did not move.
+        # What stands still in the pictures while the object turns is evidence of a camera that did not move.
         verification.filter_stationary_matches = standing and self.settings.region == "auto"
         imported, listed = pycolmap.ImportedPairingOptions(), self.place / "pairs.txt"
         imported.match_list_path = str(listed)
@@ -226,10 +228,11 @@ class _Search:
     def _map(self, pycolmap: Any, standing: bool, bar: Any) -> list[Any]:
         """Return COLMAP's models, the largest first."""
         options = pycolmap.IncrementalPipelineOptions()
-        # One thread: the sums of several are rounded by who comes first, and equal photographs must have equal cameras.
+        # One thread: sums from several threads are rounded by their order, and equal photographs must have equal
+        # cameras.
         options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
         options.min_model_size, options.max_num_models = 3, 5
-        # A turning object fills a small part of the photographs, which says little of the lens.
+        # A turning object fills a small part of the photographs, which says little about the lens.
         lens = not (standing and all(shot.focal for shot in self.album.shots))
         options.ba_refine_focal_length = options.ba_refine_extra_params = lens
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = lens
@@ -262,7 +265,7 @@ class _Search:
         return Capture(self.album.name, frames, self.album.folder, images, up)
 
     def _verified(self, pycolmap: Any) -> dict[tuple[int, int], tuple[str, int]]:
-        """Return kind of motion and number of matches of each pair of photographs that a motion explains."""
+        """Return the kind of motion and the number of matches for each pair of photographs that a motion explains."""
         with self._open(pycolmap) as database:
             numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
             ids, geometries = database.read_two_view_geometries()
@@ -287,7 +290,7 @@ def _threads() -> int:
 
 @contextmanager
 def _quiet(pycolmap: Any) -> Iterator[None]:
-    """Keep COLMAP's own progress out of the log; what it raises is told."""
+    """Keep COLMAP's own progress out of the log; its exceptions are reported."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:

@@ -1,4 +1,4 @@
-"""What meshes are painted with: colours of vertices, and as many textures as a file's materials have."""
+"""The paint of meshes: vertex colours, and any number of textures from a file's materials."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from neural_sim.pictures import read_picture
 _log = logging.getLogger(__name__)
 
 GREY = (160, 160, 160, 255)
-"""What is painted where a file says no colour."""
+"""The colour if a file states none."""
 LARGEST_SIDE = 8192
-"""Sides of textures in pixels that every OpenGL takes; larger ones are halved."""
+"""Largest side of a texture, in pixels, that every OpenGL accepts; larger textures are halved."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 """What a texture shows beyond its edges."""
 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture in sRGB and what it shows beyond its edges, along u and v."""
+    """A picture in sRGB, and what it shows beyond its edges along u and v."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
 
 
 class Paint(Visuals):
-    """Colours of vertices times textures, for meshes of several materials.
+    """Vertex colours times textures, for meshes with several materials.
 
     Args:
-        albedo: of each vertex, sRGB in [0, 1]; what a texture is multiplied by.
-        uv: of each vertex; v points up in the picture.
-        page: the texture of each vertex, -1: none. The vertices of a face agree.
+        albedo: sRGB colour of each vertex, in [0, 1]; multiplies the texture.
+        uv: texture coordinates of each vertex; v points up in the picture.
+        page: texture of each vertex, -1: none. The vertices of a face have the same one.
         textures: the textures.
     """
 
@@ -65,7 +65,7 @@ class Paint(Visuals):
 
     @property
     def defined(self) -> bool:
-        """Whether there are colours, as trimesh asks."""
+        """Whether there are colours; trimesh asks for this."""
         return True
 
     @override
@@ -74,7 +74,7 @@ class Paint(Visuals):
 
     @override
     def update_faces(self, mask: Shaped[np.ndarray, "kept"]) -> None:
-        """Faces have no colours of their own."""
+        """Do nothing: faces have no colours of their own."""
 
     @override
     def concatenate(self, other: Visuals) -> Visuals:
@@ -94,13 +94,13 @@ class Part:
     """The triangles of one material.
 
     Args:
-        vertices: their corners.
-        faces: three indices each.
-        colours: sRGB in [0, 1] of the vertices, or of the faces; they multiply the texture.
-        normals: of the vertices, None: those of the faces round them.
+        vertices: the corners of the triangles.
+        faces: three indices for each.
+        colours: sRGB in [0, 1], of vertices or faces; they multiply the texture.
+        normals: normals of the vertices; None: derived from the faces around them.
         uv: texture coordinates of the vertices; v points up in the picture.
-        texture: None: the colours alone.
-        by_face: whether colours are of the faces.
+        texture: the texture; None: only the colours.
+        by_face: whether colours belong to faces.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -113,10 +113,10 @@ class Part:
 
 
 def join(parts: Sequence[Part]) -> trimesh.Trimesh:
-    """Join parts into one mesh, painted with trimesh's own kinds of colours where these can say it.
+    """Join parts into one mesh, painted with trimesh's own kinds of colours if these suffice.
 
     Raises:
-        ValueError: no parts.
+        ValueError: there are no parts.
     """
     if not parts:
         raise ValueError("holds no triangles")
@@ -193,10 +193,10 @@ def tinted(texture: Texture, factor: Float[np.ndarray, "3"]) -> Texture:
 
 
 def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> Texture:
-    """Read a picture as a texture, as it is stored: texture coordinates know nothing of EXIF, opacity is left out.
+    """Read a picture as a texture, as stored: texture coordinates ignore EXIF, and opacity is dropped.
 
     Raises:
-        ValueError: no picture that can be read, with ``where``.
+        ValueError: no picture can be read; the message has ``where``.
     """
     image = read_picture(BytesIO(source) if isinstance(source, bytes) else source, where, upright=False)
     image = image.convert("RGB")
@@ -208,11 +208,11 @@ def read_texture(source: Path | bytes, where: str, wrap: tuple[Wrap, Wrap] = ("r
 
 
 def find_named(written: str, folder: Path) -> Path | None:
-    """Find a file that a mesh in ``folder`` names, as its writer's machine may have spelt it.
+    """Find a file that a mesh in ``folder`` refers to, however the machine that wrote it spelt the name.
 
-    Separators of Windows count as separators, case does not count where no file has the very name, and where the named
-    folder is not there, the last name is looked for in the folder itself, in those in it, and in a folder ``textures``
-    beside it.
+    Windows' separators count as separators. Case is ignored if no file has exactly this name. If the named folder does
+    not exist, the last part of the name is searched in the folder itself, in its sub-folders, and in a neighbouring
+    folder ``textures``.
     """
     parts = [part for part in written.strip().strip('"').replace("\\", "/").split("/") if part != "."]
     if not parts or not parts[-1]:
@@ -237,7 +237,7 @@ def find_named(written: str, folder: Path) -> Path | None:
 
 
 def _followed(parts: Sequence[str], folder: Path) -> Path | None:
-    """Follow names from a folder whatever their case; None where they lead to no file, or to several."""
+    """Follow names from a folder in any case; None if they lead to no file, or to several."""
     here = folder
     for part in parts:
         if part == "..":

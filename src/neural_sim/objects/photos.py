@@ -1,4 +1,4 @@
-"""Photographs of objects: one folder per object, with cameras (``transforms.json``, COLMAP's model) or without."""
+"""Photographs of objects: one folder for each, with cameras (``transforms.json``, COLMAP's model) or without."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ class PoseFinder(Protocol):
         mask: Callable[[Shot], Bool[np.ndarray, "_ _"] | None],
         progress: bool = False,
     ) -> FoundCapture:
-        """Return the cameras; ``mask`` says where a photograph shows the object, if anything does.
+        """Return the cameras; ``mask`` gives the region of a photograph that shows the object, or None.
 
         Raises:
-            ValueError: photographs whose cameras cannot be found.
+            ValueError: the cameras cannot be found.
         """
         ...
 
@@ -77,39 +77,41 @@ class PoseCorrector(Protocol):
     """Corrects the poses of an object's photographs."""
 
     def refine(self, views: PosedViews, held_out: int) -> PosedViews:
-        """Return the views, of which the last ``held_out`` are test frames, at corrected poses."""
+        """Return the views at corrected poses; the last ``held_out`` are test frames."""
         ...
 
 
 @validated
 class Photos:
-    """Captures of a folder; an object has the name of its folder.
+    """Captures in a folder; an object has the name of its folder.
 
     Args:
-        root: the folder of the objects' folders, or the folder of one object.
+        root: the folder that holds the objects' folders, or the folder of one object.
         names: objects to load; null: all.
         masks: source of the objects' masks, see ``Pictures``.
-        up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; a mapping by
-            object's name; null: that of the capture's file, else the mean of the cameras' up vectors.
-        size: the diameter of the object's bounding sphere in metres, or a mapping by object's name; null: unknown, so
+        up: the world's up direction in a capture's frame: ``+x``, ``-x``, ``+y``, ..., or three numbers; or a mapping
+            by object name; null: the one in the capture's file, else the mean of the cameras' up vectors.
+        size: diameter of the object's bounding sphere in metres, or a mapping by object name; null: unknown, so
             that distances are in object radii.
-        box: with ``masks="scene"``: two corners of a box about the object, along the axes of the capture's frame and in
-            its unit, or a mapping by object's name; null: that of ``box.json`` in the capture's folder, else the object
-            is looked for where the cameras look.
-        scene: what computes masks where ``masks="scene"``.
-        refinement: what corrects the cameras' poses; null: they stay as they are.
-        poor: what happens where a field does not show its object: nothing trains on it (``refuse``), or ``use``.
-        poses: what finds the cameras of photographs alone; null: they are given, by ``transforms.json`` or a model of
-            COLMAP's.
+        box: with ``masks="scene"``: two corners of a box around the object, along the axes of the capture's frame and
+            in its unit, or a mapping by object name; null: the one in ``box.json`` in the capture's folder, else the
+            object is searched where the cameras look.
+        scene: computes masks if ``masks="scene"``.
+        refinement: corrects the cameras' poses; null: they are not changed.
+        poor: what happens if a field does not show its object: nothing trains on it (``refuse``), or it is used
+            (``use``).
+        poses: finds the cameras if there are only photographs; null: they are given, by ``transforms.json`` or a COLMAP
+            model.
         mask_command: with ``masks="command"``: see ``MaskCommand``.
-        mask_value: the object's value in masks that are images of labels, or a mapping by object's name.
-        beside: meshes that are further objects of the run, with other names; null: none.
-        frames: where cameras are found and a folder holds a video and no photographs, how many frames of it are taken.
+        mask_value: the object's value in masks that are images of labels, or a mapping by object name.
+        beside: meshes that are additional objects of the run, with other names; null: none.
+        frames: number of frames to take from a video, if cameras are searched and a folder has a video but no
+            photographs.
 
     Raises:
-        ValueError: a missing folder, one without captures, an unknown name, ``masks="scene"`` without ``scene``,
-            ``box`` without ``masks="scene"``, ``masks="command"`` without a command, a capture that its reader
-            refuses, or a name that is also one of ``beside``.
+        ValueError: a folder is missing or has no captures, a name is unknown, ``masks="scene"`` has no ``scene``,
+            ``box`` is set without ``masks="scene"``, ``masks="command"`` has no command, a reader refuses its capture,
+            or a name is also that of a mesh in ``beside``.
     """
 
     def __init__(
@@ -151,7 +153,7 @@ class Photos:
         self._check()
 
     def _check(self) -> None:
-        """Raise errors in files here, not in a later stage."""
+        """Raise errors about files now, not in a later stage."""
         if self.poses is None:
             for capture in self.captures.values():
                 if self.masks in ("auto", "files"):
@@ -166,7 +168,7 @@ class Photos:
                     refuse_shared(found, file, shot.image)
 
     def _found(self) -> dict[str, Path]:
-        """Find the captures' folders by the names of their objects: those below the root, else the root itself."""
+        """Find the captures' folders by object name: those below the root, else the root itself."""
         usable = is_capture if self.poses is None else can_be_captured
         below = [
             p for p in sorted(self.root.iterdir()) if p.is_dir() and p.name not in (FOLDER, MASKS_FOLDER)
@@ -196,14 +198,14 @@ class Photos:
 
     @cached_property
     def captures(self) -> dict[str, Capture]:
-        """Frames and cameras by object. Given ones are read, without the photographs; others are found, in minutes."""
+        """Frames and cameras by object. Given cameras are read, without photographs; others are found, in minutes."""
         if self.poses is not None:
             return {name: self.find(name).capture for name in self._folders}
         return {name: self._read(name) for name in self._folders}
 
     @cached_property
     def albums(self) -> dict[str, Album]:
-        """Photographs whose cameras are to be found, by object; frames of a video are taken first."""
+        """Photographs whose cameras must be found, by object; frames of a video are taken first."""
         for name, folder in self._folders.items():
             take_frames(folder, name, self.frames)
         return {name: read_album(folder, name) for name, folder in self._folders.items()}
@@ -214,12 +216,12 @@ class Photos:
         """Find the cameras of an object's photographs.
 
         Args:
-            name: of the object.
-            computed: its ``command_masks``; None: they are computed now.
-            progress: whether to show a bar.
+            name: name of the object.
+            computed: its ``command_masks``; None: they are computed here.
+            progress: whether to show a progress bar.
 
         Raises:
-            ValueError: cameras that are given, or cannot be found.
+            ValueError: the cameras are given, or cannot be found.
         """
         if self.poses is None:
             raise ValueError(f"objects/poses=given: the cameras of {name} are given")
@@ -239,7 +241,7 @@ class Photos:
         return self.poses.find(album, mask, progress)
 
     def with_cameras(self, captures: Iterable[Capture]) -> Photos:
-        """Return this source with captures whose cameras were found."""
+        """Return this source with the captures whose cameras were found."""
         made = copy.copy(self)
         made.captures = {capture.name: capture for capture in captures}
         return made
@@ -251,20 +253,20 @@ class Photos:
         return tuple(frame.image for frame in self.captures[name].frames)
 
     def command_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Return a mask for each of ``images`` where ``masks="command"``, else none."""
+        """Return a mask for each of ``images`` if ``masks="command"``, else none."""
         return () if self.command is None else self.command.masks(self.images(name), self._value(name))
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each capture's files, masks included, and of the options that apply to it."""
+        """Return the SHA-256 of each capture's files, masks included, and of the options that apply to it."""
         return {name: self._digest(name) for name in self._folders}
 
     def radius(self, name: str) -> float | None:
-        """Radius of an object's bounding sphere in metres, None if unknown."""
+        """Return the radius of an object's bounding sphere in metres, None if unknown."""
         size = self.size.get(name) if isinstance(self.size, Mapping) else self.size
         return None if size is None else 0.5 * float(size)
 
     def box_of(self, name: str) -> Corners | None:
-        """Return an object's box where one says what the object is: as set, else as saved beside its capture."""
+        """Return the box that defines an object, if any: as set, else as saved in its capture's folder."""
         if self.masks != "scene":
             return None
         return box_of(self.box, name) or saved_box(self._folders[name])
@@ -274,12 +276,12 @@ class Photos:
         return self._folders[name]
 
     def split(self, name: str, count: int, held_out: int) -> tuple[list[Frame], list[Frame]]:
-        """At most ``count`` training frames and ``held_out`` test frames, evenly spread.
+        """Return at most ``count`` training frames and ``held_out`` test frames, evenly spread.
 
         Test frames are the capture's own if it has any, else at most an eighth of all frames.
 
         Raises:
-            ValueError: fewer than two training frames.
+            ValueError: there are fewer than two training frames.
         """
         frames = self.captures[name].frames
         test = [frame for frame in frames if frame.test]
@@ -294,7 +296,7 @@ class Photos:
         return _spread(train, count), _spread(test, held_out)
 
     def computed_masks(self, name: str) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Compute a mask for each frame of an object's capture where ``masks="scene"``, else none."""
+        """Compute a mask for each frame of an object's capture if ``masks="scene"``, else none."""
         if self.scene is None or self.masks != "scene":
             return ()
         return self.scene.masks(self.captures[name], self._up(name), self.box_of(name))
@@ -302,7 +304,7 @@ class Photos:
     def pictures(self, name: str, computed: tuple[Float[Tensor, "_ _"], ...] | None = None) -> Pictures:
         """Return an object's photographs.
 
-        ``computed`` are its ``command_masks`` or ``computed_masks``; None: they are computed now.
+        ``computed`` are its ``command_masks`` or ``computed_masks``; None: they are computed here.
         """
         made = (self.command_masks(name) or self.computed_masks(name)) if computed is None else computed
         if self.command is not None:
@@ -329,14 +331,14 @@ class Photos:
         return views if self.refinement is None else self.refinement.refine(views, len(test))
 
     def up_of(self, name: str) -> tuple[float, float, float]:
-        """Return the up direction in the frame of a capture: as set, else its file's, else the cameras' mean."""
+        """Return the up direction in a capture's frame: as set, else its file's, else the cameras' mean."""
         capture = self.captures[name]
         return self._up(name) or capture.up or mean_up(capture)
 
     def directions(self, name: str) -> Float[np.ndarray, "photos 3"]:
-        """Compute unit vectors to the cameras from where they look, or from the object's box, in the object's frame.
+        """Compute unit vectors to the cameras, in the object's frame, from where they look or from the object's box.
 
-        No photograph is read: masks would move the centre a little, and the directions by some degrees.
+        No photograph is read: masks would move the centre a little, and the directions by a few degrees.
         """
         poses = np.stack([frame.camera_to_world for frame in self.captures[name].frames])
         box = self.box_of(name)
@@ -355,7 +357,7 @@ class Photos:
         return self.mask_value.get(name) if isinstance(self.mask_value, Mapping) else self.mask_value
 
     def _digest(self, name: str) -> str:
-        """Digest of the object's files and options, and of cameras that were found."""
+        """Digest the object's files and options, and any cameras that were found."""
         capture, folder = self.captures[name], self._folders[name]
         masks = () if self.masks in MADE else (mask_of(frame, capture.source) for frame in capture.frames)
         files = _named([*capture.files, *(path for path in masks if path is not None)], folder)
@@ -365,7 +367,7 @@ class Photos:
         return content_digest({options: Path(), **files})
 
     def found_digest(self, name: str) -> str:
-        """Digest of what found cameras depend on: the photographs, their masks, and how these are read."""
+        """Digest what found cameras depend on: the photographs, their masks, and how these are read."""
         options = f"{self.masks} {self._value(name)} {self.command} "
         return content_digest({options: Path(), **self._pictures_and_masks(name)})
 
@@ -376,7 +378,7 @@ class Photos:
 
 
 def _named(files: Iterable[Path], folder: Path) -> dict[str, Path]:
-    """Files by their names in a folder; those elsewhere by their paths."""
+    """Name files relative to a folder; those elsewhere by their paths."""
     return {
         str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path): path for path in files
     }
@@ -393,7 +395,7 @@ def is_capture(folder: Path) -> bool:
 
 
 def _spread(frames: list[Frame], count: int) -> list[Frame]:
-    """At most ``count`` of the frames, evenly spread."""
+    """Return at most ``count`` of the frames, evenly spread."""
     if count >= len(frames):
         return list(frames)
     return [frames[int((i + 0.5) * len(frames) / count)] for i in range(count)]

@@ -26,7 +26,7 @@ MADE = ("scene", "command")
 """Masks that are computed before photographs are read."""
 Direction = tuple[float, float, float]
 Corners = tuple[Direction, Direction]
-"""The lowest and the highest corner of a box along the axes of the capture's frame, in its unit."""
+"""Lowest and highest corner of a box along the axes of the capture's frame, in its unit."""
 Box = Annotated[
     Corners,
     Matching(
@@ -35,10 +35,10 @@ Box = Annotated[
     ),
 ]
 BOX_FILE = "box.json"
-"""Beside a capture: the object's box, as the page of ``stages=[box]`` saves it."""
+"""File next to a capture with the object's box, as saved by the page of ``stages=[box]``."""
 FOLDER = "masks"
 SHARPNESS = 4.0
-"""Slope of the masks' opacity about a half, where a computed mask has its edge: an object is opaque, fog is nothing."""
+"""Slope of a computed mask's opacity at its edge, one half: objects become opaque, and fog vanishes."""
 
 
 @runtime_checkable
@@ -48,10 +48,10 @@ class SceneMaskMaker(Protocol):
     def masks(
         self, capture: Capture, up: Direction | None, box: Corners | None
     ) -> tuple[Float[Tensor, "_ _"], ...]:
-        """Compute the opacity of the object in [0, 1] for each of the capture's frames, at any size.
+        """Compute the object's opacity in [0, 1] for each frame of the capture, at any size.
 
         Raises:
-            ValueError: no object found.
+            ValueError: no object was found.
         """
         ...
 
@@ -66,10 +66,10 @@ def box_of(box: Box | Mapping[str, Box | None] | None, name: str) -> Corners | N
 
 
 def saved_box(folder: Path) -> Corners | None:
-    """Read the box that was saved beside a capture, None without one.
+    """Read the box that was saved next to a capture; None without one.
 
     Raises:
-        ValueError: a file that is no box, with its path.
+        ValueError: the file is not a box; the message has its path.
     """
     file = folder / BOX_FILE
     if not file.is_file():
@@ -85,14 +85,14 @@ def saved_box(folder: Path) -> Corners | None:
 class Pictures:
     """Reads the photographs of a capture.
 
-    ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image of its name in a
-    folder ``masks`` beside the images or beside the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
-    first of these that a frame has; ``scene`` and ``command``: ``computed``, a mask of any size for each of the
-    capture's frames, in their order. In files of labels, ``value`` is the object's.
+    ``masks`` is the source of the object's mask. ``files``: the frame's ``mask_path``, or an image with its name in a
+    folder ``masks`` next to the images or the capture's file; ``alpha``: the image's alpha channel; ``auto``: the
+    first of these that a frame has; ``scene`` and ``command``: ``computed``, with a mask of any size for each of the
+    capture's frames, in their order. In files of labels, the object has ``value``.
 
     Raises:
-        ValueError: computed masks that are missing or too few; from ``rgba``, a frame without a
-            mask, or a mask of another size.
+        ValueError: computed masks are missing or too few. ``rgba`` raises it if a frame has no mask, or one of another
+            size.
     """
 
     capture: Capture
@@ -109,7 +109,7 @@ class Pictures:
             )
 
     def rgba(self, frame: Frame) -> Float[Tensor, "h w 4"]:
-        """Colour and mask of a frame: straight alpha, float32 in [0, 1]."""
+        """Return colour and mask of a frame: straight alpha, float32 in [0, 1]."""
         picture = read_picture(frame.image, upright=False)
         colours = _values(picture.convert("RGB"))
         if self.masks in MADE:
@@ -136,10 +136,10 @@ class Pictures:
 def given_mask(
     image: Path, file: Path | None, picture: Image.Image, masks: Masks, value: int | None
 ) -> Float[Tensor, "h w"] | None:
-    """Return a photograph's mask, from its ``file`` or its own alpha channel; None where there is none.
+    """Return a photograph's mask, from its ``file`` or its own alpha channel; None if there is none.
 
     Raises:
-        ValueError: a file that is no mask of the photograph.
+        ValueError: the file is not a mask of the photograph.
     """
     if file is not None and masks != "alpha":
         mask = read_mask(file, value)
@@ -153,8 +153,8 @@ def check_masks(capture: Capture) -> None:
     """Check the files of a capture's masks by their headers.
 
     Raises:
-        ValueError: a file that is no picture or not of its photograph's size, or one of a folder of masks that several
-            photographs would have.
+        ValueError: a file is not a picture or not of its photograph's size, or a file in a folder of masks would belong
+            to several photographs.
     """
     found: dict[Path, Path] = {}
     for frame in capture.frames:
@@ -167,7 +167,7 @@ def check_masks(capture: Capture) -> None:
 
 
 def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
-    """Note whose mask a file is in ``found``. Raises ``ValueError`` where it is another photograph's already."""
+    """Note in ``found`` whose mask a file is. Raises ``ValueError`` if it already belongs to another photograph."""
     other = found.setdefault(file, image)
     if other != image:
         raise ValueError(
@@ -177,28 +177,28 @@ def refuse_shared(found: dict[Path, Path], file: Path, image: Path) -> None:
 
 
 def refuse_size(file: Path, size: Size, image: Path, wanted: Size) -> None:
-    """Raise ``ValueError`` for a mask that has not the size of its image."""
+    """Raise ``ValueError`` for a mask that does not have its image's size."""
     if size != wanted:
         raise ValueError(f"{file}: the mask has {by(size)} pixels, its image {image} {by(wanted)}")
 
 
 def mask_of(frame: Frame, source: Path) -> Path | None:
-    """Find the file of a frame's mask, None without one."""
+    """Find the file of a frame's mask; None without one."""
     return frame.mask or mask_beside(frame.image, source)
 
 
 def mask_beside(image: Path, source: Path) -> Path | None:
-    """Find the file of an image's mask in a folder of masks. COLMAP calls it ``image.jpg.png``, others ``image.png``.
+    """Find an image's mask in a folder of masks, as ``image.jpg.png`` (COLMAP) or ``image.png`` (others).
 
-    The folder lies beside the image or beside one of the folders about it, up to the one that holds ``source`` too. In
-    it, a mask may lie below the same folders as its image.
+    The folder is next to the image or to one of the folders around it, up to the one that also holds ``source``. In it,
+    a mask may have the same sub-folders as its image.
     """
     whole = os.path.abspath(image.parent)
     home = os.path.commonpath([whole, os.path.abspath(source if source.is_dir() else source.parent)])
     levels = len(Path(whole).parts) - len(Path(home).parts) + 1
     for folder in [image.parent, *image.parent.parents][: max(2, levels)]:
         below = image.parent.relative_to(folder)
-        inner = [below, Path(*below.parts[1:]), Path()]  # without the folder of images, and by the name alone
+        inner = [below, Path(*below.parts[1:]), Path()]  # without the folder of images, and by name alone
         for part in dict.fromkeys(inner):
             for name in (f"{image.name}.png", f"{image.stem}.png", image.name):
                 if (folder / FOLDER / part / name).is_file():

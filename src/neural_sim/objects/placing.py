@@ -1,4 +1,4 @@
-"""An object's placement in its capture's frame: the up direction, and centre and radius from the visual hull."""
+"""An object's place in its capture's frame: the up direction, and centre and radius from the visual hull."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ AXES = {
     for sign, axis in itertools.product("+-", "xyz")
 }
 SMALL = 256
-"""Pixels along the longer side of the silhouettes that carve the hull."""
+"""Longer side, in pixels, of the silhouettes that carve the hull."""
 NEARLY_ALL = 0.95
-"""Fraction of a photograph beyond which a mask is doubted."""
+"""Fraction of a photograph above which a mask is doubted."""
 CELLS = 48
-"""Cells along each side of the cube that is carved."""
+"""Number of cells along each side of the cube that is carved."""
 OUTSIDE = 0.05
-"""Largest fraction of the views of a cell of the hull in which it lies outside the silhouette: poses and masks of
+"""Largest fraction of the views seeing a hull cell in which it may lie outside the silhouette: poses and masks of
 photographs are not exact."""
 SEEN_BY = 0.5
-"""Smallest fraction of all views that see a cell of the hull: cells seen by few lie at the photographs' edges."""
+"""Smallest fraction of all views that must see a hull cell: cells seen by few lie at the photographs' edges."""
 
 
 @dataclass(frozen=True)
 class Placement:
     """Where an object lies in its capture.
 
-    ``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere about the origin. ``radius``
+    ``to_object`` maps the capture's frame to the object's: +z up, inside the unit sphere around the origin. ``radius``
     is that sphere's radius in the capture's unit.
     """
 
@@ -58,10 +58,10 @@ def place(pictures: Pictures, up: tuple[float, float, float] | None, box: Corner
     """Place an object by the visual hull (Laurentini 1994) of its silhouettes, which gives centre and radius.
 
     ``up`` is in the capture's frame; None: that of its file, else the mean of the cameras' up vectors, which is logged.
-    ``box``: the hull ends at its sides, which are along the axes of the capture's frame.
+    ``box`` bounds the hull; its sides are along the axes of the capture's frame.
 
     Raises:
-        ValueError: masks without an object, or an empty visual hull.
+        ValueError: the masks show no object, or the visual hull is empty.
     """
     capture = pictures.capture
     chosen = up if up is not None else capture.up
@@ -118,7 +118,7 @@ def silhouette(pictures: Pictures, frame: Frame) -> Bool[Tensor, "h w"]:
 
 
 def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "_ _"]]) -> None:
-    """Warn of masks that touch the edges of their photographs or cover nearly all of them."""
+    """Warn about masks that touch the edges of their photographs or cover nearly all of them."""
     kinds = {
         "touch the edges of their photographs, beyond which the object is unknown": lambda mask: bool(
             torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any()
@@ -137,7 +137,7 @@ def _doubt(capture: Capture, silhouettes: Sequence[Bool[Tensor, "_ _"]]) -> None
 def sphere_of(
     capture: Capture, silhouettes: Sequence[Bool[Tensor, "_ _"]], box: Corners | None = None
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Centre and radius of the silhouettes' visual hull, or of its part in a box, in the capture's frame."""
+    """Return centre and radius of the silhouettes' visual hull, or of its part in a box, in the capture's frame."""
     empty = [frame.image for frame, mask in zip(capture.frames, silhouettes, strict=True) if not mask.any()]
     if len(empty) == len(silhouettes):
         raise ValueError(
@@ -150,7 +150,7 @@ def sphere_of(
     shown = [(frame, mask) for frame, mask in zip(capture.frames, silhouettes, strict=True) if mask.any()]
     ends = torch.tensor([[-math.inf] * 3, [math.inf] * 3] if box is None else box, dtype=torch.float64)
     centre, half = _first_cube(shown) if box is None else _cube_of(box)
-    # First by whole cells, in order not to miss a thin part; then in a cube that fits, by the cells' centres.
+    # First by whole cells, so that no thin part is missed; then in a cube that fits, by the cells' centres.
     for reach in (0.5 * np.sqrt(3.0), 0.0):
         cell = 2.0 * half / CELLS
         axis = torch.linspace(-half + 0.5 * cell, half - 0.5 * cell, CELLS, dtype=torch.float64)
@@ -171,13 +171,13 @@ def sphere_of(
 
 
 def _cube_of(box: Corners) -> tuple[np.ndarray, float]:
-    """Return the middle of a box, and half the side of a cube about it."""
+    """Return the centre of a box, and half the side of a cube around it."""
     low, high = np.array(box)
     return 0.5 * (low + high), 0.5 * float((high - low).max())
 
 
 def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, float]:
-    """Find a cube about the object: the point nearest to the rays through the silhouettes' centres, and half a side."""
+    """Find the cube around the point nearest to the rays through the silhouettes' centres: centre, half a side."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     spans = []
     for frame, mask in shown:
@@ -200,7 +200,7 @@ def _first_cube(shown: Sequence[tuple[Frame, Tensor]]) -> tuple[np.ndarray, floa
 def _carved(
     shown: Sequence[tuple[Frame, Tensor]], cells: Float[Tensor, "n 3"], reach: float
 ) -> Bool[Tensor, "n"]:
-    """Cells of the visual hull: nearly all photographs that see a cell show the object within ``reach`` of it."""
+    """Find the hull's cells: nearly all photographs that see a cell show the object within ``reach`` of it."""
     seen, missed = torch.zeros(len(cells)), torch.zeros(len(cells))
     for frame, mask in shown:
         lens, pose = frame.lens, torch.from_numpy(frame.camera_to_world)
@@ -218,7 +218,7 @@ def _carved(
 
 
 def _at(mask: Tensor, pixel: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
-    """Whether pixels lie in the image, and the reduced mask's values there."""
+    """Return whether pixels lie in the image, and the reduced mask's values there."""
     size = pixel.new_tensor([lens.width, lens.height])
     inside = ((pixel >= 0.0) & (pixel < size)).all(-1)
     place = (pixel / size * pixel.new_tensor([mask.shape[1], mask.shape[0]])).nan_to_num(0.0).long()

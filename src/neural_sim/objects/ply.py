@@ -1,4 +1,4 @@
-"""PLY files: textures by vertex or corner, one or several, or the colours of vertices or faces."""
+"""PLY files: one texture or several, by vertex or corner, or the colours of vertices or faces."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 
 def ply_references(path: Path) -> list[Path]:
-    """Return the textures that a PLY file names.
+    """Return the textures to which a PLY file refers.
 
     Raises:
-        ValueError: a texture that is not there.
+        ValueError: a texture is missing.
     """
     with path.open("rb") as file:
         head = file.read(1 << 16).partition(b"end_header")[0].decode("utf-8", "replace")
@@ -45,10 +45,10 @@ def ply_references(path: Path) -> list[Path]:
 
 
 def read_ply(path: Path) -> list[Part]:
-    """Read the parts of a PLY file, one a texture.
+    """Read the parts of a PLY file, one for each texture.
 
     Raises:
-        ValueError: a file that cannot be read, or a texture that is not there.
+        ValueError: the file cannot be read, or a texture is missing.
     """
     textures = ply_references(path)
     elements = read_elements(path)
@@ -75,7 +75,7 @@ def read_ply(path: Path) -> list[Part]:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Triangles of vertices; ``origin`` is each one's polygon and its three places in it."""
+    """Triangles of vertices; ``origin`` has each one's polygon and its three places in it."""
 
     vertices: Float[np.ndarray, "v 3"]
     normals: Float[np.ndarray, "v 3"] | None
@@ -141,7 +141,7 @@ def _textured(
     parts = []
     for index in np.unique(number).tolist():
         of = number == index
-        # Vertices are split where their corners differ in coordinates.
+        # Vertices are split if their corners differ in coordinates.
         rows = np.concatenate([model.corners[of].reshape(-1, 1), uv[of].reshape(-1, 2)], -1)
         unique, faces = np.unique(rows, axis=0, return_inverse=True)
         at, white = unique[:, 0].astype(np.int64), np.ones((len(unique), 3))
@@ -158,7 +158,7 @@ def _stacked(element: Element | None, names: Sequence[str]) -> Float[np.ndarray,
 
 
 def _colours(element: Element) -> Float[np.ndarray, "n 3"] | None:
-    """Return colours in [0, 1] by what their type holds; whole numbers of 32 bits are bytes that were written long."""
+    """Return colours in [0, 1] according to their type; 32-bit integers are bytes that were stored wider."""
     for names in _COLOURS:
         values = _stacked(element, names)
         if values is None:

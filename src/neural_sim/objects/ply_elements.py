@@ -1,4 +1,4 @@
-"""The elements of a PLY file as they are stored: ASCII and binary, of any byte order, with lists of any lengths."""
+"""The elements of a PLY file as stored: ASCII and binary, of any byte order, with lists of any lengths."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _TYPES = {
     "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 Order = Literal["<", ">"]
-"""Of the bytes of a number: little or big end first."""
+"""Byte order of a number: little- or big-endian."""
 _END = b"end_header"
 _MOST = 100_000_000
 
 
 @dataclass(frozen=True)
 class Property:
-    """A property: its type, and that of its lengths if it is a list."""
+    """A property: its type, and the type of its lengths if it is a list."""
 
     name: str
     kind: np.dtype
@@ -32,7 +32,7 @@ class Property:
 
 @dataclass
 class Element:
-    """An element's columns by name: an array for numbers, an array of arrays where lists differ in length."""
+    """An element's columns by name: an array for numbers, an array of arrays if lists differ in length."""
 
     name: str
     count: int
@@ -44,7 +44,7 @@ def read_elements(path: Path) -> dict[str, Element]:
     """Read a PLY file's elements, by name.
 
     Raises:
-        ValueError: a header or data that are not a PLY file's, or that end too early.
+        ValueError: header or data are not those of a PLY file, or end too early.
     """
     data = path.read_bytes()
     head, found, body = data.partition(_END)
@@ -94,7 +94,7 @@ def _read_binary(elements: Sequence[Element], data: bytes, order: Order) -> None
 
 
 def _rows_of_bytes(element: Element, data: bytes, start: int, order: Order) -> int:
-    """Read an element's columns, all rows at once where their lists have the first row's lengths."""
+    """Read an element's columns, all rows at once if their lists have the first row's lengths."""
     lengths = _lengths_at(element, data, start, order)
     fields: list[tuple] = []
     for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
@@ -123,7 +123,7 @@ def _rows_of_bytes(element: Element, data: bytes, start: int, order: Order) -> i
 
 
 def _lengths_at(element: Element, data: bytes, start: int, order: Order) -> list[int]:
-    """Return the lengths of the lists of the row at ``start``, 0 for numbers."""
+    """Return the lengths of the lists in the row at ``start``; 0 for numbers."""
     made = []
     for item in element.properties:
         length = 0

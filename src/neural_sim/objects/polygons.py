@@ -1,4 +1,4 @@
-"""Polygons of files, cut into triangles."""
+"""Triangulation of polygons in files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 def clipped(corners: Float[np.ndarray, "n 3"]) -> list[tuple[int, int, int]]:
-    """Cut a plane polygon into triangles: a fan where it is convex, else ear by ear."""
+    """Cut a plane polygon into triangles: a fan if it is convex, else ear by ear."""
     count = len(corners)
     following = np.roll(corners, -1, axis=0)
     normal = np.cross(corners - corners[0], following - corners[0]).sum(0)  # twice the area's vector

@@ -1,4 +1,4 @@
-"""The embedded default objects, generated at run time: no downloads, the same bytes for the same seed."""
+"""The built-in default objects, generated at run time: no downloads, the same bytes for the same seed."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ class Procedural:
     """Six textured household objects, two blue and four red, without a unit of length.
 
     Args:
-        names: which of them; None: all.
-        seed: of their small print. Shapes and marks are fixed; an object does not depend on which others are chosen.
+        names: which of the objects; None: all.
+        seed: seed of their small print. Shapes and marks are fixed; an object does not depend on which others are
+            chosen.
 
     Raises:
-        ValueError: unknown names.
+        ValueError: a name is unknown.
     """
 
     metric: ClassVar[bool] = False
@@ -50,7 +51,7 @@ class Procedural:
         return list(self._names)
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each object's geometry and texture."""
+        """Return the SHA-256 of each object's geometry and texture."""
         return {item.name: item.digest for item in self.load()}
 
     def load(self) -> list[ObjectMesh]:

@@ -17,9 +17,9 @@ log = logging.getLogger(__name__)
 
 HUGE_FACES = 500_000
 LEAST_VERTICES = 50
-"""Fewer may have a tip far from the others by design."""
+"""Number of vertices below which a tip far from the others may be intended."""
 OUTLIER = 1.5
-"""How many times as far as any other; 1.003 in the scans of YCB."""
+"""Distance of an outlier as a multiple of any other's; YCB scans have up to 1.003."""
 
 
 def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
@@ -27,11 +27,11 @@ def repair(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trimesh:
 
     The copy has finite normals, no degenerate faces, and colours.
 
-    Normals that are not finite are recomputed from the faces. A mesh without colours, or without its texture, gets its
-    material's colour or grey. More than ``HUGE_FACES`` faces only give a warning.
+    Normals that are not finite are recomputed from the faces. A mesh without colours, or with a missing texture, gets
+    its material's colour or grey. More than ``HUGE_FACES`` faces only give a warning.
 
     Raises:
-        ValueError: no face of positive area with finite vertices, with ``source``.
+        ValueError: no face has positive area and finite vertices; the message has ``source``.
     """
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise ValueError(f"{source}: object {name!r} has no faces; want a triangle mesh")
@@ -69,7 +69,7 @@ def _without_bad_faces(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh
 
 
 def _warn_of_outlier(vertices: Float[np.ndarray, "v 3"], name: str, source: str) -> None:
-    """Warn of one place far from all others, as a wrong digit of a file makes it: it would shrink the rest."""
+    """Warn about one vertex far from all others, as from a wrong digit in a file: it would shrink the rest."""
     away = np.linalg.norm(vertices - np.median(vertices, axis=0), axis=1)
     farthest = int(away.argmax())
     others = away[(vertices != vertices[farthest]).any(axis=1)]
@@ -89,7 +89,7 @@ def _with_finite_normals(mesh: trimesh.Trimesh, name: str, source: str) -> trime
         "%s: object %r: %d of %d normals were not of finite unit length, recomputed",
         source, name, int(bad.sum()), len(bad),
     )  # fmt: skip
-    # A new mesh has no normals of the file, so trimesh computes them from the faces.
+    # A new mesh has none of the file's normals, so that trimesh computes them from the faces.
     rebuilt = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     rebuilt.visual = copy.deepcopy(mesh.visual)
     fresh = np.array(rebuilt.vertex_normals)
@@ -114,7 +114,7 @@ def _with_colour(mesh: trimesh.Trimesh, name: str, source: str) -> trimesh.Trime
         if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
             visual.uv = _finite_uv(np.asarray(visual.uv), name, source)
             return mesh
-        if np.asarray(material.main_color)[:3].any():  # files without any colour come out black
+        if np.asarray(material.main_color)[:3].any():  # files without any colour would come out black
             paint = tuple(int(value) for value in np.asarray(material.main_color)[:4])
         log.warning("%s: object %r: no texture to draw (missing?), painted plain %s", source, name, paint[:3])
     elif isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):

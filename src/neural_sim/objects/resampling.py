@@ -1,7 +1,7 @@
 """Photographs resampled as views of one camera: undistorted, each camera rotated towards the object's centre.
 
-A rotation of a camera about its centre, and a change of its intrinsics, map pixels to pixels whatever the scene (a
-homography). So photographs of any size and lens become views of one square camera that shows the whole object.
+Rotating a camera about its centre and changing its intrinsics maps pixels to pixels whatever the scene (a homography).
+Photographs of any size and lens therefore become views of one square camera that shows the whole object.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from neural_sim.objects.placing import Placement
 from neural_sim.types import PinholeCamera, PosedViews
 
 MARGIN = 1.08
-"""Width of the views over that of the object's bounding sphere."""
+"""Width of the views relative to that of the object's bounding sphere."""
 MOST_SAMPLES = 16
-"""Samples along each side of a pixel of the views, at most."""
+"""Largest number of samples along each side of a view's pixel."""
 
 
 def shared_camera(poses: Float[np.ndarray, "n 4 4"], image_size: int, name: str) -> PinholeCamera:
     """Choose the square camera that shows the whole unit sphere from the nearest of these poses (object radii).
 
     Raises:
-        ValueError: a camera inside the sphere.
+        ValueError: a camera is inside the sphere.
     """
     nearest = float(np.linalg.norm(poses[:, :3, 3], axis=-1).min())
     if nearest <= 1.02:
@@ -76,7 +76,7 @@ def resample(
 
 
 def pixels_per_pixel(frame: Frame, camera: PinholeCamera) -> float:
-    """Pixels of the photograph along a side of one pixel of the views."""
+    """Return the number of the photograph's pixels along a side of one pixel of the views."""
     return max(frame.lens.fx, frame.lens.fy) / focal_length(camera)
 
 

@@ -16,7 +16,7 @@ from neural_sim.objects.texture import Print, atlas
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles that share one printed panel; ``uv`` in [0, 1] of that panel, v upwards."""
+    """Triangles that share one printed panel; ``uv``, in [0, 1] of that panel, has v upwards."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -27,11 +27,11 @@ class Part:
 def revolve(
     profile: list[tuple[float, float]], side: Print, cap: Print, segments: int = 64, rows: int = 6
 ) -> list[Part]:
-    """Solid of revolution of a profile of (radius, z) about the z axis, one part for each of its straight pieces.
+    """Make a solid of revolution from a profile of (radius, z) about the z axis, one part for each straight piece.
 
-    The profile runs anticlockwise seen with radius to the right and z up: from the bottom's centre outwards, up the
+    The profile runs anticlockwise, seen with radius to the right and z up: from the bottom's centre outwards, up the
     side, back to the axis. Steep pieces take ``side`` (x: azimuth, 0.5 at world +x and growing towards +y; y:
-    height over the profile's range), flat ones ``cap`` seen from outside (image right is +y).
+    height over the profile's range), flat ones ``cap``, seen from outside (image right is +y).
     """
     heights = [z for _, z in profile]
     low, span = min(heights), max(max(heights) - min(heights), 1e-9)
@@ -80,7 +80,7 @@ def tube(path: Float[np.ndarray, "n 3"], radius: float, panel: Print, sides: int
     beside = np.cross(tangent, across)
     angles = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = np.cos(angles)[None, :, None] * beside[:, None] + np.sin(angles)[None, :, None] * across
-    point = 0.0 * ring[:1]  # a ring of no radius closes each end
+    point = 0.0 * ring[:1]  # a ring of radius zero closes each end
     rings = np.concatenate([path[:1, None] + point, path[:, None] + radius * ring, path[-1:, None] + point])
     u = np.broadcast_to(np.linspace(0.0, 1.0, sides + 1), rings.shape[:2])
     v = np.broadcast_to(np.linspace(0.0, 1.0, len(rings))[:, None], rings.shape[:2])

@@ -1,4 +1,4 @@
-"""What stands still in all photographs of an object: of a turntable, the room."""
+"""What stands still in all photographs of an object: on a turntable, the room."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from neural_sim.objects.album import Shot
 from neural_sim.pictures import read_picture
 
 LONGER = 200
-"""Pixels along the longer side at which photographs are compared."""
+"""Longer side, in pixels, at which photographs are compared."""
 TEXTURE = 0.03
-"""Smallest contrast with its surroundings (of white) of a pixel that could tell of the camera's motion."""
+"""Smallest contrast with its surroundings (relative to white) of a pixel that could show the camera's motion."""
 CHANGE = 0.35
-"""Largest change of a standing pixel from its usual value, relative to its contrast: exposure and noise are less."""
+"""Largest change of a standing pixel from its usual value, relative to its contrast: exposure and noise change less."""
 STILL = 0.8
-"""Share of the photographs in which a standing pixel has its usual value."""
+"""Fraction of the photographs in which a standing pixel has its usual value."""
 LEAST_SHARE = 0.15
-"""Of the pixels with texture; below it what stands still is a speck on the lens, or chance."""
+"""Smallest fraction of textured pixels that stand still; less is a speck on the lens, or chance."""
 AROUND = 5
-"""Pixels about which contrast is measured."""
+"""Distance in pixels around which contrast is measured."""
 
 
 def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "_ _"]] | None:
-    """Return what stands still in photographs of one size, None where next to nothing does.
+    """Return what stands still in photographs of one size; None if almost nothing does.
 
-    Contrast with the surroundings is compared, which the exposure changes little.
+    Contrasts with the surroundings are compared, because exposure hardly changes them.
     """
     if len({shot.size for shot in shots}) > 1:
-        return None  # nobody turns a camera that stands on a tripod
+        return None  # a camera on a tripod is not turned
     details = np.stack([_detail(shot) for shot in shots])
     usual = np.median(details, axis=0)
     textured = np.abs(usual) > TEXTURE
@@ -42,7 +42,7 @@ def standing_parts(shots: Sequence[Shot]) -> dict[Path, Bool[np.ndarray, "_ _"]]
     share = still.sum() / max(1.0, float((np.abs(details) > TEXTURE).mean(0).sum()))
     if share < LEAST_SHARE:
         return None
-    # Between standing pixels with texture lie standing ones without.
+    # Pixels without texture between standing pixels stand still as well.
     grown = ndimage.binary_closing(np.pad(still, 2 * AROUND, mode="reflect"), iterations=AROUND)
     grown = grown[2 * AROUND : -2 * AROUND, 2 * AROUND : -2 * AROUND]
     return {shot.image: grown for shot in shots}

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 Colour = tuple[int, int, int]
 
-# Texels repeated round each panel, so that mip levels do not mix neighbours: enough for a 16-fold reduction.
+# Texels repeated around each panel, so that mip levels do not mix neighbours: enough for a 16-fold reduction.
 MARGIN = 16
 
 
@@ -37,7 +37,7 @@ class Print:
     def text_lines(
         self, area: tuple[float, float, float, float], lines: int, colour: Colour, generator: torch.Generator
     ) -> None:
-        """Bars of random lengths in ``area`` (x0, y0, x1, y1), like lines of small print."""
+        """Print bars of random lengths in ``area`` (x0, y0, x1, y1), like lines of small print."""
         x0, y0, x1, y1 = area
         pitch = (y1 - y0) / lines
         lengths = 0.55 + 0.45 * torch.rand(lines, generator=generator, dtype=torch.float64)
@@ -63,7 +63,7 @@ class Print:
 def atlas(
     panels: list[UInt8[np.ndarray, "_h _w 3"]],
 ) -> tuple[Image.Image, list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]]]:
-    """Stack panels into one image; the (scale, offset) that map each panel's uv in [0, 1] to the atlas's uv."""
+    """Stack panels into one image; also return the (scale, offset) from each panel's uv in [0, 1] to the atlas's."""
     width = max(panel.shape[1] for panel in panels) + 2 * MARGIN
     height = sum(panel.shape[0] + 2 * MARGIN for panel in panels)
     image = np.zeros((height, width, 3), dtype=np.uint8)

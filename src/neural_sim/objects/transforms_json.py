@@ -1,4 +1,4 @@
-"""Captures as ``transforms.json``: nerfstudio's, instant-ngp's, and NeRF-synthetic's of three files."""
+"""Captures as ``transforms.json``: nerfstudio's, instant-ngp's, and NeRF-synthetic's with three files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ NAMES = ("transforms.json", "transforms_train.json", "transforms_val.json", "tra
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")
 PARTS = ("train", "val", "test")
 HELD_OUT = "held out"
-"""Key under which the files of frames that score are kept beside what the file says."""
+"""Key for the files of scoring frames, in addition to what the file itself holds."""
 POSE = "transform_matrix"
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "k5", "k6")
-"""Keys of lenses that are not read: instant-ngp's, and the divisor of OpenCV's full model."""
+"""Keys of lenses that cannot be read: instant-ngp's, and the divisor of OpenCV's full model."""
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -34,14 +34,13 @@ def has_transforms(folder: Path) -> bool:
 def read_transforms(folder: Path, name: str) -> Capture:
     """Read the capture of a folder.
 
-    It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` beside it, whose
-    frames are test frames. The latter are Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
+    It has ``transforms.json``, or ``transforms_train.json`` with optional ``_val`` and ``_test`` files, whose frames
+    are test frames. The latter kind is Blender's, with +z up. A frame's intrinsics override the file's. Frames whose
     image is missing or whose pose is null are left out with a warning.
 
     Raises:
-        ValueError: a file that is not readable or has no frames, a frame without a pose or with a matrix that is no
-            rotation, images that are all missing, one whose size is not that of its intrinsics, an unknown camera
-            model.
+        ValueError: a file is not readable or has no frames, a frame has no pose or its matrix is not a rotation, all
+            images are missing, an image's size is not that of its intrinsics, or the camera model is unknown.
     """
     whole = (folder / NAMES[0]).is_file()
     sources = (
@@ -91,7 +90,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out nulls, and give the file's focal lengths and angles to the frames that have none of their own."""
+    """Drop nulls, and give the file's focal lengths and angles to the frames that have none of their own."""
     common = {key: value for key, value in document.items() if value is not None}
     focal = {key: common.pop(key) for key in FOCAL if key in common}
     frames = []
@@ -105,7 +104,7 @@ def _with_own_lenses(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> dict[str, Any]:
-    """Follow nerfstudio's lists of files: those of ``val`` and ``test`` score, what is in none is left out."""
+    """Apply nerfstudio's lists of files: those in ``val`` and ``test`` score, those in no list are left out."""
     lists = {part: document[f"{part}_filenames"] for part in PARTS if f"{part}_filenames" in document}
     if not lists:
         return document
@@ -131,7 +130,7 @@ def _divided(document: dict[str, Any], path: Path, known: Mapping[str, int]) -> 
 
 
 def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] | None:
-    """instant-ngp's ``up``."""
+    """Read instant-ngp's ``up``."""
     if "up" not in document:
         return None
     up = document["up"]
@@ -148,7 +147,7 @@ def _up(document: Mapping[str, Any], path: Path) -> tuple[float, float, float] |
 def _frame(
     entry: Any, number: int, document: Mapping[str, Any], source: Path, test: bool
 ) -> Frame | str | None:
-    """Return an entry's frame; where its image is missing, that path as it is written; None where its pose is null."""
+    """Return an entry's frame; the path as written if its image is missing; None if its pose is null."""
     where = f"{source}: frames[{number}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError(f"{where}: want a file_path, got {entry!r}")

@@ -34,10 +34,10 @@ def videos_of(folder: Path) -> list[Path]:
 def take_frames(folder: Path, name: str, count: int) -> None:
     """Write frames of a folder's video into its folder ``images``, unless it has photographs.
 
-    The video is cut into ``count`` equal parts, and the sharpest frame of each is taken, upright.
+    The video is cut into ``count`` equal parts, and the sharpest frame of each is kept, upright.
 
     Raises:
-        ValueError: several videos, one that cannot be read, or a folder that cannot be written.
+        ValueError: there are several videos, one cannot be read, or the folder cannot be written.
     """
     videos = videos_of(folder)
     if not videos or pictures_of(folder):
@@ -50,7 +50,7 @@ def take_frames(folder: Path, name: str, count: int) -> None:
     require("video", f"objects.root: {videos[0]}")
     images = folder / FOLDER
     try:
-        place = Path(tempfile.mkdtemp(prefix=f"._{FOLDER}-", dir=folder))  # a leftover where a run is killed
+        place = Path(tempfile.mkdtemp(prefix=f"._{FOLDER}-", dir=folder))  # remains if a run is killed
     except OSError as error:
         raise ValueError(
             f"{folder}: frames of {videos[0].name} cannot be written into it ({error.strerror}); copy the video to a "
@@ -72,7 +72,7 @@ def take_frames(folder: Path, name: str, count: int) -> None:
 
 def _sharpest(video: Path, count: int) -> Iterator[tuple[int, Image.Image]]:
     """Yield the number and the picture of the sharpest frame in each of at most ``count`` equal parts of a video."""
-    import av  # ffmpeg's libraries; loaded for videos alone
+    import av  # ffmpeg's libraries; loaded only for videos
 
     try:
         with av.open(video) as container:
@@ -83,7 +83,7 @@ def _sharpest(video: Path, count: int) -> Iterator[tuple[int, Image.Image]]:
             frames = enumerate(container.decode(video=0))
             for _, part in groupby(frames, lambda numbered: numbered[0] * count // max(count, total)):
                 number, frame = max(part, key=lambda numbered: _sharpness(numbered[1]))
-                # Telephones store what the sensor saw, and by how much a player is to turn it.
+                # Phones store what the sensor saw, and by how much a player should rotate it.
                 yield number, frame.to_image().rotate(frame.rotation, expand=True)
     except av.FFmpegError as error:
         raise ValueError(f"{video}: cannot be read as a video: {error.strerror}") from error

@@ -17,16 +17,16 @@ from neural_sim.objects.polygons import clipped
 _log = logging.getLogger(__name__)
 
 _FLAGS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-imfchan": 1, "-mm": 2, "-texres": 1}
-"""Options of maps that change nothing here, and how many values follow them."""
+"""Options of maps that have no effect here, and how many values follow them."""
 _NO_MATERIAL = ("none", "(null)", "null", "default")
-"""Names under which writers put faces without a material."""
+"""Names that writers use for faces without a material."""
 Corner = tuple[int, int, int]
-"""Indices from 0 of a corner's vertex, texture coordinate and normal, -1: none."""
+"""Indices, from 0, of a corner's vertex, texture coordinate and normal; -1: none."""
 
 
 @dataclass
 class Material:
-    """A material of an MTL file: its colour, its texture's file, and how the texture lies."""
+    """A material of an MTL file: its colour, its texture's file, and the placement of the texture."""
 
     colour: tuple[float, float, float] | None = None
     texture: Path | None = None
@@ -37,7 +37,7 @@ class Material:
 
 @dataclass
 class _Model:
-    """The lines of an OBJ file. ``faces`` are polygons, by material; ``lines`` are numbers of their first lines."""
+    """The lines of an OBJ file. ``faces`` are polygons, by material; ``lines`` are the numbers of their first lines."""
 
     vertices: list[list[str]] = field(default_factory=list)
     coordinates: list[list[str]] = field(default_factory=list)
@@ -46,10 +46,10 @@ class _Model:
 
 
 def obj_references(path: Path) -> list[Path]:
-    """Return the files that an OBJ file names: its material libraries and their textures.
+    """Return the files to which an OBJ file refers: its material libraries and their textures.
 
     Raises:
-        ValueError: a texture that is not there, or a library that cannot be read.
+        ValueError: a texture is missing, or a library cannot be read.
     """
     libraries = _libraries(_text(path), path)
     textures = [material.texture for material in _materials(libraries).values()]
@@ -57,10 +57,10 @@ def obj_references(path: Path) -> list[Path]:
 
 
 def read_obj(path: Path) -> list[Part]:
-    """Read the parts of an OBJ file, one a material.
+    """Read the parts of an OBJ file, one for each material.
 
     Raises:
-        ValueError: a line that cannot be read, an index of nothing, a material or texture that is not there.
+        ValueError: a line cannot be read, an index points to nothing, or a material or texture is missing.
     """
     text = _text(path)
     libraries = _libraries(text, path)
@@ -121,7 +121,7 @@ def _material(
     faces: int,
     coloured: bool,
 ) -> Material:
-    """Return the material of a name; what faces without one have is said."""
+    """Return the material with a name; log which one faces without a material get."""
     if name in materials:
         return materials[name]
     if coloured:
@@ -141,7 +141,7 @@ def _material(
 
 
 def _libraries(text: str, path: Path) -> list[Path]:
-    """Find the material libraries that a file names; one that is not there matters only if a face needs it."""
+    """Find the material libraries to which a file refers; a missing one matters only if a face needs it."""
     found = []
     for written in re.findall(r"^[ \t]*mtllib[ \t]+(.+?)[ \t]*$", text, re.MULTILINE):
         whole = find_named(written, path.parent)
@@ -185,7 +185,7 @@ def _kd(rest: str, where: str) -> tuple[float, float, float]:
 
 
 def _map(material: Material, rest: str, library: Path, where: str) -> None:
-    """Read ``map_Kd`` with its options; a file of the whole text's name comes first."""
+    """Read ``map_Kd`` with its options; a file named by the whole text has priority."""
     found = find_named(rest, library.parent) if not rest.startswith("-") else None
     if found is None:
         words = rest.split()
@@ -215,7 +215,7 @@ def _map(material: Material, rest: str, library: Path, where: str) -> None:
 
 
 def _leading_numbers(words: list[str]) -> list[float]:
-    """Take up to three numbers off the front."""
+    """Remove up to three numbers from the front."""
     values: list[float] = []
     while len(words) > 1 and len(values) < 3:  # the last word is the file's name
         try:
@@ -230,7 +230,7 @@ def _leading_numbers(words: list[str]) -> list[float]:
 
 
 def _text(path: Path) -> str:
-    """Read a text of any line ends; what is no UTF-8 is Latin-1, as older writers left it."""
+    """Read a text with any line ends; if it is not UTF-8, it is Latin-1, which older writers used."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -276,7 +276,7 @@ def _corners(words: Sequence[str], model: _Model, where: str) -> Iterator[Corner
             for place, index in enumerate(word.split("/")):
                 if index:
                     value = int(index)
-                    # Indices count from 1; negative ones from the last line before the face.
+                    # Indices count from 1; negative ones count back from the last line before the face.
                     made[place] = value - 1 if value > 0 else counts[place] + value
                     if value == 0 or made[place] < 0:
                         raise ValueError
@@ -334,7 +334,7 @@ def _triangles(polygons: list[list[Corner]], vertices: Float[np.ndarray, "v 3"])
 
 
 def _uniform(corners: Int[np.ndarray, "f 3 3"]) -> Iterator[Int[np.ndarray, "some 3 3"]]:
-    """Split triangles into those with and without coordinates; normals count where all of those have them."""
+    """Split triangles into those with and without coordinates; normals count if all of those have them."""
     mapped = np.all(corners[:, :, 1] >= 0, axis=1)
     for chosen in (mapped, ~mapped):
         if chosen.any():

@@ -23,7 +23,7 @@ class YCB(MeshFiles):
         names: objects as '019_pitcher_base', '019' or 'pitcher_base'; None: all.
 
     Raises:
-        ValueError: a folder without such objects, or an unknown name.
+        ValueError: the folder has no such objects, or a name is unknown.
     """
 
     def __init__(self, root: str | Path, names: Names = None) -> None:
